@@ -1,0 +1,11 @@
+"""What server, workers and consumers say to each other.
+
+Pure data: the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
+"""
+
+PROTOCOL_VERSION = 1
+"""Version of the messages on the wire. Peers of another version are refused with both numbers."""
+
+NUMERICS_VERSION = 1
+"""Version of everything that turns (spec, catalogue, seed, epoch, index) into bytes: permutation, draws,
+kernel. It is part of a sample's identity; a change that alters any byte of any sample raises it."""

@@ -1,0 +1,108 @@
+"""Every exception this project raises on purpose, and whose fault it reports.
+
+    V2VError
+    |-- UsageError               the caller: an argument, a flag, a configuration file
+    |   |-- RecipeError              a recipe key, value or preset
+    |   |-- CorpusError              a folder, list file or index that gives no sequence
+    |   `-- StateMismatch            a saved position that belongs to another stream
+    |-- VideoError               the file: it cannot give what it promised (path, frame, reason)
+    |   `-- VideoChanged             it is not the file that was catalogued
+    |-- ProtocolError            the peer: it sent what no peer of ours would send
+    |   |-- VersionMismatch          another protocol or numerics version
+    |   `-- LimitExceeded            a message, a list or a credit larger than stated
+    |-- RemoteError              the server answered a request with a refusal (code, text)
+    |   `-- SampleUnavailable        one sample could not be made from any of its candidates
+    |-- ServerLost               nobody: the server did not answer within the deadline
+    `-- WorkerCrashLoop          the workers die without finishing anything
+
+A message says what is wrong, the number, the limit and what to do about it.
+"""
+
+from __future__ import annotations
+
+
+class V2VError(Exception):
+    """Root of the tree: everything the project raises on purpose."""
+
+
+class UsageError(V2VError):
+    """The caller asked for something that cannot be: an argument, a flag, a configuration file."""
+
+
+class RecipeError(UsageError):
+    """A recipe names an unknown key or preset, or a value outside its limits."""
+
+
+class CorpusError(UsageError):
+    """A folder, list file or catalogue index that cannot serve: missing, empty, or admitting nothing."""
+
+
+class StateMismatch(UsageError):
+    """A saved position belongs to another stream; the message names both sides."""
+
+
+class VideoError(V2VError):
+    """A video file cannot give what it promised.
+
+    Attributes:
+        video: the path or catalogue id of the file.
+        frame: the first frame number (presentation order, from 0) that could not be had; None when no single
+            frame is to blame (the file does not open).
+        reason: one line of text.
+    """
+
+    def __init__(self, video: str, frame: int | None, reason: str) -> None:
+        self.video = video
+        self.frame = frame
+        self.reason = reason
+        where = "" if frame is None else f" at frame {frame}"
+        super().__init__(f"{video}{where}: {reason}")
+
+    def __reduce__(self) -> tuple[type[VideoError], tuple[str, int | None, str]]:
+        # The default would pass the finished message to a three-argument __init__.
+        return type(self), (self.video, self.frame, self.reason)
+
+
+class VideoChanged(VideoError):
+    """The file differs from the one that was catalogued (size, or hash of its head and tail)."""
+
+
+class ProtocolError(V2VError):
+    """The peer sent something that no peer of this protocol sends."""
+
+
+class VersionMismatch(ProtocolError):
+    """The peer speaks another version; the message names both."""
+
+
+class LimitExceeded(ProtocolError):
+    """A message, list or credit is larger than the stated limit."""
+
+
+class RemoteError(V2VError):
+    """The server refused a request.
+
+    Attributes:
+        code: a short stable word, see ``v2v_protocol.messages.ErrorCode``.
+        text: the server's explanation.
+    """
+
+    def __init__(self, code: str, text: str) -> None:
+        self.code = code
+        self.text = text
+        super().__init__(f"{text} [{code}]")
+
+    def __reduce__(self) -> tuple[type[RemoteError], tuple[str, str]]:
+        return type(self), (self.code, self.text)
+
+
+class SampleUnavailable(RemoteError):
+    """No candidate video of one sample could be used (or the spec says ``on_bad_video: raise``)."""
+
+
+class ServerLost(V2VError):
+    """The server did not answer within the deadline; the message names address and last sample."""
+
+
+class WorkerCrashLoop(V2VError):
+    """Server workers died again and again without finishing a single sample."""

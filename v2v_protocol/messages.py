@@ -1,0 +1,237 @@
+"""The messages, as frozen dataclasses. How they become bytes is :mod:`v2v_protocol.wire`; who may send what when is
+`docs/protocol.md`.
+
+    consumer -> server     Hello, Want, Ping, Goodbye
+    server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Refused, Pong
+    worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), JobFailed, Ping, Goodbye
+    server -> worker       Lease, Stop, Refused, Pong
+
+Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int
+or str, and Mapping (plain values, checked by whoever knows its form).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class ErrorCode(StrEnum):
+    """Why the server refused a request."""
+
+    VERSION = "version"
+    MALFORMED = "malformed"
+    SPEC = "spec"
+    UNKNOWN_SESSION = "unknown-session"
+    CREDIT = "credit"
+    RANGE = "range"
+
+
+# --- consumer -> server -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Opens (or opens again, after a server restart) a consumer's session.
+
+    Attributes:
+        spec: what the consumer asks for, see ``StreamSpec.from_dict``; missing fields take the server's defaults.
+        arrays: names of the arrays wanted.
+        batch_size: samples of a batch; it only sizes the suggested credit.
+        seed: seed of the stream.
+    """
+
+    spec: Mapping[str, Any]
+    arrays: tuple[str, ...]
+    batch_size: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """Asks for samples of one epoch; each index is one unit of credit spent until it is answered.
+
+    An index that is asked for again while it is in work is not made twice.
+    """
+
+    epoch: int
+    indices: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    """Is anybody there? Sent when nothing else was, so that any traffic counts as life."""
+
+
+@dataclass(frozen=True, slots=True)
+class Goodbye:
+    """The sender leaves in peace: forget its session, or give its leases to others."""
+
+
+# --- server -> consumer -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """Answers Hello.
+
+    Attributes:
+        spec: the resolved spec, every field present.
+        spec_digest, catalogue_digest, numerics_version: the server's half of every sample's identity.
+        sequences: N, samples of one epoch before ranks drop a remainder.
+        credit: samples the consumer may have asked for and not yet received, at most.
+    """
+
+    spec: Mapping[str, Any]
+    spec_digest: str
+    catalogue_digest: str
+    numerics_version: int
+    sequences: int
+    credit: int
+
+
+@dataclass(frozen=True, slots=True)
+class SampleHeader:
+    """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
+
+    Attributes:
+        epoch, index: which sample.
+        names, dtypes: of the arrays, in the order of the raw frames.
+        shapes: of all arrays, flattened: ndim, extents, ndim, extents ...
+        provenance: ``Provenance.to_dict()``.
+        worker: name of the server worker that made it.
+        cpu_seconds: processor time it took there.
+    """
+
+    epoch: int
+    index: int
+    names: tuple[str, ...]
+    dtypes: tuple[str, ...]
+    shapes: tuple[int, ...]
+    provenance: Mapping[str, Any]
+    worker: str
+    cpu_seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unavailable:
+    """One asked sample cannot be made from any of its candidates; ``text`` says what each of them lacked."""
+
+    epoch: int
+    index: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A request was not accepted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Pong:
+    """Answers Ping."""
+
+
+# --- worker -> server -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerHello:
+    """A worker offers itself, with room for ``credit`` leases at a time."""
+
+    name: str
+    host: str
+    pid: int
+    numerics_version: int
+    credit: int
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """The worker starts on this lease now: only a lease that was begun can be blamed for what happens next."""
+
+    lease: int
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One sample of a lease is done; the frames of its SampleHeader message follow, to be passed on unopened."""
+
+    lease: int
+    index: int
+    cpu_seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class JobFailed:
+    """The lease's video could not give what it promised. ``frame`` and ``reason`` are those of VideoError."""
+
+    lease: int
+    frame: int | None
+    reason: str
+
+
+# --- server -> worker -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """A decode group: one clip of one video, and the indices to be made from it.
+
+    Attributes:
+        lease: number of the lease.
+        reply_to: routing identity of the consumer (opaque; lets a direct data path be added without a new message).
+        spec: canonical bytes of the StreamSpec.
+        spec_digest, catalogue_digest: of the identity of its samples.
+        seed, epoch, indices: of the identity of its samples.
+        arrays: names of the arrays to send.
+        video: catalogue id; the worker finds the file below its own root.
+        fingerprint: what the file must still be.
+        rows: rows of the picture that may be used, ``Rows`` syntax.
+        width_px, height_px: of the upright picture, before rows.
+        frames_per_second: average rate, for noise stated per second.
+        thresholds: (positive, negative) as float.hex() when the corpus states them for this video, else empty.
+        start_frame: first frame of the sequence.
+        frame_index: ``FrameIndex.to_bytes()`` of the part of the file that is needed.
+        candidate: which candidate of the index this is.
+        refusals: candidates passed over before, as ``Refusal`` fields: {"refusals": [...]}.
+        deadline_seconds: a worker silent for longer than this is taken for hung.
+    """
+
+    lease: int
+    reply_to: bytes
+    spec: bytes
+    spec_digest: str
+    catalogue_digest: str
+    seed: int
+    epoch: int
+    indices: tuple[int, ...]
+    arrays: tuple[str, ...]
+    video: str
+    fingerprint: str
+    rows: str
+    width_px: int
+    height_px: int
+    frames_per_second: float
+    thresholds: tuple[str, ...]
+    start_frame: int
+    frame_index: bytes
+    candidate: int
+    refusals: Mapping[str, Any]
+    deadline_seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Finish what was begun, say Goodbye and exit."""
+
+
+Message = (
+    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Refused | Pong
+    | WorkerHello | Begun | Result | JobFailed | Lease | Stop
+)  # fmt: skip

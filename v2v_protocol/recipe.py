@@ -1,0 +1,280 @@
+"""The recipe: the ranges a virtual event camera and its view of a video are drawn from.
+
+A :class:`Recipe` holds everything that shapes a sample besides the video itself. One draw from it, keyed by (seed,
+epoch, index), is a :class:`v2v_protocol.sample.SampleParams`. Values of the default preset, ``paper``, are those of the
+training configurations released with "V2V: Scaling Event-Based Vision through Efficient Video-to-Voxel Simulation"
+(Lou et al., NeurIPS 2025, arXiv 2505.16797).
+
+The pixel model (section 3 of the paper), per pixel, with F in 0..255:
+
+    L(t)  = log(log_eps + (F(t) / 255) ** gamma)
+    dL(t) = residual(t-1) + L(t) - L(t-1) + N(t) + H        N(t) ~ Normal(0, noise_sigma^2), fresh for every frame
+    N+    = max(0, floor( dL(t) / threshold_pos))
+    N-    = max(0, floor(-dL(t) / threshold_neg))
+    residual(t) = dL(t) - threshold_pos N+ + threshold_neg N-
+    V(bin)     += N+ - N-
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from v2v_protocol.errors import RecipeError
+
+Range = tuple[float, float]
+"""Lowest and highest value of a uniform draw; equal ends fix the value."""
+
+_LARGEST_FRAMES = 1_000_001
+_LARGEST_SIDE_PX = 16_384
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Ranges of one virtual camera. Frozen, hashable, validated on construction.
+
+    Clip
+        voxels_per_clip: T, voxel grids of a clip.
+        bins: B, bins of one voxel grid.
+        frames_per_bin: steps between video frames that fall into one bin.
+        lead_frames: 1 puts the frame before the first target frame in front (flow networks), else 0.
+        lead_voxels: 1 puts one more voxel grid in front (ERAFT), else 0.
+
+    View
+        crop_height_px, crop_width_px: size of the random crop, pixels.
+        resize_scale: scale of the picture before the crop; raised where the crop would not fit otherwise, as far as
+            the upper end allows.
+        flip_probability: chance of a horizontal flip.
+        pause_probability: chance, per frame, that a running camera stops (the frame repeats).
+        pause_stay_probability: chance, per frame, that a stopped camera stays so.
+        contrast_probability: chance that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up.
+        contrast_scale: range of s.
+
+    Intensity
+        gamma: exponent of the reverse gamma correction.
+        log_eps: epsilon inside the logarithm.
+
+    Pixel
+        threshold: smaller of the two contrast thresholds, log-intensity units.
+        threshold_ratio: the other one, as a multiple; a coin says which of the two is the positive one.
+        threshold_source: "sample" draws thresholds afresh for every sample; "video" once per video for ever (taken
+            from the list file where it states them).
+        noise_sigma: standard deviation of the noise, log units per frame, or per square root of a second.
+        noise_scales_with_threshold: True multiplies noise_sigma by the drawn positive threshold.
+        hot_pixel_share: share of the crop's pixels that are hot.
+        hot_pixel_sigma: standard deviation of a hot pixel's constant drift, log units per frame, or per second.
+        noise_unit: "frame" or "second": the time base of noise_sigma and hot_pixel_sigma.
+
+    Raises:
+        RecipeError: a value is outside its limits; the message names the field, the value and the limit.
+    """
+
+    voxels_per_clip: int = 40
+    bins: int = 5
+    frames_per_bin: int = 1
+    lead_frames: int = 0
+    lead_voxels: int = 0
+
+    crop_height_px: int = 128
+    crop_width_px: int = 128
+    resize_scale: Range = (1.0, 1.0)
+    flip_probability: float = 0.5
+    pause_probability: float = 0.0102
+    pause_stay_probability: float = 0.9791
+    contrast_probability: float = 0.0
+    contrast_scale: Range = (1.0, 3.0)
+
+    gamma: float = 2.2
+    log_eps: float = 0.001
+
+    threshold: Range = (0.05, 2.0)
+    threshold_ratio: Range = (1.0, 1.5)
+    threshold_source: str = "sample"
+    noise_sigma: Range = (0.0, 0.1)
+    noise_scales_with_threshold: bool = False
+    hot_pixel_share: Range = (0.0, 0.001)
+    hot_pixel_sigma: Range = (0.0, 10.0)
+    noise_unit: str = "frame"
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = _coerced(field.name, getattr(self, field.name), field.default)
+            object.__setattr__(self, field.name, value)
+        for name, (low, high) in _LIMITS.items():
+            value = getattr(self, name)
+            for end in value if isinstance(value, tuple) else (value,):
+                if not low <= end <= high:
+                    raise RecipeError(f"recipe {name} = {_shown(value)}: {end} is outside {low} .. {high}")
+        for name, words in _CHOICES.items():
+            if getattr(self, name) not in words:
+                raise RecipeError(f"recipe {name} = {getattr(self, name)!r}: choose one of {', '.join(words)}")
+        if self.frames_needed > _LARGEST_FRAMES:
+            raise RecipeError(
+                f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin + 1); "
+                f"the limit is {_LARGEST_FRAMES}"
+            )
+
+    @property
+    def steps(self) -> int:
+        """Differences between consecutive frames in a sample, lead voxel included."""
+        return (self.voxels_per_clip + self.lead_voxels) * self.bins * self.frames_per_bin
+
+    @property
+    def frames_needed(self) -> int:
+        """Consecutive video frames a sample needs when the camera never pauses (paper: 201)."""
+        return self.steps + 1
+
+    @property
+    def frames_per_sequence(self) -> int:
+        """L, the stride between the starts of a video's sequences (paper: 200)."""
+        return self.steps
+
+    @property
+    def target_steps(self) -> tuple[int, ...]:
+        """Frame positions (0 .. steps) of the delivered frames: the end of each voxel, and the lead frame."""
+        span = self.bins * self.frames_per_bin
+        first = (self.lead_voxels + 1 - self.lead_frames) * span
+        return tuple(range(first, self.steps + 1, span))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields as plain values (ranges as lists), in a stable order."""
+        return {
+            field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
+            for field in dataclasses.fields(self)
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
+        """A recipe from plain values.
+
+        Args:
+            values: fields by name; missing ones take the value of ``values["preset"]``, by default ``paper``.
+
+        Raises:
+            RecipeError: an unknown key (the nearest known one is named), an unknown preset, a bad value.
+        """
+        rest = dict(values)
+        base = preset(rest.pop("preset", DEFAULT_PRESET))
+        return base.replace(**rest)
+
+    def replace(self, **changes: Any) -> Recipe:
+        """This recipe with some fields changed.
+
+        Raises:
+            RecipeError: an unknown key or a bad value.
+        """
+        known = [field.name for field in dataclasses.fields(self)]
+        for key in changes:
+            if key not in known:
+                raise RecipeError(f"unknown recipe key {key!r}{_nearest(key, known)}; known: {', '.join(known)}")
+        return dataclasses.replace(self, **changes)
+
+
+_LIMITS: dict[str, tuple[float, float]] = {
+    "voxels_per_clip": (1, 1_000_000),
+    "bins": (1, 1024),
+    "frames_per_bin": (1, 1024),
+    "lead_frames": (0, 1),
+    "lead_voxels": (0, 1),
+    "crop_height_px": (1, _LARGEST_SIDE_PX),
+    "crop_width_px": (1, _LARGEST_SIDE_PX),
+    "resize_scale": (0.01, 100.0),
+    "flip_probability": (0.0, 1.0),
+    "pause_probability": (0.0, 1.0),
+    "pause_stay_probability": (0.0, 1.0),
+    "contrast_probability": (0.0, 1.0),
+    "contrast_scale": (0.0, 100.0),
+    "gamma": (0.05, 20.0),
+    "log_eps": (1e-12, 1.0),
+    "threshold": (1e-6, 1e6),
+    "threshold_ratio": (1e-6, 1e6),
+    "noise_sigma": (0.0, 1e6),
+    "hot_pixel_share": (0.0, 1.0),
+    "hot_pixel_sigma": (0.0, 1e9),
+}
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "threshold_source": ("sample", "video"),
+    "noise_unit": ("frame", "second"),
+}
+
+
+def _coerced(name: str, value: Any, default: Any) -> Any:
+    """``value`` in the type of the field's default; a single number stands for a range of equal ends."""
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise RecipeError(f"recipe {name} = {value!r}: give true or false")
+        return value
+    if isinstance(default, int):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise RecipeError(f"recipe {name} = {value!r}: give a whole number")
+        return value
+    if isinstance(default, str):
+        if not isinstance(value, str):
+            raise RecipeError(f"recipe {name} = {value!r}: give a word")
+        return value
+    if isinstance(default, float):
+        return _number(name, value)
+    ends = tuple(value) if isinstance(value, list | tuple) else (value, value)
+    if len(ends) != 2:
+        raise RecipeError(f"recipe {name} = {value!r}: give one number, or a pair [lowest, highest]")
+    low, high = (_number(name, end) for end in ends)
+    if low > high:
+        raise RecipeError(f"recipe {name} = [{low}, {high}]: the lowest value comes first")
+    return low, high
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise RecipeError(f"recipe {name} = {value!r}: give a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise RecipeError(f"recipe {name} = {value!r}: give a finite number")
+    return number
+
+
+def _shown(value: Any) -> str:
+    return str(list(value)) if isinstance(value, tuple) else repr(value)
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+DEFAULT_PRESET = "paper"
+
+PRESETS: dict[str, Recipe] = {
+    "paper": Recipe(),
+    # Ablation "-F": one draw of the thresholds per video, for ever.
+    "paper-fixed-thresholds": Recipe(threshold_source="video"),
+    # Ablation "LDR": contrast raised, then clipped.
+    "paper-contrast": Recipe(contrast_probability=0.8),
+    # EVFlowNet: the frame before the first target frame, for pseudo flow.
+    "paper-flow": Recipe(lead_frames=1),
+    # ERAFT: that frame, and one more voxel grid in front.
+    "paper-eraft": Recipe(lead_frames=1, lead_voxels=1),
+    # The paper's pixel without noise, hot pixels or pauses: for tests and for looking.
+    "noise-free": Recipe(
+        noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), hot_pixel_sigma=(0.0, 0.0), pause_probability=0.0
+    ),
+}
+
+
+def preset(name: object) -> Recipe:
+    """The preset of that name.
+
+    Raises:
+        RecipeError: no such preset; the message lists them.
+    """
+    if not isinstance(name, str) or name not in PRESETS:
+        raise RecipeError(f"unknown recipe preset {name!r}{_nearest(str(name), list(PRESETS))}; "
+                          f"known: {', '.join(PRESETS)}")  # fmt: skip
+    return PRESETS[name]

@@ -1,0 +1,209 @@
+"""One sample: who it is, what was drawn for it, where it came from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_protocol.recipe import Recipe
+
+LARGEST_SEED = 2**64 - 1
+LARGEST_EPOCH = 2**32 - 1
+LARGEST_INDEX = 2**48 - 1
+ARRAYS = ("voxels", "frames")
+"""Arrays a consumer may ask for."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleId:
+    """Identity of a sample. Equal identities mean equal bytes, whoever makes the sample, wherever, whenever.
+
+    Attributes:
+        spec_digest: digest of the :class:`v2v_protocol.spec.StreamSpec`.
+        catalogue_digest: digest of the catalogue snapshot.
+        numerics_version: :data:`v2v_protocol.NUMERICS_VERSION` of the maker.
+        seed: 0 .. 2**64 - 1.
+        epoch: 0 .. 2**32 - 1.
+        index: global index in the epoch's permutation.
+    """
+
+    spec_digest: str
+    catalogue_digest: str
+    numerics_version: int
+    seed: int
+    epoch: int
+    index: int
+
+    def __post_init__(self) -> None:
+        for name, value, limit in (
+            ("seed", self.seed, LARGEST_SEED),
+            ("epoch", self.epoch, LARGEST_EPOCH),
+            ("index", self.index, LARGEST_INDEX),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
+                raise UsageError(f"{name} = {value!r}: give a whole number from 0 to {limit}")
+
+
+@dataclass(frozen=True, slots=True)
+class SampleParams:
+    """One draw from a recipe.
+
+    Attributes:
+        threshold_pos, threshold_neg: contrast thresholds, log units, exactly representable in float32.
+        noise_sigma: log units per frame, or per square root of a second (the recipe's ``noise_unit``).
+        hot_pixel_count: number of hot pixels in the crop.
+        hot_pixel_sigma: standard deviation of their drift, log units per frame or per second.
+        pauses: (first, length) of each run of repeated frames; first is the position in 1 .. steps of the first repeat.
+        scale: resize factor of the picture before the crop.
+        crop_top_px, crop_left_px: place of the crop in the resized picture.
+        flip: True mirrors left and right.
+        contrast: the degrade scale s, or 0.0 when the picture is left alone.
+        noise_key: four 32-bit words that key every per-pixel random number of this sample.
+    """
+
+    threshold_pos: float
+    threshold_neg: float
+    noise_sigma: float
+    hot_pixel_count: int
+    hot_pixel_sigma: float
+    pauses: tuple[tuple[int, int], ...]
+    scale: float
+    crop_top_px: int
+    crop_left_px: int
+    flip: bool
+    contrast: float
+    noise_key: tuple[int, int, int, int]
+
+    def source_index(self, steps: int) -> npt.NDArray[np.int64]:
+        """Which decoded frame each position of the clip shows.
+
+        Returns:
+            [steps + 1] int64, starting at 0, each entry equal to the one before (paused) or one more.
+        """
+        advance = np.ones(steps + 1, np.int64)
+        advance[0] = 0
+        for first, length in self.pauses:
+            advance[first : first + length] = 0
+        return np.cumsum(advance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for the provenance."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A candidate that was passed over for an index: which video, where, why."""
+
+    candidate: int
+    video: str
+    frame: int | None
+    reason: str
+
+    def __str__(self) -> str:
+        where = "" if self.frame is None else f" at frame {self.frame}"
+        return f"{self.video}{where}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a sample came from: enough to make it again and to explain it. Deterministic: no clock, no host.
+
+    Attributes:
+        id: the sample's identity.
+        video: catalogue id (relative POSIX path) of the source.
+        fingerprint: size and hash of the source file.
+        start_frame: first frame of the sequence, presentation order.
+        candidate: 0, or which substitute of the index this is.
+        refusals: the candidates passed over before it.
+        params: the draw.
+        saturated_bins: voxel bins whose count did not fit the dtype and were clipped.
+        irregular_timestamps: steps whose time stamps were missing or not increasing (noise per second used the
+            average rate there).
+        decoder: codec name, and whether its decoding is bit-exact on every host.
+    """
+
+    id: SampleId
+    video: str
+    fingerprint: str
+    start_frame: int
+    candidate: int
+    refusals: tuple[Refusal, ...]
+    params: SampleParams
+    saturated_bins: int
+    irregular_timestamps: int
+    decoder: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as they travel in the sample's header."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
+        """The provenance back from plain values.
+
+        Raises:
+            ProtocolError: a field is missing or unknown.
+        """
+        try:
+            rest = dict(values)
+            params = dict(rest.pop("params"))
+            params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
+            params["noise_key"] = tuple(int(word) for word in params["noise_key"])
+            return cls(
+                id=SampleId(**rest.pop("id")),
+                refusals=tuple(Refusal(**item) for item in rest.pop("refusals")),
+                params=SampleParams(**params),
+                **rest,
+            )
+        except (KeyError, TypeError, ValueError, UsageError) as error:
+            raise ProtocolError(f"provenance of a sample does not fit its form: {error}") from error
+
+
+def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """dtype and shape of each asked array of one sample (no batch dimension).
+
+    voxels [T + lead_voxels, bins, H, W] in ``voxel_dtype``; frames [T + lead_frames, 1, H, W] uint8.
+
+    Raises:
+        UsageError: an array nobody makes, none at all, or one asked twice.
+    """
+    if not arrays or len(set(arrays)) != len(arrays):
+        raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
+    height, width = recipe.crop_height_px, recipe.crop_width_px
+    known = {
+        "voxels": (voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, height, width)),
+        "frames": ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, height, width)),
+    }
+    for name in arrays:
+        if name not in known:
+            raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
+    return {name: known[name] for name in arrays}
+
+
+def layout_bytes(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> int:
+    """Bytes of one sample of that layout."""
+    return sum(np.dtype(dtype).itemsize * int(np.prod(shape)) for dtype, shape in layout.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One simulated clip.
+
+    Attributes:
+        arrays: by name, in the shapes of :func:`array_layout`.
+        provenance: where it came from.
+    """
+
+    arrays: Mapping[str, npt.NDArray[Any]]
+    provenance: Provenance
+
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name}: {array.dtype}{list(array.shape)}" for name, array in self.arrays.items())
+        return f"Sample({shapes}, {self.provenance.video}@{self.provenance.start_frame})"

@@ -1,0 +1,245 @@
+"""Messages <-> frames of a ZeroMQ multipart message.
+
+Frame 0 is a msgpack map: ``{"v": protocol version, "t": type name, ...fields}``. A SampleHeader is followed by one raw
+frame per array; a Result is followed by the frames of a whole SampleHeader message, which a broker passes on unopened.
+
+Everything that comes off a wire is hostile until it is decoded: sizes are limited before anything is allocated, types
+are checked field by field, dtypes come from an allow-list, nothing is ever unpickled. Whatever bytes arrive,
+:func:`decode` either returns a message or raises a :class:`v2v_protocol.errors.ProtocolError`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
+from v2v_protocol.messages import (
+    Begun,
+    Goodbye,
+    Hello,
+    JobFailed,
+    Lease,
+    Message,
+    Ping,
+    Pong,
+    Refused,
+    Result,
+    SampleHeader,
+    Stop,
+    Unavailable,
+    Want,
+    Welcome,
+    WorkerHello,
+)
+
+LARGEST_HEADER_BYTES = 1 << 20
+"""Frame 0. The largest in use is a Lease: a frame index of a few thousand frames is a few kilobytes."""
+LARGEST_ARRAY_BYTES = 1 << 31
+LARGEST_TUPLE = 65_536
+ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
+_MOST_ARRAYS = 8
+_MOST_DIMENSIONS = 8
+
+Buffer: TypeAlias = bytes | bytearray | memoryview
+Frames: TypeAlias = list[Buffer]
+
+_TYPES: dict[str, type[Any]] = {
+    "hello": Hello,
+    "want": Want,
+    "ping": Ping,
+    "goodbye": Goodbye,
+    "welcome": Welcome,
+    "sample": SampleHeader,
+    "unavailable": Unavailable,
+    "refused": Refused,
+    "pong": Pong,
+    "worker-hello": WorkerHello,
+    "begun": Begun,
+    "result": Result,
+    "job-failed": JobFailed,
+    "lease": Lease,
+    "stop": Stop,
+}
+_NAMES = {cls: name for name, cls in _TYPES.items()}
+
+
+def encode(message: Message) -> Frames:
+    """The header frame of a message, alone in a list so that payload frames can be appended.
+
+    Raises:
+        LimitExceeded: the header is larger than any peer would accept.
+    """
+    fields = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
+    header = msgpack.packb({"v": PROTOCOL_VERSION, "t": _NAMES[type(message)], **fields}, use_bin_type=True)
+    if len(header) > LARGEST_HEADER_BYTES:
+        raise LimitExceeded(
+            f"a {_NAMES[type(message)]} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}"
+        )
+    return [header]
+
+
+def encode_sample(
+    *,
+    epoch: int,
+    index: int,
+    arrays: Mapping[str, npt.NDArray[Any]],
+    provenance: Mapping[str, Any],
+    worker: str,
+    cpu_seconds: float,
+) -> Frames:
+    """A whole SampleHeader message. The arrays are not copied: leave them alone until they are sent.
+
+    Raises:
+        LimitExceeded: an array dtype that is not on the allow-list, or an array that is not C-contiguous.
+    """
+    shapes: list[int] = []
+    for name, array in arrays.items():
+        if array.dtype.name not in ARRAY_DTYPES or not array.flags.c_contiguous:
+            raise LimitExceeded(f"array {name}: dtype {array.dtype} (allowed: {', '.join(ARRAY_DTYPES)}), C-contiguous")
+        shapes += [array.ndim, *array.shape]
+    header = SampleHeader(
+        epoch=epoch,
+        index=index,
+        names=tuple(arrays),
+        dtypes=tuple(array.dtype.name for array in arrays.values()),
+        shapes=tuple(shapes),
+        provenance=provenance,
+        worker=worker,
+        cpu_seconds=cpu_seconds,
+    )
+    return [*encode(header), *(array.reshape(-1).view(np.uint8).data for array in arrays.values())]
+
+
+def decode(header: Buffer) -> Message:
+    """The message in a header frame.
+
+    Raises:
+        VersionMismatch: the peer speaks another version.
+        LimitExceeded: the frame, or a list in it, is too large.
+        ProtocolError: anything else that is not a message of ours.
+    """
+    if len(header) > LARGEST_HEADER_BYTES:
+        raise LimitExceeded(f"a header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
+    try:
+        fields = msgpack.unpackb(header, raw=False, strict_map_key=True, use_list=True)
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        # msgpack's own errors quote raw bytes; the kind of damage is enough.
+        raise ProtocolError(f"not a message: {type(error).__name__}") from error
+    if not isinstance(fields, dict) or "v" not in fields or "t" not in fields:
+        raise ProtocolError("not a message: no version or type")
+    version = fields.pop("v")
+    if version != PROTOCOL_VERSION or type(version) is not int:
+        raise VersionMismatch(f"the peer speaks protocol version {version!r:.40}, this side version {PROTOCOL_VERSION}")
+    name = fields.pop("t")
+    cls = _TYPES.get(name) if isinstance(name, str) else None
+    if cls is None:
+        raise ProtocolError(f"unknown message type {name!r:.40}")
+    checks = _CHECKS[cls]
+    if fields.keys() != checks.keys():
+        raise ProtocolError(f"{name}: fields {sorted(map(str, fields))[:40]!r:.400}, expected {sorted(checks)}")
+    message: Message = cls(**{key: checks[key](f"{name}.{key}", value) for key, value in fields.items()})
+    return message
+
+
+def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, npt.NDArray[Any]]:
+    """The arrays behind a SampleHeader, as read-only views of the payload (no copy).
+
+    Raises:
+        ProtocolError, LimitExceeded: names, dtypes, shapes and frame lengths do not agree, or break a limit.
+    """
+    if not len(header.names) == len(header.dtypes) == len(payload):
+        raise ProtocolError(
+            f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
+        )
+    if len(payload) > _MOST_ARRAYS or len(set(header.names)) != len(header.names):
+        raise LimitExceeded(f"sample: arrays {list(header.names)!r:.200}; at most {_MOST_ARRAYS}, no name twice")
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    rest = list(header.shapes)
+    for name, dtype, raw in zip(header.names, header.dtypes, payload, strict=True):
+        if dtype not in ARRAY_DTYPES:
+            raise ProtocolError(
+                f"sample: array {name!r:.40} of dtype {dtype!r:.40}; allowed: {', '.join(ARRAY_DTYPES)}"
+            )
+        ndim = rest.pop(0) if rest else 0
+        shape, rest = tuple(rest[:ndim]), rest[ndim:]
+        if len(shape) != ndim or not 0 < ndim <= _MOST_DIMENSIONS:
+            raise ProtocolError(f"sample: array {name!r:.40} has no complete shape")
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size > LARGEST_ARRAY_BYTES:
+            raise LimitExceeded(f"sample: array {name!r:.40} of {size} bytes; the limit is {LARGEST_ARRAY_BYTES}")
+        if size != len(raw):
+            raise ProtocolError(f"sample: array {name!r:.40} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
+        array = np.frombuffer(raw, dtype=np.dtype(dtype)).reshape(shape)
+        array.flags.writeable = False
+        arrays[name] = array
+    if rest:
+        raise ProtocolError(f"sample: {len(rest)} extents belong to no array")
+    return arrays
+
+
+# --- field checks -----------------------------------------------------------------------------------------------------
+
+Check: TypeAlias = Callable[[str, Any], Any]
+
+
+def _exactly(kind: type[Any]) -> Check:
+    def check(name: str, value: Any) -> Any:
+        if type(value) is not kind:
+            raise ProtocolError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        return value
+
+    return check
+
+
+def _int(name: str, value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**64:
+        raise ProtocolError(f"{name}: expected a whole number from 0 to 2**64 - 1, got {value!r:.40}")
+    return value
+
+
+def _float(name: str, value: Any) -> float:
+    if type(value) not in (float, int) or not math.isfinite(value):
+        raise ProtocolError(f"{name}: expected a finite number, got {value!r:.40}")
+    return float(value)
+
+
+def _int_or_none(name: str, value: Any) -> int | None:
+    return None if value is None else _int(name, value)
+
+
+def _tuple_of(check: Check) -> Check:
+    def check_all(name: str, value: Any) -> tuple[Any, ...]:
+        if type(value) is not list:
+            raise ProtocolError(f"{name}: expected a list, got {type(value).__name__}")
+        if len(value) > LARGEST_TUPLE:
+            raise LimitExceeded(f"{name}: {len(value)} entries; the limit is {LARGEST_TUPLE}")
+        return tuple(check(name, item) for item in value)
+
+    return check_all
+
+
+_BY_ANNOTATION: dict[str, Check] = {
+    "int": _int,
+    "float": _float,
+    "bool": _exactly(bool),
+    "str": _exactly(str),
+    "bytes": _exactly(bytes),
+    "int | None": _int_or_none,
+    "tuple[int, ...]": _tuple_of(_int),
+    "tuple[str, ...]": _tuple_of(_exactly(str)),
+    "Mapping[str, Any]": _exactly(dict),
+}
+_CHECKS: dict[type[Any], dict[str, Check]] = {
+    # Annotations are strings here (postponed evaluation), which makes them keys of a closed vocabulary: a message
+    # with a field type the wire does not check fails at import.
+    cls: {field.name: _BY_ANNOTATION[str(field.type)] for field in dataclasses.fields(cls)}
+    for cls in _TYPES.values()
+}

@@ -1,0 +1,153 @@
+"""The command lines of the server: arguments -> configuration -> call.
+
+Exit status: 0 success, 1 the command could not do its work, 2 wrong usage or input, 130 interrupted. Errors are one
+line on stderr; `--debug` shows the trace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.recipe import PRESETS
+from v2v_protocol.sample import ARRAYS
+from v2v_protocol.spec import VOXEL_DTYPES
+from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
+
+
+def serve(argv: Sequence[str] | None = None) -> None:
+    """`v2v-serve`."""
+    parser = _parser("v2v-serve", "Decode videos, simulate event voxels, stream samples to trainers.")
+    parser.add_argument(
+        "--videos", metavar="DIR", help="folder of videos (searched recursively), a video, or a list file"
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="local worker processes (default 2)")
+    parser.add_argument("--config", metavar="FILE", help="YAML file of these settings; a flag wins over it")
+    parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts --videos")
+    parser.add_argument(
+        "--rows", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid), top:180px, 0.1:0.6"
+    )
+    parser.add_argument(
+        "--bind", metavar="ADDRESS", help=f"address for consumers (default {DEFAULT_BIND}; port * is a free one)"
+    )
+    parser.add_argument("--worker-bind", metavar="ADDRESS", help="address for workers (default: private to this host)")
+    parser.add_argument(
+        "--insecure", action="store_true", default=None, help="allow addresses other machines can reach"
+    )
+    parser.add_argument("--port-file", metavar="FILE", help="receives the bound address once the server is ready")
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    _add_recipe(parser)
+    parser.add_argument("--voxel-dtype", choices=VOXEL_DTYPES, help="default int8: saturating, and counted")
+    parser.add_argument("--no-shuffle", dest="shuffle", action="store_false", default=None, help="catalogue order")
+    parser.add_argument("--max-sequences-per-video", type=int, metavar="N", help="per epoch (default 10)")
+    parser.add_argument("--on-bad-video", choices=("substitute", "raise"), help="default substitute")
+    parser.add_argument(
+        "--lease-deadline-seconds", type=float, metavar="S", help="a worker silent for longer hangs (60)"
+    )
+    parser.add_argument(
+        "--session-idle-seconds", type=float, metavar="S", help="forget consumers silent for longer (600)"
+    )
+    parser.add_argument("--max-credit-bytes", type=int, metavar="N", help="bytes in flight to one consumer (2 GiB)")
+
+    def run(arguments: argparse.Namespace) -> None:
+        from v2v_server.serve import serve as run_server
+
+        flags = {name: value for name, value in vars(arguments).items() if name not in ("debug", "config", "set")}
+        flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
+        run_server(ServeConfig.load(arguments.config, flags))
+
+    _main(parser, run, argv)
+
+
+def worker(argv: Sequence[str] | None = None) -> None:
+    """`v2v-worker`."""
+    parser = _parser("v2v-worker", "Work for a server: take leases, make samples.")
+    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
+    parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus folder on this host")
+    parser.add_argument("--name", help="unique name (default: host and process id)")
+    parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
+
+    def run(arguments: argparse.Namespace) -> None:
+        from v2v_server.worker import run_worker
+
+        run_worker(arguments.connect, Path(arguments.videos), arguments.name, arguments.parent_pid)
+
+    _main(parser, run, argv)
+
+
+def simulate(argv: Sequence[str] | None = None) -> None:
+    """`v2v-simulate`."""
+    parser = _parser("v2v-simulate", "Make one sample in this process: the same bytes a server would stream.")
+    parser.add_argument("video", metavar="VIDEO", help="a video; or a folder or list file, to remake a streamed sample")
+    parser.add_argument(
+        "--out", required=True, metavar="FILE.npz", help="receives voxels, frames and provenance (JSON)"
+    )
+    parser.add_argument("--picture", metavar="FILE.png", help="also draw frames and voxels")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--epoch", type=int, default=0)
+    parser.add_argument("--index", type=int, default=0, help="global index in the epoch")
+    parser.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
+    parser.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    parser.add_argument("--arrays", default=",".join(ARRAYS), help=f"comma separated, default {','.join(ARRAYS)}")
+    parser.add_argument("--voxel-dtype", choices=VOXEL_DTYPES, default="int8")
+    _add_recipe(parser)
+
+    def run(arguments: argparse.Namespace) -> None:
+        from v2v_server.remake import simulate_to_file
+
+        simulate_to_file(
+            arguments.video,
+            out=Path(arguments.out),
+            picture=None if arguments.picture is None else Path(arguments.picture),
+            list_file=arguments.list,
+            rows=arguments.rows,
+            recipe=recipe_setting(arguments.recipe, arguments.set),
+            voxel_dtype=arguments.voxel_dtype,
+            arrays=tuple(arguments.arrays.split(",")),
+            seed=arguments.seed,
+            epoch=arguments.epoch,
+            index=arguments.index,
+        )
+
+    _main(parser, run, argv)
+
+
+def _parser(name: str, description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=name, description=description)
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    return parser
+
+
+def _add_recipe(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--recipe", metavar="NAME", help=f"preset ({', '.join(PRESETS)}) or YAML file of recipe fields")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change one recipe field, e.g. voxels_per_clip=5",
+    )
+
+
+def _main(
+    parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], None], argv: Sequence[str] | None
+) -> None:
+    arguments = parser.parse_args(argv)
+    try:
+        run(arguments)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except V2VError as error:
+        if arguments.debug:
+            raise
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
+
+
+_COMMANDS = {"serve": serve, "worker": worker, "simulate": simulate}
+
+if __name__ == "__main__":
+    _COMMANDS[sys.argv[1]](sys.argv[2:])

@@ -1,0 +1,58 @@
+"""From an index to the lease that describes the work: everything a worker on any host needs, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from v2v_protocol.messages import Lease
+from v2v_protocol.spec import StreamSpec
+from v2v_server.leases import Task
+from v2v_server.schedule import Schedule
+from v2v_server.video.catalogue import Catalogue
+
+
+def describe(
+    task: Task,
+    *,
+    number: int,
+    catalogue: Catalogue,
+    schedule: Schedule,
+    spec: StreamSpec,
+    seed: int,
+    arrays: tuple[str, ...],
+    deadline_seconds: float,
+) -> Lease:
+    """The lease for one task.
+
+    Raises:
+        CorpusError: the catalogue's index can no longer be read.
+    """
+    sequence = schedule.candidate(seed, task.epoch, task.index, task.candidate)
+    video = sequence.video
+    thresholds: tuple[str, ...] = ()
+    if video.threshold_pos is not None and video.threshold_neg is not None:
+        thresholds = (video.threshold_pos.hex(), video.threshold_neg.hex())
+    index = catalogue.frame_index(video.id).slice(sequence.start_frame, spec.recipe.frames_needed)
+    return Lease(
+        lease=number,
+        reply_to=task.session,
+        spec=spec.canonical(),
+        spec_digest=spec.digest,
+        catalogue_digest=catalogue.digest,
+        seed=seed,
+        epoch=task.epoch,
+        indices=(task.index,),
+        arrays=arrays,
+        video=video.id,
+        fingerprint=video.fingerprint,
+        rows=str(catalogue.rows),
+        width_px=video.width_px,
+        height_px=video.height_px,
+        frames_per_second=video.frames_per_second,
+        thresholds=thresholds,
+        start_frame=sequence.start_frame,
+        frame_index=index.to_bytes(),
+        candidate=task.candidate,
+        refusals={"refusals": [dataclasses.asdict(refusal) for refusal in task.refusals]},
+        deadline_seconds=deadline_seconds,
+    )

@@ -1,0 +1,60 @@
+"""What the server counts about itself. Every number has one owner: the dispatcher counts, everything else reads."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class Counters:
+    """Totals since the start.
+
+    Attributes:
+        samples: samples handed to consumers.
+        batches: the same in batches of each consumer's own size (a fraction while one is filling).
+        bytes: payload bytes of those samples.
+        worker_cpu_seconds: processor time the workers took for them.
+        refused_candidates: videos passed over because they could not give what they promised.
+        unavailable: samples that no candidate could give.
+        returned_leases: leases taken back from workers that died, hung or left.
+        late_results: answers to leases that had been taken back.
+        workers_lost: workers that died or were given up.
+        malformed: messages that were none.
+    """
+
+    samples: int = 0
+    batches: float = 0.0
+    bytes: int = 0
+    worker_cpu_seconds: float = 0.0
+    refused_candidates: int = 0
+    unavailable: int = 0
+    returned_leases: int = 0
+    late_results: int = 0
+    workers_lost: int = 0
+    malformed: int = 0
+
+    @property
+    def faults(self) -> int:
+        """Everything that went wrong and was survived."""
+        return self.refused_candidates + self.unavailable + self.workers_lost + self.malformed
+
+
+class Rate:
+    """Events a second over the last few seconds.
+
+    Args:
+        window_seconds: how far back it looks.
+    """
+
+    def __init__(self, window_seconds: float) -> None:
+        self._window_seconds = window_seconds
+        self._points: deque[tuple[float, float]] = deque()
+
+    def update(self, now: float, total: float) -> float:
+        """Notes the running total and returns the rate since the window's beginning (0.0 before two notes)."""
+        self._points.append((now, total))
+        while len(self._points) > 2 and now - self._points[0][0] > self._window_seconds:
+            self._points.popleft()
+        (then, before), (_, after) = self._points[0], self._points[-1]
+        return (after - before) / (now - then) if now > then else 0.0

@@ -1,0 +1,174 @@
+"""The pool of local worker processes: spawn, watch, restart with backoff, stop. Who spawns also reaps.
+
+Workers are started as programs of their own (never forked), in their own process group so that Ctrl-C in a terminal
+reaches only the server, and die with the server even when it is killed.
+
+A worker that dies is started again after a delay that doubles with every death in a row. When the workers die again and
+again without a single sample being finished, something is wrong that restarting does not mend, and the pool says so.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2v_protocol.errors import WorkerCrashLoop
+
+_FIRST_BACKOFF_SECONDS = 0.2
+_LONGEST_BACKOFF_SECONDS = 10.0
+_CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True, slots=True)
+class Death:
+    """A worker process that ended without being asked to.
+
+    Attributes:
+        identity: its routing identity.
+        status: what the operating system said, in words.
+        blame: the same, when the sample it was at may be to blame; None when it was killed from outside.
+    """
+
+    identity: bytes
+    status: str
+    blame: str | None
+
+
+@dataclass(slots=True)
+class _Slot:
+    process: subprocess.Popen[bytes] | None = None
+    identity: bytes = b""
+    generation: int = 0
+    given_up: bool = False
+    start_at: float = 0.0
+
+
+class Pool:
+    """Keeps a number of worker processes running.
+
+    Args:
+        workers: how many.
+        root: the corpus folder.
+        address: where the server listens for workers.
+        label: prefix of the workers' names, unique to this server.
+    """
+
+    def __init__(self, workers: int, root: Path, address: str, label: str) -> None:
+        self._slots = [_Slot() for _ in range(workers)]
+        self._root = root
+        self._address = address
+        self._label = label
+        self._deaths_in_a_row = 0
+        self._samples_seen = 0
+
+    @property
+    def crash_budget(self) -> int:
+        """Deaths in a row, without any finished sample between them, that are survived."""
+        return 3 * len(self._slots) + 4
+
+    @property
+    def running(self) -> int:
+        """Processes that are alive."""
+        return sum(slot.process is not None and slot.process.poll() is None for slot in self._slots)
+
+    def pids(self) -> list[int]:
+        """Process ids of the workers that are alive."""
+        return [slot.process.pid for slot in self._slots if slot.process is not None and slot.process.poll() is None]
+
+    def check(self, now: float, samples: int) -> list[Death]:
+        """Reaps the dead and starts what is due. To be called a few times a second.
+
+        Args:
+            now: the time, seconds.
+            samples: samples finished so far by all workers; any progress forgives earlier deaths.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        if samples > self._samples_seen:
+            self._samples_seen = samples
+            self._deaths_in_a_row = 0
+        deaths = []
+        for number, slot in enumerate(self._slots):
+            if slot.process is not None and slot.process.poll() is not None:
+                death = _post_mortem(slot.identity, slot.process.returncode)
+                self._deaths_in_a_row += 1
+                if self._deaths_in_a_row > self.crash_budget:
+                    raise WorkerCrashLoop(
+                        f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
+                        f"{self.crash_budget}); the last one {death.status}. What they printed is above; "
+                        f"`v2v-simulate` on one of the videos shows the same in one process"
+                    )
+                delay = min(_FIRST_BACKOFF_SECONDS * 2 ** (self._deaths_in_a_row - 1), _LONGEST_BACKOFF_SECONDS)
+                slot.process, slot.start_at = None, now + delay
+                if not slot.given_up:
+                    deaths.append(death)
+            if slot.process is None and now >= slot.start_at:
+                self._start(number, slot)
+        return deaths
+
+    def give_up(self, identity: bytes) -> None:
+        """Kills a worker that hangs. The caller has taken its leases back, so its death is not reported again."""
+        for slot in self._slots:
+            if slot.identity == identity and slot.process is not None:
+                slot.given_up = True
+                slot.process.kill()
+
+    def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
+        """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
+        processes = [slot.process for slot in self._slots if slot.process is not None]
+        _wait(processes, join_seconds)
+        for process in processes:
+            if process.poll() is None:
+                process.terminate()
+        _wait(processes, terminate_seconds)
+        for process in processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        for slot in self._slots:
+            slot.process = None
+
+    def _start(self, number: int, slot: _Slot) -> None:
+        slot.generation += 1
+        slot.given_up = False
+        name = f"{self._label}-{number}.{slot.generation}"
+        slot.identity = name.encode()
+        slot.process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "v2v_server.cli", "worker"),
+                *("--connect", self._address, "--videos", str(self._root), "--name", name),
+                *("--parent-pid", str(os.getpid())),
+            ],
+            stdin=subprocess.DEVNULL,
+            env=os.environ | _ONE_THREAD,
+            process_group=0,
+        )
+
+
+def _post_mortem(identity: bytes, returncode: int) -> Death:
+    if returncode >= 0:
+        status = f"exited with status {returncode}"
+        return Death(identity, status, f"a worker {status} over it" if returncode else None)
+    try:
+        name = signal.Signals(-returncode).name
+    except ValueError:
+        name = f"signal {-returncode}"
+    status = f"was ended by {name}"
+    return Death(identity, status, f"a worker {status} over it" if -returncode in _CRASH_SIGNALS else None)
+
+
+def _wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return

@@ -1,0 +1,118 @@
+"""From a lease to its samples: decode, view, simulate.
+
+Server workers and `v2v-simulate` both come through here, which is why a sample made by either is the same.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_protocol.messages import Lease
+from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId
+from v2v_protocol.spec import StreamSpec
+from v2v_server.simulation import simulate_clip, step_seconds
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.video.decode import check_fingerprint, decode_luma
+from v2v_server.video.index import FrameIndex
+from v2v_server.video.rows import Rows
+
+
+def make_sample(lease: Lease, index: int, root: Path) -> Sample:
+    """Makes one sample of a lease.
+
+    Args:
+        lease: the work.
+        index: one of ``lease.indices``.
+        root: folder that the catalogue's ids are relative to, on this host.
+
+    Raises:
+        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
+        ProtocolError: the lease does not fit its form.
+    """
+    spec = _spec(lease.spec)
+    recipe = spec.recipe
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    params = draw(
+        recipe,
+        seed=lease.seed,
+        epoch=lease.epoch,
+        index=index,
+        picture_height_px=bottom - top,
+        picture_width_px=lease.width_px,
+        video_id=lease.video,
+        video_thresholds=_thresholds(lease.thresholds),
+    )
+    source = params.source_index(recipe.steps)
+    path = _below(root, lease.video)
+    try:
+        check_fingerprint(path, lease.fingerprint)
+        clip = decode_luma(
+            path,
+            FrameIndex.from_bytes(lease.frame_index),
+            lease.start_frame,
+            int(source[-1]) + 1,
+            window=source_window(params, recipe, top, bottom - top, lease.width_px),
+        )
+    except VideoError as error:
+        # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
+        raise type(error)(lease.video, error.frame, error.reason) from error
+    view = apply_view(clip.frames, params, recipe)
+
+    seconds, irregular = None, 0
+    if recipe.noise_unit == "second":
+        seconds, irregular = step_seconds(clip.seconds, source, lease.frames_per_second)
+    arrays: dict[str, np.ndarray] = {}
+    saturated = 0
+    for name in lease.arrays:
+        if name == "voxels":
+            arrays[name], saturated = simulate_clip(view, params, recipe, spec.voxel_dtype, seconds)
+        elif name == "frames":
+            arrays[name] = view[source[list(recipe.target_steps)], None]
+        else:
+            raise ProtocolError(f"lease {lease.lease} asks for an array {name!r} that this worker does not make")
+    return Sample(
+        arrays=arrays,
+        provenance=Provenance(
+            id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
+            video=lease.video,
+            fingerprint=lease.fingerprint,
+            start_frame=lease.start_frame,
+            candidate=lease.candidate,
+            refusals=_refusals(lease),
+            params=params,
+            saturated_bins=saturated,
+            irregular_timestamps=irregular,
+            decoder=clip.codec if clip.bit_exact else f"{clip.codec} (host-dependent)",
+        ),
+    )
+
+
+@lru_cache(maxsize=16)
+def _spec(canonical: bytes) -> StreamSpec:
+    return StreamSpec.from_dict(json.loads(canonical))
+
+
+def _thresholds(texts: tuple[str, ...]) -> tuple[float, float] | None:
+    if not texts:
+        return None
+    positive, negative = (float.fromhex(text) for text in texts)
+    return positive, negative
+
+
+def _refusals(lease: Lease) -> tuple[Refusal, ...]:
+    return tuple(Refusal(**item) for item in lease.refusals["refusals"])
+
+
+def _below(root: Path, video: str) -> Path:
+    """The file of a catalogue id, which may not lead out of the root whatever a message says."""
+    relative = PurePosixPath(video)
+    if relative.is_absolute() or ".." in relative.parts:
+        raise ProtocolError(f"video id {video!r} leads out of the corpus folder")
+    return root.joinpath(relative)

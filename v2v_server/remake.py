@@ -1,0 +1,119 @@
+"""Any sample of any stream, made in this process: what `v2v-simulate` does, and how a test or a bug report remakes a
+sample that a trainer saw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError
+from v2v_protocol.sample import Refusal, Sample, SampleId, array_layout
+from v2v_protocol.spec import StreamSpec
+from v2v_server.jobs import describe
+from v2v_server.leases import Task
+from v2v_server.picture import draw_sample, write_png
+from v2v_server.produce import make_sample
+from v2v_server.schedule import MOST_CANDIDATES, Schedule
+from v2v_server.sequences import SequenceTable
+from v2v_server.video.catalogue import Catalogue, open_catalogue
+from v2v_server.video.rows import Rows
+
+
+def remake(
+    catalogue: Catalogue,
+    spec: StreamSpec,
+    *,
+    seed: int,
+    epoch: int,
+    index: int,
+    arrays: tuple[str, ...] = ("voxels", "frames"),
+) -> Sample:
+    """The sample of an identity: the same bytes a server streams, candidates and refusals included.
+
+    Args:
+        catalogue: the corpus.
+        spec: the stream's spec.
+        seed, epoch, index: the rest of the identity.
+        arrays: which arrays to make.
+
+    Raises:
+        UsageError: an index outside the epoch, or arrays nobody makes.
+        CorpusError: no video gives a sequence.
+        SampleUnavailable: no candidate could give the sample.
+    """
+    array_layout(spec.recipe, spec.voxel_dtype, arrays)
+    SampleId(spec.digest, catalogue.digest, 0, seed, epoch, index)
+    table = SequenceTable(catalogue.videos, catalogue.rows, spec)
+    if not table.count:
+        story = "; ".join(
+            f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
+        )
+        raise CorpusError(f"no video gives a sequence: {story}")
+    if index >= table.count:
+        raise UsageError(f"index {index}: the epoch has {table.count} sequences, 0 .. {table.count - 1}")
+    schedule = Schedule(table, shuffle=spec.shuffle)
+    task = Task(b"", epoch, index)
+    most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
+    while task.candidate < most:
+        lease = describe(
+            task,
+            number=1,
+            catalogue=catalogue,
+            schedule=schedule,
+            spec=spec,
+            seed=seed,
+            arrays=arrays,
+            deadline_seconds=60.0,
+        )
+        try:
+            return make_sample(lease, index, catalogue.root)
+        except VideoError as error:
+            refusal = Refusal(task.candidate, lease.video, error.frame, error.reason)
+            task = replace(task, candidate=task.candidate + 1, refusals=(*task.refusals, refusal))
+    raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
+
+
+def simulate_to_file(
+    source: str,
+    *,
+    out: Path,
+    picture: Path | None,
+    list_file: str | None,
+    rows: str,
+    recipe: Any,
+    voxel_dtype: str,
+    arrays: tuple[str, ...],
+    seed: int,
+    epoch: int,
+    index: int,
+) -> None:
+    """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
+
+    Raises:
+        UsageError, CorpusError, SampleUnavailable: see :func:`remake`; or a file cannot be written.
+    """
+    spec = StreamSpec.from_dict({"recipe": recipe, "voxel_dtype": voxel_dtype})
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows))
+    for problem in catalogue.problems:
+        print(f"cannot be used: {problem.id}: {problem.reason}")
+    sample = remake(catalogue, spec, seed=seed, epoch=epoch, index=index, arrays=arrays)
+    provenance = sample.provenance.to_dict()
+    content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
+    try:
+        np.savez_compressed(out, **content)
+        if picture is not None:
+            write_png(picture, draw_sample(sample))
+    except OSError as error:
+        raise UsageError(f"{error.filename or out}: {error.strerror}") from error
+    params = sample.provenance.params
+    print(
+        f"{sample.provenance.video} from frame {sample.provenance.start_frame}: "
+        + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
+        + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
+        f"{params.hot_pixel_count} hot pixels, {sample.provenance.saturated_bins} bins saturated; written to {out}"
+    )

@@ -1,0 +1,102 @@
+"""Which sequences of which videos a spec may draw samples from.
+
+A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
+start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import accumulate
+
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
+from v2v_server.simulation.draw import admits, smallest_scale
+from v2v_server.video.catalogue import VideoEntry
+from v2v_server.video.rows import Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A video that gives this spec no sequence: why, and which setting would admit it."""
+
+    video: str
+    reason: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """One run of frames: the video and its first frame."""
+
+    video: VideoEntry
+    start_frame: int
+
+
+class SequenceTable:
+    """All sequences of a corpus under one spec, in catalogue order, looked up by rank.
+
+    Args:
+        videos: the catalogue's entries, in its order.
+        rows: the rows of each picture that may be used.
+        spec: says how many frames a sequence needs and how large the crop is.
+
+    Attributes:
+        count: N, sequences in all.
+        rejections: the videos that give none.
+    """
+
+    def __init__(self, videos: Iterable[VideoEntry], rows: Rows, spec: StreamSpec) -> None:
+        self._stride = spec.recipe.frames_per_sequence
+        admitted: list[VideoEntry] = []
+        counts: list[int] = []
+        rejections: list[Rejection] = []
+        for video in videos:
+            rejection = _rejection(video, rows, spec.recipe)
+            if rejection is not None:
+                rejections.append(rejection)
+                continue
+            fit = (video.frames - spec.recipe.frames_needed) // self._stride + 1
+            admitted.append(video)
+            counts.append(min(fit, spec.max_sequences_per_video))
+        self._videos = tuple(admitted)
+        self._ends = tuple(accumulate(counts))
+        self.count = self._ends[-1] if self._ends else 0
+        self.rejections = tuple(rejections)
+
+    @property
+    def videos(self) -> int:
+        """Videos that give at least one sequence."""
+        return len(self._videos)
+
+    def __getitem__(self, rank: int) -> Sequence:
+        """The sequence of that rank, 0 .. count-1.
+
+        Raises:
+            IndexError: rank is outside.
+        """
+        if not 0 <= rank < self.count:
+            raise IndexError(f"sequence {rank} of {self.count}")
+        video = bisect_right(self._ends, rank)
+        first = self._ends[video - 1] if video else 0
+        return Sequence(self._videos[video], (rank - first) * self._stride)
+
+
+def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | None:
+    needed = recipe.frames_needed
+    if video.frames < needed:
+        most = (video.frames - 1) // (recipe.bins * recipe.frames_per_bin) - recipe.lead_voxels
+        remedy = f"voxels_per_clip at most {most}" if most >= 1 else "fewer bins or frames_per_bin"
+        return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy)
+    top, bottom = rows.bounds(video.height_px)
+    height, width = bottom - top, video.width_px
+    if not admits(recipe, height, width):
+        scale = smallest_scale(recipe, height, width)
+        return Rejection(
+            video.id,
+            f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}",
+            f"resize_scale up to {scale:.3g}, or a smaller crop",
+        )
+    return None

@@ -1,0 +1,87 @@
+"""What a person sees of a running server: the summary at the start and one live line."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from typing import TextIO
+
+from v2v_protocol.spec import StreamSpec
+from v2v_server.dispatcher import Dispatcher
+from v2v_server.metrics import Rate
+from v2v_server.sequences import SequenceTable
+from v2v_server.video.catalogue import Catalogue
+
+_SHOWN = 5
+_LIVE_SECONDS = 0.5
+_LOG_SECONDS = 10.0
+
+
+def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> list[str]:
+    """Lines that say how many sequences there are, which videos give none, and which setting would admit them."""
+    recipe = spec.recipe
+    lines = [
+        f"{len(catalogue.videos)} videos in {catalogue.root}: {table.videos} give {table.count} sequences of "
+        f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
+    ]
+    if table.rejections:
+        lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
+        by_remedy = Counter(rejection.remedy for rejection in table.rejections)
+        for rejection in table.rejections[:_SHOWN]:
+            lines.append(f"  {rejection.video}: {rejection.reason}; would admit it: {rejection.remedy}")
+        if len(table.rejections) > _SHOWN:
+            common = "; ".join(f"{remedy} ({count})" for remedy, count in by_remedy.most_common(3))
+            lines.append(f"  ... and {len(table.rejections) - _SHOWN} more; most frequent remedies: {common}")
+    if catalogue.problems:
+        lines.append(f"{len(catalogue.problems)} files cannot be used at all:")
+        lines += [f"  {problem.id}: {problem.reason}" for problem in catalogue.problems[:_SHOWN]]
+        if len(catalogue.problems) > _SHOWN:
+            lines.append(f"  ... and {len(catalogue.problems) - _SHOWN} more")
+    return lines
+
+
+class StatusLine:
+    """One line that is kept up to date on a terminal, or printed every ten seconds into a log.
+
+    Args:
+        stream: where to.
+    """
+
+    def __init__(self, stream: TextIO = sys.stderr) -> None:
+        self._stream = stream
+        self._live = stream.isatty()
+        self._period = _LIVE_SECONDS if self._live else _LOG_SECONDS
+        self._next = 0.0
+        self._batches = Rate(window_seconds=5.0)
+        self._samples = Rate(window_seconds=5.0)
+        self._width = 0
+
+    def update(self, now: float, dispatcher: Dispatcher, running: int) -> None:
+        """Shows the state if it is time to."""
+        if now < self._next:
+            return
+        self._next = now + self._period
+        self._show(self._text(now, dispatcher, running))
+
+    def close(self) -> None:
+        """Leaves the last line standing."""
+        if self._live and self._width:
+            self._stream.write("\n")
+            self._stream.flush()
+
+    def _text(self, now: float, dispatcher: Dispatcher, running: int) -> str:
+        counters = dispatcher.counters
+        return (
+            f"{self._batches.update(now, counters.batches):.2f} batches/s  "
+            f"{self._samples.update(now, counters.samples):.1f} samples/s  "
+            f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
+            f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
+        )
+
+    def _show(self, text: str) -> None:
+        if self._live:
+            self._stream.write("\r" + text.ljust(self._width))
+            self._width = len(text)
+        else:
+            self._stream.write(text + "\n")
+        self._stream.flush()

@@ -1,0 +1,170 @@
+"""The server worker: takes a lease, makes its samples, sends them, takes the next.
+
+It holds two leases at a time, so that the next one is at hand when a sample is done; sending happens in ZeroMQ's own
+thread while the next sample is made. Its life is in others' hands: it may be killed at any moment, and does nothing
+that would have to be undone.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import time
+from collections import deque
+from pathlib import Path
+
+import cv2
+import zmq
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import CorpusError, ProtocolError, RemoteError, UsageError, V2VError, VideoError
+from v2v_protocol.messages import (
+    Begun,
+    ErrorCode,
+    Goodbye,
+    JobFailed,
+    Lease,
+    Message,
+    Ping,
+    Refused,
+    Result,
+    Stop,
+    WorkerHello,
+)
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, encode_sample
+from v2v_server.process import die_with_parent, keep_freed_memory
+from v2v_server.produce import make_sample
+
+CREDIT = 2
+_PING_SECONDS = 5.0
+
+
+class Worker:
+    """One worker's conversation with the server.
+
+    Args:
+        name: unique name, also its routing identity.
+        root: the corpus folder on this host.
+        address: where the server listens for workers.
+    """
+
+    def __init__(self, name: str, root: Path, address: str) -> None:
+        self._name = name
+        self._root = root
+        self._leases: deque[Lease] = deque()
+        self._stopping = False
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        self._socket.setsockopt(zmq.LINGER, 5000)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
+        # Leases bound what is queued: at most CREDIT samples in either direction.
+        self._socket.setsockopt(zmq.SNDHWM, 0)
+        self._socket.setsockopt(zmq.RCVHWM, 0)
+        self._socket.setsockopt(zmq.IPV6, 1)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+
+    def run(self) -> None:
+        """Works until told to stop.
+
+        Raises:
+            RemoteError: the server refuses this worker (another version).
+        """
+        try:
+            self._say_hello()
+            while not self._stopping:
+                self._receive(0.0 if self._leases else _PING_SECONDS)
+                if self._leases and not self._stopping:
+                    self._work(self._leases.popleft())
+            self._send(encode(Goodbye()))
+        finally:
+            self._context.destroy()
+
+    def _say_hello(self) -> None:
+        hello = WorkerHello(self._name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT)
+        self._send(encode(hello))
+
+    def _receive(self, wait_seconds: float) -> None:
+        """Takes every message that is there, waiting for the first one at most this long."""
+        timeout = int(wait_seconds * 1000)
+        if not self._socket.poll(timeout):
+            if timeout:
+                self._send(encode(Ping()))
+            return
+        while self._socket.poll(0):
+            frames = self._socket.recv_multipart()
+            try:
+                self._handle(decode(frames[0]))
+            except ProtocolError as error:
+                print(f"{self._name}: ignored a message from the server: {error}", file=sys.stderr)
+
+    def _handle(self, message: Message) -> None:
+        match message:
+            case Lease():
+                self._leases.append(message)
+            case Stop():
+                self._stopping = True
+            case Refused(ErrorCode.UNKNOWN_SESSION):
+                # The server was restarted, or had given us up: what we hold has been given to others.
+                self._leases.clear()
+                self._say_hello()
+            case Refused(code, text):
+                raise RemoteError(code, text)
+            case _:
+                pass
+
+    def _work(self, lease: Lease) -> None:
+        self._send(encode(Begun(lease.lease)))
+        for index in lease.indices:
+            started = time.process_time()
+            try:
+                sample = make_sample(lease, index, self._root)
+            except VideoError as error:
+                self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
+                return
+            except (V2VError, MemoryError, ValueError, ArithmeticError, LookupError, TypeError, OSError) as error:
+                # Not foreseen, so not the video's fault for certain; but this video and this draw brought it about,
+                # and the stream must go on. The reason travels in the provenance and the server's log.
+                self._send(encode(JobFailed(lease.lease, None, f"{type(error).__name__}: {error}"[:500])))
+                return
+            cpu_seconds = time.process_time() - started
+            frames = encode_sample(
+                epoch=lease.epoch,
+                index=index,
+                arrays=sample.arrays,
+                provenance=sample.provenance.to_dict(),
+                worker=self._name,
+                cpu_seconds=cpu_seconds,
+            )
+            self._send([*encode(Result(lease.lease, index, cpu_seconds)), *frames])
+
+    def _send(self, frames: Frames) -> None:
+        self._socket.send_multipart(frames, copy=False)
+
+
+def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None) -> None:
+    """Runs one worker in this process until the server stops it.
+
+    Args:
+        address: where the server listens for workers.
+        root: the corpus folder on this host.
+        name: unique name; by default host and process id.
+        parent_pid: the server, when this is one of its own processes: we die with it.
+
+    Raises:
+        CorpusError: the folder is missing.
+        UsageError: the address cannot be connected to.
+        RemoteError: the server refuses this worker.
+    """
+    if parent_pid is not None:
+        die_with_parent(parent_pid)
+    if not root.is_dir():
+        raise CorpusError(f"--videos {root}: no such folder on this host")
+    keep_freed_memory()
+    cv2.setNumThreads(1)
+    Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address).run()
