@@ -194,7 +194,7 @@ class Lease:
         fingerprint: what the file must still be.
         rows: rows of the picture that may be used, ``Rows`` syntax.
         width_px, height_px: of the upright picture, before rows.
-        frames_per_second: average rate, for noise stated per second.
+        frames_per_second: average rate, for noise stated per second; 0 where unknown.
         thresholds: (positive, negative) as float.hex() when the corpus states them for this video, else empty.
         start_frame: first frame of the sequence.
         frame_index: ``FrameIndex.to_bytes()`` of the part of the file that is needed.

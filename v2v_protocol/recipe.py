@@ -30,6 +30,7 @@ Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""
 
 _LARGEST_FRAMES = 1_000_001
+LARGEST_SCALE = 100.0
 _LARGEST_SIDE_PX = 16_384
 
 
@@ -161,7 +162,7 @@ class Recipe:
         base = preset(rest.pop("preset", DEFAULT_PRESET))
         return base.replace(**rest)
 
-    def replace(self, **changes: Any) -> Recipe:
+    def replace(self, /, **changes: Any) -> Recipe:
         """This recipe with some fields changed.
 
         Raises:
@@ -182,7 +183,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "lead_voxels": (0, 1),
     "crop_height_px": (1, _LARGEST_SIDE_PX),
     "crop_width_px": (1, _LARGEST_SIDE_PX),
-    "resize_scale": (0.01, 100.0),
+    "resize_scale": (0.01, LARGEST_SCALE),
     "flip_probability": (0.0, 1.0),
     "pause_probability": (0.0, 1.0),
     "pause_stay_probability": (0.0, 1.0),
@@ -237,7 +238,8 @@ def _number(name: str, value: Any) -> float:
         number = math.inf
     if not math.isfinite(number):
         raise RecipeError(f"recipe {name} = {value!r}: give a finite number")
-    return number
+    # Minus zero equals zero, but would not give the same digest.
+    return number + 0.0
 
 
 def _shown(value: Any) -> str:

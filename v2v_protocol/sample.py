@@ -162,7 +162,7 @@ class Provenance:
                 params=SampleParams(**params),
                 **rest,
             )
-        except (KeyError, TypeError, ValueError, UsageError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, UsageError) as error:
             raise ProtocolError(f"provenance of a sample does not fit its form: {error}") from error
 
 

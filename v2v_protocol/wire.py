@@ -47,6 +47,8 @@ LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
 _MOST_ARRAYS = 8
 _MOST_DIMENSIONS = 8
+_DEEPEST_NESTING = 16
+"""Containers within containers. Deeper ones could not even be shown in an error message (RecursionError)."""
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 Frames: TypeAlias = list[Buffer]
@@ -123,7 +125,7 @@ def decode(header: Buffer) -> Message:
 
     Raises:
         VersionMismatch: the peer speaks another version.
-        LimitExceeded: the frame, or a list in it, is too large.
+        LimitExceeded: the frame, or a list in it, is too large, or nested too deeply.
         ProtocolError: anything else that is not a message of ours.
     """
     if len(header) > LARGEST_HEADER_BYTES:
@@ -135,6 +137,7 @@ def decode(header: Buffer) -> Message:
         raise ProtocolError(f"not a message: {type(error).__name__}") from error
     if not isinstance(fields, dict) or "v" not in fields or "t" not in fields:
         raise ProtocolError("not a message: no version or type")
+    _check_nesting(fields)
     version = fields.pop("v")
     if version != PROTOCOL_VERSION or type(version) is not int:
         raise VersionMismatch(f"the peer speaks protocol version {version!r:.40}, this side version {PROTOCOL_VERSION}")
@@ -170,8 +173,8 @@ def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, 
             )
         ndim = rest.pop(0) if rest else 0
         shape, rest = tuple(rest[:ndim]), rest[ndim:]
-        if len(shape) != ndim or not 0 < ndim <= _MOST_DIMENSIONS:
-            raise ProtocolError(f"sample: array {name!r:.40} has no complete shape")
+        if len(shape) != ndim or not 0 < ndim <= _MOST_DIMENSIONS or 0 in shape:
+            raise ProtocolError(f"sample: array {name!r:.40} has no complete shape of extents from 1")
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if size > LARGEST_ARRAY_BYTES:
             raise LimitExceeded(f"sample: array {name!r:.40} of {size} bytes; the limit is {LARGEST_ARRAY_BYTES}")
@@ -188,6 +191,16 @@ def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, 
 # --- field checks -----------------------------------------------------------------------------------------------------
 
 Check: TypeAlias = Callable[[str, Any], Any]
+
+
+def _check_nesting(fields: dict[Any, Any]) -> None:
+    level: list[Any] = [fields]
+    for _ in range(_DEEPEST_NESTING):
+        inner = (item for outer in level for item in (outer.values() if type(outer) is dict else outer))
+        level = [item for item in inner if type(item) in (dict, list)]
+        if not level:
+            return
+    raise LimitExceeded(f"a header nested more than {_DEEPEST_NESTING} deep")
 
 
 def _exactly(kind: type[Any]) -> Check:

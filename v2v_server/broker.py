@@ -48,7 +48,8 @@ class Broker:
     def _router(self, address: str, flag: str, largest_bytes: int) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
-        router.setsockopt(zmq.IPV6, 1)
+        # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
+        router.setsockopt(zmq.IPV6, int("[" in address))
         router.setsockopt(zmq.SNDHWM, 0)
         router.setsockopt(zmq.RCVHWM, 0)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)

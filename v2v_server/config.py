@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import yaml
 
@@ -134,7 +133,7 @@ def recipe_setting(recipe: str | None, settings: list[str]) -> Any:
             raise UsageError(f"--set {setting}: write KEY=VALUE, for instance --set voxels_per_clip=5")
         try:
             fields[key.strip()] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
             raise UsageError(f"--set {setting}: {text!r} is not a value") from error
     return Recipe.from_dict(fields)
 
@@ -149,7 +148,7 @@ def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
         values = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"{flag} {file}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that does not exist
         raise UsageError(f"{flag} {file}: not YAML: {' '.join(str(error).split())[:200]}") from error
     if values is None:
         return {}
@@ -167,9 +166,10 @@ def _check_address(flag: str, address: str, insecure: bool) -> None:
     if scheme == "ipc":
         return
     host, colon, port = rest.rpartition(":")
-    if not colon or not host or not (port in ("*", "0") or (port.isdigit() and 0 < int(port) < 65536)):
+    is_number = port.isascii() and port.isdecimal()
+    if not colon or not host or not (port in ("*", "0") or (is_number and 0 < int(port) < 65536)):
         raise UsageError(f"{flag} {address!r}: write tcp://HOST:PORT with a port from 1 to 65535, or * for a free one")
-    if not insecure and not _is_loopback(urlsplit(f"//{rest.replace('*', '0')}").hostname or host):
+    if not insecure and not _is_loopback(host.removeprefix("[").removesuffix("]")):
         raise UsageError(
             f"{flag} {address} is reachable from other machines, and nothing is encrypted or authenticated: "
             f"bind to 127.0.0.1, or type out --insecure if everyone on that network may use this server"

@@ -6,7 +6,7 @@ sends, the answer is an instruction or a counted fault, never an exception: one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -29,9 +29,9 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
-from v2v_protocol.sample import LARGEST_SEED, Refusal, SampleId, array_layout, layout_bytes
+from v2v_protocol.sample import Refusal, SampleId, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Buffer, Frames, decode, encode
+from v2v_protocol.wire import LARGEST_ARRAY_BYTES, Buffer, Frames, decode, encode
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.metrics import Counters
@@ -43,6 +43,13 @@ from v2v_server.video.catalogue import Catalogue
 MOST_BLAMED_DEATHS = 2
 """A candidate that was in work while this many workers died by their own doing is passed over."""
 MOST_BATCH_SIZE = 65_536
+MOST_SCHEDULES = 16
+"""Schedules kept for consumers to come. Each is a table over all videos; those in use live in their sessions."""
+_LONGEST_TEXT = 2000
+"""Characters of a text that quotes what a peer sent: unlimited, it might not fit into any message."""
+_LONGEST_REASON = 500
+_MOST_CPU_SECONDS = 86_400.0
+"""Of one sample, whatever its worker claims: an absurd number must not unbalance the sharing for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +142,7 @@ class Dispatcher:
         try:
             message = _only(frames)
         except ProtocolError as error:
-            return [self._refuse_malformed(identity, error)]
+            return [ToConsumer(identity, self._malformed(error))]
         session = self.sessions.get(identity)
         if session is not None:
             session.last_heard = now
@@ -147,13 +154,13 @@ class Dispatcher:
             case Goodbye():
                 self.consumer_lost(identity)
                 return []
-            case Want() if session is None:
-                return [_refuse(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
             case Want():
+                if session is None:
+                    return [_refuse(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 return self._want(session, message) or self._assign(now)
             case _:
-                error = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
-                return [self._refuse_malformed(identity, error)]
+                stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
+                return [ToConsumer(identity, self._malformed(stray))]
 
     def consumer_lost(self, identity: bytes) -> None:
         """The consumer left, or cannot be reached any more."""
@@ -164,8 +171,9 @@ class Dispatcher:
         try:
             spec = StreamSpec.from_dict(hello.spec, self._default_spec)
             layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
-            if hello.seed > LARGEST_SEED or not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
+            if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
                 raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
+            _check_sizes(layout)
             schedule = self._schedule(spec)
         except UsageError as error:
             return _refuse(identity, ErrorCode.SPEC, str(error))
@@ -195,7 +203,10 @@ class Dispatcher:
                     f"none of the {len(table.rejections)} videos gives a sequence; {first.video}: {first.reason} "
                     f"(would admit it: {first.remedy})"
                 )
-            schedule = self._schedules[spec.digest] = Schedule(table, shuffle=spec.shuffle)
+            schedule = Schedule(table, shuffle=spec.shuffle)
+            while len(self._schedules) >= MOST_SCHEDULES:
+                del self._schedules[next(iter(self._schedules))]
+            self._schedules[spec.digest] = schedule
         return schedule
 
     def _want(self, session: Session, want: Want) -> list[Instruction]:
@@ -209,10 +220,10 @@ class Dispatcher:
             return [_refuse(session.identity, ErrorCode.RANGE, str(error))]
         return []
 
-    def _refuse_malformed(self, identity: bytes, error: ProtocolError) -> Instruction:
+    def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1
         code = ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED
-        return _refuse(identity, code, str(error))
+        return _refused(code, str(error))
 
     # --- workers ------------------------------------------------------------------------------------------------------
 
@@ -221,8 +232,7 @@ class Dispatcher:
         try:
             message = decode(frames[0]) if frames else _only(frames)
         except ProtocolError as error:
-            self.counters.malformed += 1
-            return [ToWorker(identity, encode(Refused(ErrorCode.MALFORMED, str(error))))]
+            return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now)
         worker = self._workers.get(identity)
@@ -283,17 +293,18 @@ class Dispatcher:
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Buffer]) -> list[Instruction]:
         task = self._leases.finished(result.lease, identity)
-        if task is not None and result.index != task.index:
+        if task is not None and (result.index != task.index or not payload):
             self.counters.malformed += 1
             self.sessions.put_back(task)
             return []
-        if task is None or not self.sessions.answered(task, result.cpu_seconds):
+        cpu_seconds = min(max(result.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
+        if task is None or not self.sessions.answered(task, cpu_seconds):
             self.counters.late_results += 1
             return []
         size = sum(len(frame) for frame in payload)
         self.counters.samples += 1
         self.counters.bytes += size
-        self.counters.worker_cpu_seconds += result.cpu_seconds
+        self.counters.worker_cpu_seconds += cpu_seconds
         session = self.sessions.get(task.session)
         if session is not None:
             self.counters.batches += 1 / session.batch_size
@@ -327,7 +338,7 @@ class Dispatcher:
             return []
         self.counters.refused_candidates += 1
         sequence = session.schedule.candidate(session.seed, task.epoch, task.index, task.candidate)
-        refusal = Refusal(task.candidate, sequence.video.id, frame, reason)
+        refusal = Refusal(task.candidate, sequence.video.id, frame, reason[:_LONGEST_REASON])
         self._refusals.append(refusal)
         refusals = (*task.refusals, refusal)
         candidate = task.candidate + 1
@@ -381,5 +392,19 @@ def _only(frames: Sequence[Buffer]) -> Message:
     return decode(frames[0])
 
 
+def _check_sizes(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    for name, (dtype, shape) in layout.items():
+        size = layout_bytes({name: (dtype, shape)})
+        if size > LARGEST_ARRAY_BYTES:
+            raise UsageError(
+                f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is {LARGEST_ARRAY_BYTES}: "
+                f"ask for fewer voxels_per_clip or a smaller crop"
+            )
+
+
+def _refused(code: ErrorCode, text: str) -> Frames:
+    return encode(Refused(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
+
+
 def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
-    return ToConsumer(identity, encode(Refused(code, text)))
+    return ToConsumer(identity, _refused(code, text))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
@@ -48,7 +49,7 @@ def describe(
         rows=str(catalogue.rows),
         width_px=video.width_px,
         height_px=video.height_px,
-        frames_per_second=video.frames_per_second,
+        frames_per_second=0.0 if math.isnan(video.frames_per_second) else video.frames_per_second,
         thresholds=thresholds,
         start_frame=sequence.start_frame,
         frame_index=index.to_bytes(),

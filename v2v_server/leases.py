@@ -37,7 +37,7 @@ class Task:
 
 @dataclass(slots=True)
 class _Lease:
-    task: Task
+    task: Task | None  # None: its consumer is gone, but the worker still has to get through it
     worker: bytes
     deadline: float
     begun: bool = False
@@ -49,7 +49,6 @@ class Overdue:
 
     lease: int
     worker: bytes
-    task: Task
 
 
 class LeaseBook:
@@ -90,7 +89,8 @@ class LeaseBook:
             self._leases[other].deadline = now + self.deadline_seconds
 
     def finished(self, number: int, worker: bytes) -> Task | None:
-        """The worker answered; returns the task, or None when the lease had been taken away from it before."""
+        """The worker answered; returns the task, or None when the lease had been taken away from it before, or its
+        consumer is gone."""
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker:
             return None
@@ -102,19 +102,23 @@ class LeaseBook:
         returned = []
         for number in self._held.pop(worker, []):
             lease = self._leases.pop(number)
-            returned.append((lease.task, lease.begun))
+            if lease.task is not None:
+                returned.append((lease.task, lease.begun))
         return returned
 
     def overdue(self, now: float) -> list[Overdue]:
         """Leases past their deadline, oldest first. They stay out until their worker is given up (:meth:`lost`)."""
-        return [
-            Overdue(number, lease.worker, lease.task) for number, lease in self._leases.items() if now > lease.deadline
-        ]
+        return [Overdue(number, lease.worker) for number, lease in self._leases.items() if now > lease.deadline]
 
     def forget_session(self, session: bytes) -> None:
-        """The consumer is gone: answers to its leases will find nothing."""
-        for number in [number for number, lease in self._leases.items() if lease.task.session == session]:
-            self._drop(number)
+        """The consumer is gone: answers to its leases will find nothing.
+
+        The leases stay with their workers, which do not know and work through them: that is room they do not have for
+        others, and time for which those queued behind must not be called overdue.
+        """
+        for lease in self._leases.values():
+            if lease.task is not None and lease.task.session == session:
+                lease.task = None
 
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)

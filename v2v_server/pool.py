@@ -106,7 +106,9 @@ class Pool:
                         f"{self.crash_budget}); the last one {death.status}. What they printed is above; "
                         f"`v2v-simulate` on one of the videos shows the same in one process"
                     )
-                delay = min(_FIRST_BACKOFF_SECONDS * 2 ** (self._deaths_in_a_row - 1), _LONGEST_BACKOFF_SECONDS)
+                # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
+                doublings = min(self._deaths_in_a_row - 1, 16)
+                delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
                 slot.process, slot.start_at = None, now + delay
                 if not slot.given_up:
                     deaths.append(death)
@@ -155,8 +157,9 @@ class Pool:
 
 def _post_mortem(identity: bytes, returncode: int) -> Death:
     if returncode >= 0:
-        status = f"exited with status {returncode}"
-        return Death(identity, status, f"a worker {status} over it" if returncode else None)
+        # An exception nobody foresaw, a broken installation, no memory: whose fault it is cannot be told from here, and
+        # to pass over videos for it would silently change the stream.
+        return Death(identity, f"exited with status {returncode}", None)
     try:
         name = signal.Signals(-returncode).name
     except ValueError:

@@ -6,26 +6,48 @@ Server workers and `v2v-simulate` both come through here, which is why a sample 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId
+from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.simulation import simulate_clip, step_seconds
+from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.view import apply_view, source_window
-from v2v_server.video.decode import check_fingerprint, decode_luma
+from v2v_server.video.decode import DecodedClip, decode_luma
+from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.index import FrameIndex
 from v2v_server.video.rows import Rows
 
 
-def make_sample(lease: Lease, index: int, root: Path) -> Sample:
-    """Makes one sample of a lease.
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """The decoded part of a sample.
+
+    Attributes:
+        spec: the stream's spec.
+        params: the sample's draw.
+        source: [steps + 1] int64, which decoded frame each position of the clip shows.
+        clip: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
+    """
+
+    spec: StreamSpec
+    params: SampleParams
+    source: npt.NDArray[np.int64]
+    clip: DecodedClip
+
+
+def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
+    """Draws the camera and decodes the frames that one sample of a lease needs, and no more.
 
     Args:
         lease: the work.
@@ -37,10 +59,9 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
         ProtocolError: the lease does not fit its form.
     """
     spec = _spec(lease.spec)
-    recipe = spec.recipe
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     params = draw(
-        recipe,
+        spec.recipe,
         seed=lease.seed,
         epoch=lease.epoch,
         index=index,
@@ -49,34 +70,43 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
         video_id=lease.video,
         video_thresholds=_thresholds(lease.thresholds),
     )
-    source = params.source_index(recipe.steps)
+    source = params.source_index(spec.recipe.steps)
+    window = source_window(params, spec.recipe, top, bottom - top, lease.width_px)
     path = _below(root, lease.video)
     try:
         check_fingerprint(path, lease.fingerprint)
-        clip = decode_luma(
-            path,
-            FrameIndex.from_bytes(lease.frame_index),
-            lease.start_frame,
-            int(source[-1]) + 1,
-            window=source_window(params, recipe, top, bottom - top, lease.width_px),
-        )
+        frame_index = FrameIndex.from_bytes(lease.frame_index)
+        clip = decode_luma(path, frame_index, lease.start_frame, int(source[-1]) + 1, window)
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    view = apply_view(clip.frames, params, recipe)
+    return Decoded(spec, params, source, clip)
 
+
+def make_sample(lease: Lease, index: int, root: Path) -> Sample:
+    """Makes one sample of a lease: :func:`decode_for`, then view and simulation.
+
+    Raises:
+        VideoError, ProtocolError: see :func:`decode_for`.
+    """
+    decoded = decode_for(lease, index, root)
+    params, recipe, source = decoded.params, decoded.spec.recipe, decoded.source
+    view = apply_view(decoded.clip.frames, params, recipe)
     seconds, irregular = None, 0
     if recipe.noise_unit == "second":
-        seconds, irregular = step_seconds(clip.seconds, source, lease.frames_per_second)
-    arrays: dict[str, np.ndarray] = {}
+        if not lease.frames_per_second:
+            raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe states noise per second")
+        seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second)
+    arrays: dict[str, npt.NDArray[Any]] = {}
     saturated = 0
     for name in lease.arrays:
         if name == "voxels":
-            arrays[name], saturated = simulate_clip(view, params, recipe, spec.voxel_dtype, seconds)
+            arrays[name], saturated = simulate_clip(view, params, recipe, decoded.spec.voxel_dtype, seconds)
         elif name == "frames":
             arrays[name] = view[source[list(recipe.target_steps)], None]
         else:
             raise ProtocolError(f"lease {lease.lease} asks for an array {name!r} that this worker does not make")
+    codec = decoded.clip.codec
     return Sample(
         arrays=arrays,
         provenance=Provenance(
@@ -89,7 +119,7 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
             params=params,
             saturated_bins=saturated,
             irregular_timestamps=irregular,
-            decoder=clip.codec if clip.bit_exact else f"{clip.codec} (host-dependent)",
+            decoder=codec if decoded.clip.bit_exact else f"{codec} (host-dependent)",
         ),
     )
 

@@ -6,12 +6,14 @@ start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L 
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import accumulate
 
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.catalogue import VideoEntry
@@ -88,15 +90,21 @@ def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | Non
     needed = recipe.frames_needed
     if video.frames < needed:
         most = (video.frames - 1) // (recipe.bins * recipe.frames_per_bin) - recipe.lead_voxels
-        remedy = f"voxels_per_clip at most {most}" if most >= 1 else "fewer bins or frames_per_bin"
+        remedy = f"voxels_per_clip at most {most}" if most >= 1 else "fewer bins or frames_per_bin, no lead_voxels"
+        if video.frames < 2:
+            remedy = "none: a voxel grid needs two frames"
         return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy)
-    top, bottom = rows.bounds(video.height_px)
+    try:
+        top, bottom = rows.bounds(video.height_px)
+    except UsageError as error:
+        return Rejection(video.id, str(error), "other rows")
     height, width = bottom - top, video.width_px
     if not admits(recipe, height, width):
-        scale = smallest_scale(recipe, height, width)
+        # Rounded up, or the picture would still be a fraction of a pixel too small.
+        scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
         return Rejection(
             video.id,
             f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}",
-            f"resize_scale up to {scale:.3g}, or a smaller crop",
+            f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop",
         )
     return None

