@@ -87,7 +87,11 @@ class RemoteError(V2VError):
         text: the server's explanation.
     """
 
-    def __init__(self, code: str, text: str) -> None:
+    def __init__(self, code: str, text: str | None = None) -> None:
+        if text is None:
+            # PyTorch builds an exception of a loader worker again from its message alone.
+            text, _, rest = code.rpartition(" [")
+            code = rest.removesuffix("]")
         self.code = code
         self.text = text
         super().__init__(f"{text} [{code}]")

@@ -51,6 +51,7 @@ def serve(argv: Sequence[str] | None = None) -> None:
         "--session-idle-seconds", type=float, metavar="S", help="forget consumers silent for longer (600)"
     )
     parser.add_argument("--max-credit-bytes", type=int, metavar="N", help="bytes in flight to one consumer (2 GiB)")
+    parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
 
     def run(arguments: argparse.Namespace) -> None:
         from v2v_server.serve import serve as run_server

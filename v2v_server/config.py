@@ -40,6 +40,7 @@ class ServeConfig:
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
         max_credit_bytes: bound on the bytes in flight to one consumer.
+        parent_pid: stop when this process is no longer the parent; 0: never mind.
 
     Raises:
         UsageError: an unknown key, a value of the wrong kind or outside its limits.
@@ -62,6 +63,7 @@ class ServeConfig:
     lease_deadline_seconds: float = 60.0
     session_idle_seconds: float = 600.0
     max_credit_bytes: int = 2 << 30
+    parent_pid: int = 0
     spec: StreamSpec = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -169,7 +171,7 @@ def _check_address(flag: str, address: str, insecure: bool) -> None:
     is_number = port.isascii() and port.isdecimal()
     if not colon or not host or not (port in ("*", "0") or (is_number and 0 < int(port) < 65536)):
         raise UsageError(f"{flag} {address!r}: write tcp://HOST:PORT with a port from 1 to 65535, or * for a free one")
-    if not insecure and not _is_loopback(host.removeprefix("[").removesuffix("]")):
+    if not insecure and not _is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
         raise UsageError(
             f"{flag} {address} is reachable from other machines, and nothing is encrypted or authenticated: "
             f"bind to 127.0.0.1, or type out --insecure if everyone on that network may use this server"

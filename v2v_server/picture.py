@@ -95,7 +95,7 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def _draw_row(row: Row) -> Image:
-    strongest = float(np.quantile(np.abs(row.bins[row.bins != 0]), 0.98)) if np.any(row.bins) else 1.0
+    strongest = float(np.quantile(np.abs(row.bins[row.bins != 0], dtype=np.float32), 0.98)) if np.any(row.bins) else 1.0
     tiles = [_label(row, strongest), _fit(cv2.cvtColor(row.frame, cv2.COLOR_GRAY2BGR))]
     tiles += [_fit(_red_blue(events, strongest)) for events in row.bins]
     return np.hstack([cv2.copyMakeBorder(tile, 0, _GAP_PX, 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))

@@ -144,15 +144,20 @@ class Pool:
         name = f"{self._label}-{number}.{slot.generation}"
         slot.identity = name.encode()
         slot.process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "v2v_server.cli", "worker"),
-                *("--connect", self._address, "--videos", str(self._root), "--name", name),
-                *("--parent-pid", str(os.getpid())),
-            ],
+            _command(self._address, self._root, name),
             stdin=subprocess.DEVNULL,
             env=os.environ | _ONE_THREAD,
             process_group=0,
         )
+
+
+def _command(address: str, root: Path, name: str) -> list[str]:
+    """The program of one worker."""
+    return [
+        *(sys.executable, "-m", "v2v_server.cli", "worker"),
+        *("--connect", address, "--videos", str(root), "--name", name),
+        *("--parent-pid", str(os.getpid())),
+    ]
 
 
 def _post_mortem(identity: bytes, returncode: int) -> Death:

@@ -102,8 +102,11 @@ def _loop(config: ServeConfig, dispatcher: Dispatcher, broker: Broker, pool: Poo
             status.update(now, dispatcher, pool.running)
         return instructions
 
+    def stopping() -> bool:
+        return stop.is_set() or (config.parent_pid != 0 and os.getppid() != config.parent_pid)
+
     try:
-        broker.run(dispatcher, give_up=pool.give_up, every_tick=every_tick, stopping=stop.is_set)
+        broker.run(dispatcher, give_up=pool.give_up, every_tick=every_tick, stopping=stopping)
     finally:
         status.close()
 

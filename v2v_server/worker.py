@@ -35,6 +35,7 @@ from v2v_protocol.messages import (
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, encode_sample
 from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
+from v2v_server.simulation.clip import warm_up
 
 CREDIT = 2
 _PING_SECONDS = 5.0
@@ -166,4 +167,6 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
         raise CorpusError(f"--videos {root}: no such folder on this host")
     keep_freed_memory()
     cv2.setNumThreads(1)
+    # Compile or load the kernels first: a worker that has said hello can work at full speed.
+    warm_up()
     Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address).run()

@@ -1,0 +1,256 @@
+"""A small honest server: the real wire format over a ROUTER socket, and faults on request.
+
+The bytes of a sample are a function of (seed, epoch, index), see :func:`expected`. Credit is counted as a real server
+counts it: a request beyond it is refused whole.
+"""
+
+from __future__ import annotations
+
+import queue
+import random
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import zmq
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.messages import ErrorCode, Goodbye, Hello, Message, Ping, Pong, Refused, Unavailable, Want, Welcome
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import decode, encode, encode_sample
+
+SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=2, bins=2, crop_height_px=4, crop_width_px=6))
+_IDLE_MS = 5
+_PARAMS = SampleParams(0.2, 0.3, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+
+
+def expected(name: str, seed: int, epoch: int, index: int, spec: StreamSpec = SPEC) -> np.ndarray[Any, Any]:
+    """The array of that name of one sample."""
+    dtype, shape = array_layout(spec.recipe, spec.voxel_dtype, (name,))[name]
+    random_bytes = np.random.default_rng([seed, epoch, index, len(name)])
+    return random_bytes.integers(0, 100, shape).astype(dtype)
+
+
+class _Session:
+    def __init__(self, hello: Hello, spec: StreamSpec) -> None:
+        self.hello = hello
+        self.spec = spec
+        self.unanswered: dict[tuple[int, int], None] = {}
+
+
+class FakeServer:
+    """Serves in a thread from ``with`` on.
+
+    Attributes (set them before use or under :meth:`call`; the thread reads them):
+        catalogue, sequences, credit: what Welcome says.
+        refusal: answers every Hello, when set.
+        shuffled: answers come one at a time, at random, when nothing else is to do.
+        held: answers nothing but Ping until it is False again.
+        mute: answers nothing at all.
+        drop: samples (epoch, index) that are lost once, after they count as answered.
+        twice: samples that are sent twice.
+        unavailable: indices that cannot be made.
+        refuse_repeat: refuses, once and for credit, a request that repeats an index.
+        overstated: Welcome grants this much more than is accepted.
+        alter: changes the frames of a sample before they are sent.
+        hellos, wants: what came, in order.
+        most_unanswered: largest number of unanswered samples of one session.
+    """
+
+    def __init__(self, *, sequences: int = 23, credit: int = 8, spec: StreamSpec = SPEC) -> None:
+        self.spec = spec
+        self.catalogue = "catalogue-1"
+        self.sequences = sequences
+        self.credit = credit
+        self.refusal: Refused | None = None
+        self.shuffled = False
+        self.held = False
+        self.mute = False
+        self.drop: set[tuple[int, int]] = set()
+        self.twice: set[tuple[int, int]] = set()
+        self.unavailable: set[int] = set()
+        self.refuse_repeat = False
+        self.overstated = 0
+        self.alter: Callable[[list[Any]], list[Any]] = lambda frames: frames
+        self.hellos: list[Hello] = []
+        self.goodbyes = 0
+        self.wants: list[tuple[int, int]] = []
+        self.most_unanswered = 0
+        self.refused_for_credit = 0
+        self._random = random.Random(7)
+        self._sessions: dict[bytes, _Session] = {}
+        self._commands: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._wake = self._context.socket(zmq.PAIR)
+        self._wake.bind("inproc://wake")
+        self._socket = self._bind("tcp://127.0.0.1:*")
+        self.address = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._thread = threading.Thread(target=self._serve, name="fake-server")
+
+    def _bind(self, address: str) -> zmq.Socket[bytes]:
+        socket = self._context.socket(zmq.ROUTER)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        while True:
+            try:
+                socket.bind(address)
+                return socket
+            except zmq.ZMQError as error:  # the socket before it is closed in the background
+                if error.errno != zmq.EADDRINUSE:
+                    raise
+
+    def __enter__(self) -> FakeServer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.call(self._stop)
+        self._thread.join()
+        self._wake.close(linger=0)
+        self._context.term()
+
+    def call(self, command: Callable[[], Any]) -> Any:
+        """Runs ``command`` in the server's thread, between two messages."""
+        future: Future[Any] = Future()
+        self._commands.put((command, future))
+        self._wake.send(b"")
+        return future.result()
+
+    def restart(self, **changes: Any) -> None:
+        """As a killed and restarted server: the same port, no memory of anybody, some attributes changed."""
+
+        def again() -> None:
+            self._socket.close(linger=0)
+            self._sessions.clear()
+            for name, value in changes.items():
+                setattr(self, name, value)
+            self._socket = self._bind(self.address)
+
+        self.call(again)
+
+    def forget(self) -> None:
+        """Forgets all sessions, as a server does with silent ones."""
+        self.call(self._sessions.clear)
+
+    @property
+    def sessions(self) -> int:
+        return self.call(lambda: len(self._sessions))
+
+    # --- the thread ---------------------------------------------------------------------------------------------------
+
+    def _stop(self) -> None:
+        self._running = False
+
+    def _serve(self) -> None:
+        self._running = True
+        wake = self._context.socket(zmq.PAIR)
+        wake.connect("inproc://wake")
+        while self._running:
+            poller = zmq.Poller()
+            poller.register(wake, zmq.POLLIN)
+            poller.register(self._socket, zmq.POLLIN)
+            ready = dict(poller.poll(_IDLE_MS if self._busy() else None))
+            if wake in ready:
+                wake.recv()
+                command, future = self._commands.get()
+                try:
+                    future.set_result(command())
+                except BaseException as error:  # noqa: BLE001 - it is the caller's
+                    future.set_exception(error)
+            elif self._socket in ready:
+                identity, header, *_ = self._socket.recv_multipart()
+                self._handle(identity, decode(header))
+            elif not ready:
+                self._answer_one()
+        wake.close(linger=0)
+        self._socket.close(linger=0)
+
+    def _busy(self) -> bool:
+        return not self.held and not self.mute and any(session.unanswered for session in self._sessions.values())
+
+    def _send(self, identity: bytes, frames: list[Any]) -> None:
+        self._socket.send_multipart([identity, *frames])
+
+    def _handle(self, identity: bytes, message: Message) -> None:
+        if isinstance(message, Hello):
+            self.hellos.append(message)
+        if self.mute:
+            return
+        session = self._sessions.get(identity)
+        if isinstance(message, Hello):
+            self._send(identity, encode(self._welcome(identity, message)))
+        elif isinstance(message, Goodbye):
+            self.goodbyes += 1
+            self._sessions.pop(identity, None)
+        elif isinstance(message, Ping):
+            self._send(identity, encode(Pong()))
+        elif session is None:
+            self._send(identity, encode(Refused(ErrorCode.UNKNOWN_SESSION, "say Hello again")))
+        elif isinstance(message, Want):
+            self._want(identity, session, message)
+
+    def _welcome(self, identity: bytes, hello: Hello) -> Message:
+        if self.refusal is not None:
+            return self.refusal
+        try:
+            spec = StreamSpec.from_dict(hello.spec, default=self.spec)
+        except UsageError as error:
+            return Refused(ErrorCode.SPEC, str(error))
+        self._sessions[identity] = _Session(hello, spec)
+        return Welcome(spec.to_dict(), spec.digest, self.catalogue, 1, self.sequences, self.credit + self.overstated)
+
+    def _want(self, identity: bytes, session: _Session, want: Want) -> None:
+        asked = [(want.epoch, index) for index in want.indices]
+        repeats = any(key in self.wants for key in asked)
+        self.wants += asked
+        if any(index >= self.sequences for index in want.indices):
+            self._send(identity, encode(Refused(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
+            return
+        unanswered = session.unanswered | dict.fromkeys(asked)
+        if len(unanswered) > self.credit or (repeats and self.refuse_repeat):
+            self.refuse_repeat = False
+            self.refused_for_credit += 1
+            self._send(identity, encode(Refused(ErrorCode.CREDIT, f"{len(unanswered)} of {self.credit}")))
+            return
+        session.unanswered = unanswered
+        self.most_unanswered = max(self.most_unanswered, len(unanswered))
+        if not self.shuffled and not self.held:
+            for epoch, index in list(session.unanswered):
+                self._answer(identity, session, epoch, index)
+
+    def _answer_one(self) -> None:
+        waiting = [
+            (identity, session, key) for identity, session in self._sessions.items() for key in session.unanswered
+        ]
+        if waiting and not self.held:
+            identity, session, key = self._random.choice(waiting)
+            self._answer(identity, session, *key)
+
+    def _answer(self, identity: bytes, session: _Session, epoch: int, index: int) -> None:
+        del session.unanswered[epoch, index]
+        if index in self.unavailable:
+            self._send(identity, encode(Unavailable(epoch, index, "a.mp4 at frame 3: truncated")))
+            return
+        if (epoch, index) in self.drop:
+            self.drop.remove((epoch, index))
+            return
+        frames = self.alter(self.sample(session, epoch, index))
+        for _ in range(2 if (epoch, index) in self.twice else 1):
+            self._send(identity, frames)
+
+    def sample(self, session: _Session, epoch: int, index: int) -> list[Any]:
+        seed = session.hello.seed
+        identity = SampleId(session.spec.digest, self.catalogue, 1, seed, epoch, index)
+        provenance = Provenance(identity, "a.mp4", "7:00", 0, 0, (), _PARAMS, 0, 0, "h264 exact")
+        return encode_sample(
+            epoch=epoch,
+            index=index,
+            arrays={name: expected(name, seed, epoch, index, session.spec) for name in session.hello.arrays},
+            provenance=provenance.to_dict(),
+            worker="fake",
+            cpu_seconds=0.25,
+        )

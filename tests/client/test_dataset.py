@@ -1,0 +1,584 @@
+import copy
+import gc
+import os
+import pickle
+import threading
+
+import numpy as np
+import psutil
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from tests.client.fake_server import SPEC, FakeServer, expected
+from v2v_client import (
+    ProtocolError,
+    RemoteError,
+    SampleUnavailable,
+    ServerLost,
+    StateMismatch,
+    UsageError,
+    V2VStreamDataset,
+)
+from v2v_client.liveness import Patience
+from v2v_protocol.messages import Refused
+from v2v_protocol.recipe import Recipe
+
+SEED = 5
+QUICK = Patience(ping_seconds=0.05, rewant_seconds=0.2)
+
+
+@pytest.fixture
+def server():
+    with FakeServer(sequences=23, credit=8) as running:
+        yield running
+
+
+@pytest.fixture(autouse=True)
+def nothing_leaks():
+    gc.collect()
+    process = psutil.Process()
+    threads, files, children = process.num_threads(), process.num_fds(), len(process.children())
+    yield
+    gc.collect()
+    assert [thread.name for thread in threading.enumerate() if thread is not threading.main_thread()] == []
+    # Pools of OpenMP and of multiprocessing's helpers may begin in a test; a leak in each of them would add up.
+    assert process.num_fds() - files <= 4
+    assert process.num_threads() - threads <= 4
+    assert len(process.children()) - children <= 2  # multiprocessing's resource tracker and fork server
+
+
+def dataset(server, **options):
+    options = {"batch_size": 4, "seed": SEED, "timeout_seconds": 20.0, "patience": QUICK} | options
+    return V2VStreamDataset(server.address, **options)
+
+
+def places(batches):
+    return [(batch.epoch, index) for batch in batches for index in batch.indices]
+
+
+def epoch_places(epoch, start=0, stop=20):
+    return [(epoch, index) for index in range(start, stop)]
+
+
+def assert_true_bytes(batch, spec=SPEC):
+    for name, tensor in batch.arrays.items():
+        for row, index in enumerate(batch.indices):
+            np.testing.assert_array_equal(tensor[row].numpy(), expected(name, SEED, batch.epoch, index, spec))
+
+
+# --- what comes -------------------------------------------------------------------------------------------------------
+
+
+def test_one_iteration_is_one_epoch_in_order_with_the_bytes_of_each_sample(server):
+    stream = dataset(server)
+    for epoch in (0, 1):
+        batches = list(stream)
+        assert places(batches) == epoch_places(epoch)
+        for batch in batches:
+            assert_true_bytes(batch)
+            assert batch.cpu_seconds == 1.0
+            assert batch.wait_seconds >= 0
+            assert [item.id.index for item in batch.provenance] == list(batch.indices)
+    assert server.most_unanswered <= server.credit
+    assert server.refused_for_credit == 0
+
+
+def test_the_batch_has_the_promised_form(server):
+    batch = next(iter(dataset(server)))
+    assert batch.voxels.shape == (4, 2, 2, 4, 6)
+    assert batch.voxels.dtype is torch.int8
+    assert batch.frames.shape == (4, 2, 1, 4, 6)
+    assert batch.frames.dtype is torch.uint8
+    assert len(batch) == 4
+    assert repr(batch) == (
+        "Batch(voxels: int8[4, 2, 2, 4, 6] on cpu, frames: uint8[4, 2, 1, 4, 6] on cpu, epoch 0, indices 0, 1, 2, ...)"
+    )
+    moved = batch.to("cpu", non_blocking=True)
+    assert torch.equal(moved.voxels, batch.voxels)
+    assert moved.indices == batch.indices
+
+
+def test_only_the_asked_arrays_come(server):
+    batch = next(iter(dataset(server, arrays=("voxels",))))
+    assert batch.frames is None
+    assert_true_bytes(batch)
+    assert server.hellos[-1].arrays == ("voxels",)
+
+
+def test_arrival_in_any_order_and_twice_changes_nothing(server):
+    server.shuffled = True
+    server.twice = {(0, index) for index in range(0, 23, 3)}
+    batches = list(dataset(server))
+    assert places(batches) == epoch_places(0)
+    for batch in batches:
+        assert_true_bytes(batch)
+    assert server.most_unanswered == server.credit
+    assert server.refused_for_credit == 0
+
+
+def test_a_credit_smaller_than_a_batch_is_enough(server):
+    server.credit = 1
+    server.shuffled = True
+    assert places(dataset(server)) == epoch_places(0)
+    assert server.most_unanswered == 1
+
+
+def test_ranks_share_an_epoch(server):
+    of_rank = [places(dataset(server, batch_size=3, rank=rank, world_size=2)) for rank in (0, 1)]
+    assert [len(part) for part in of_rank] == [9, 9]
+    assert of_rank[0] == [(0, index) for index in range(0, 18, 2)]
+    assert sorted(of_rank[0] + of_rank[1]) == epoch_places(0, 0, 18)
+
+
+def test_ranks_are_those_of_torch_distributed(server, tmp_path):
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        stream = dataset(server)
+        assert (stream.rank, stream.world_size) == (0, 1)
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_two_processes_of_torch_distributed_get_disjoint_samples(server, tmp_path):
+    context = torch.multiprocessing.get_context("spawn")
+    results = context.SimpleQueue()
+    ranks = [
+        context.Process(target=_rank_process, args=(rank, f"file://{tmp_path}/store", server.address, results))
+        for rank in (0, 1)
+    ]
+    for process in ranks:
+        process.start()
+    found = dict(results.get() for _ in ranks)
+    for process in ranks:
+        process.join()
+        process.close()
+    results.close()
+    assert len(found[0]) == len(found[1]) == 8
+    assert sorted(found[0] + found[1]) == epoch_places(0, 0, 16)
+    assert found[1][0] == (0, 1)
+
+
+def _rank_process(rank, store, address, results):
+    torch.distributed.init_process_group("gloo", init_method=store, rank=rank, world_size=2)
+    stream = V2VStreamDataset(address, batch_size=4, seed=SEED)
+    loader = DataLoader(stream, batch_size=None, num_workers=1, multiprocessing_context="spawn")
+    results.put((rank, places(loader)))
+    torch.distributed.barrier()
+    torch.distributed.destroy_process_group()
+
+
+def test_options_reach_the_server(server):
+    stream = dataset(server, recipe={"voxels_per_clip": 3}, voxel_dtype="int16", shuffle=False)
+    batch = next(iter(stream))
+    assert batch.voxels.shape == (4, 3, 2, 4, 6)
+    assert batch.voxels.dtype is torch.int16
+    assert server.hellos[0].spec == {"recipe": {"voxels_per_clip": 3}, "voxel_dtype": "int16", "shuffle": False}
+    described = stream.describe()
+    assert described["spec"]["recipe"]["voxels_per_clip"] == 3
+    assert described["sequences"] == 23
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"batch_size": 0}, "batch_size"),
+        ({"seed": -1}, "seed"),
+        ({"epoch": -1}, "epoch"),
+        ({"arrays": ("voxel",)}, "voxel"),
+        ({"recipe": "papier"}, "papier"),
+        ({"recipe": {"gama": 2}}, "gama"),
+        ({"rank": 1}, "give both"),
+        ({"rank": 2, "world_size": 2}, "rank 2"),
+        ({"timeout_seconds": 0.0}, "timeout_seconds"),
+    ],
+)
+def test_wrong_options_are_refused_at_once(options, word):
+    with pytest.raises(UsageError, match=word):
+        V2VStreamDataset("tcp://127.0.0.1:1", **options)
+
+
+def test_an_address_that_is_none_says_what_to_give():
+    with pytest.raises(UsageError, match="tcp://host:port"):
+        next(iter(V2VStreamDataset("localhost")))
+
+
+# --- length and epochs ------------------------------------------------------------------------------------------------
+
+
+def test_length_is_exact_or_unknown(server):
+    stream = dataset(server)
+    with pytest.raises(TypeError):
+        len(stream)
+    first = next(iter(stream))
+    assert len(stream) == 5
+    stream.load_state_dict(first.resume_state)
+    assert len(stream) == 4 == len(list(stream))
+    assert len(stream) == 5
+
+
+def test_leaving_early_and_iterating_again_repeats_the_epoch(server):
+    stream = dataset(server)
+    for _ in stream:
+        break
+    assert stream.epoch == 0
+    assert places(stream) == epoch_places(0)
+    assert stream.epoch == 1
+    stream.set_epoch(7)
+    assert places(stream) == epoch_places(7)
+    gc.collect()
+    assert server.sessions == 0, "a session was left without Goodbye"
+
+
+def test_an_epoch_without_a_whole_global_batch_is_refused(server):
+    with pytest.raises(UsageError, match="23 sequences"):
+        list(dataset(server, batch_size=12, rank=0, world_size=2))
+
+
+# --- position ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("taken", [1, 3])
+@pytest.mark.parametrize("other_batch", [4, 5, 1])
+def test_resume_in_mid_epoch(server, taken, other_batch):
+    stream = dataset(server)
+    batches = iter(stream)
+    states = [next(batches).resume_state for _ in range(taken)]
+    assert stream.state_dict() == states[-1]
+    state = pickle.loads(pickle.dumps(states[-1]))
+    again = dataset(server, batch_size=other_batch)
+    again.load_state_dict(state)
+    assert again.state_dict() == state
+    iter(again)  # a stateful loader may make an iterator that it does not use
+    stop = 23 - (23 - 4 * taken) % other_batch
+    assert places(again) == epoch_places(0, 4 * taken, stop)
+    assert places(again)[0] == (1, 0)
+
+
+def test_the_state_at_the_end_of_an_epoch_begins_the_next(server):
+    stream = dataset(server)
+    *_, last = stream
+    assert stream.state_dict() == last.resume_state
+    again = dataset(server)
+    again.load_state_dict(last.resume_state)
+    iter(again)
+    assert places(again) == epoch_places(1)
+
+
+def test_a_rest_that_holds_no_batch_begins_the_next_epoch(server):
+    batches = iter(dataset(server))
+    state = [next(batches).resume_state for _ in range(4)][-1]
+    again = dataset(server, batch_size=8)
+    again.load_state_dict(state)
+    assert places(again) == epoch_places(1, 0, 16)
+
+
+def test_set_epoch_to_the_loaded_epoch_keeps_the_position(server):
+    batches = iter(dataset(server))
+    state = next(batches).resume_state
+    again = dataset(server)
+    again.load_state_dict(state)
+    again.set_epoch(0)
+    assert places(again) == epoch_places(0, 4)
+    again.load_state_dict(state)
+    again.set_epoch(3)
+    assert places(again) == epoch_places(3)
+
+
+def test_resume_with_another_world_size(server):
+    states = []
+    before = []
+    for rank in (0, 1):
+        batches = iter(dataset(server, batch_size=2, rank=rank, world_size=2))
+        taken = [next(batches) for _ in range(2)]
+        before += places(taken)
+        states.append(taken[-1].resume_state)
+    assert states[0] == states[1]
+    after = []
+    for rank in (0, 1, 2):
+        again = dataset(server, batch_size=2, rank=rank, world_size=3)
+        again.load_state_dict(states[0])
+        after += places(again)
+    assert sorted(before + after) == epoch_places(0, 0, 20)
+
+
+def test_a_state_restores_the_spec_when_none_is_given(server):
+    state = next(iter(dataset(server, recipe={"voxels_per_clip": 3}))).resume_state
+    again = dataset(server)
+    again.load_state_dict(state)
+    assert next(iter(again)).voxels.shape[1] == 3
+
+
+def test_a_state_of_another_spec_seed_or_nothing_is_refused(server):
+    state = next(iter(dataset(server))).resume_state
+    with pytest.raises(StateMismatch, match=r"gamma: 1.5 / 2.2"):
+        dataset(server, recipe={"gamma": 1.5}).load_state_dict(state)
+    with pytest.raises(StateMismatch, match="seed: the state has 5, this dataset 6"):
+        dataset(server, seed=6).load_state_dict(state)
+    for broken in ({}, {**state, "position": -1}, {**state, "extra": 1}, {**state, "version": 99}):
+        with pytest.raises(UsageError):
+            dataset(server).load_state_dict(broken)
+
+
+@pytest.mark.parametrize("change", [{"catalogue": "catalogue-2"}, {"sequences": 24}])
+def test_another_catalogue_is_refused_naming_both_sides(server, change):
+    state = next(iter(dataset(server))).resume_state
+    (name, value), *_ = change.items()
+    setattr(server, name, value)
+    again = dataset(server)
+    again.load_state_dict(state)
+    with pytest.raises(StateMismatch, match=rf"the saved state has .* tcp://.* has {value}"):
+        next(iter(again))
+
+
+def test_a_dataset_of_one_catalogue_does_not_go_on_with_another(server):
+    stream = dataset(server)
+    list(stream)
+    server.catalogue = "catalogue-2"
+    with pytest.raises(StateMismatch, match=r"catalogue-1.*catalogue-2"):
+        list(stream)
+
+
+# --- faults -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_restarted_server_is_greeted_again_and_nothing_is_lost_or_twice(server):
+    server.shuffled = True
+    stream = dataset(server)
+    batches = iter(stream)
+    taken = [next(batches)]
+    server.call(lambda: setattr(server, "held", True))
+    server.restart(held=False)
+    taken += batches
+    assert places(taken) == epoch_places(0)
+    for batch in taken:
+        assert_true_bytes(batch)
+    assert server.hellos[-1].spec == SPEC.to_dict()
+
+
+def test_a_forgotten_session_is_opened_again(server):
+    batches = iter(dataset(server, batch_size=2))
+    taken = [next(batches)]
+    server.forget()
+    assert places([*taken, *batches]) == epoch_places(0, 0, 22)
+
+
+def test_a_restart_with_other_videos_is_refused(server):
+    batches = iter(dataset(server, batch_size=2))
+    next(batches)
+    server.restart(catalogue="catalogue-2")
+    with pytest.raises(StateMismatch, match=r"catalogue-1.*catalogue-2"):
+        list(batches)
+
+
+def test_lost_messages_are_asked_for_again(server):
+    server.drop = {(0, 2), (0, 3), (0, 17)}
+    batches = list(dataset(server))
+    assert places(batches) == epoch_places(0)
+    assert server.drop == set()
+
+
+def test_a_refusal_for_credit_after_asking_again_is_made_good(server):
+    """A sample that was on its way when it was asked for again is made twice, and fills the server's account."""
+    server.drop = {(0, 2)}
+    server.refuse_repeat = True
+    assert places(dataset(server)) == epoch_places(0)
+    assert server.refused_for_credit == 1
+
+
+def test_any_other_refusal_for_credit_is_an_error(server):
+    server.overstated = 3
+    server.held = True
+    with pytest.raises(RemoteError, match=r"\[credit\]"):
+        next(iter(dataset(server)))
+
+
+def test_asking_again_for_what_is_only_slow_is_harmless(server):
+    server.held = True
+    asked_again = threading.Event()
+
+    def release():
+        if server.wants.count((0, 0)) > 1:
+            asked_again.set()
+        return asked_again.is_set()
+
+    def watch():
+        while not server.call(release):
+            pass
+        server.call(lambda: setattr(server, "held", False))
+        server.call(lambda: setattr(server, "shuffled", True))
+
+    watcher = threading.Thread(target=watch)
+    server.shuffled = True
+    watcher.start()
+    try:
+        assert places(dataset(server)) == epoch_places(0)
+    finally:
+        watcher.join()
+
+
+def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
+    stream = dataset(server, timeout_seconds=0.5)
+    batches = iter(stream)
+    next(batches)
+    server.call(lambda: setattr(server, "mute", True))
+    with pytest.raises(ServerLost, match=rf"{server.address}: nothing heard for .* last sample: epoch 0, index \d+"):
+        list(batches)
+
+
+def test_nobody_there_is_given_up():
+    with pytest.raises(ServerLost, match="no sample was received"):
+        next(iter(V2VStreamDataset("tcp://127.0.0.1:9", timeout_seconds=0.3, patience=QUICK)))
+
+
+def test_a_refusal_says_what_the_server_said(server):
+    server.refusal = Refused("spec", "no video gives 5 frames")
+    with pytest.raises(RemoteError, match="no video gives 5 frames") as caught:
+        next(iter(dataset(server)))
+    assert caught.value.code == "spec"
+
+
+def test_a_sample_that_cannot_be_made_is_named(server):
+    server.unavailable = {6}
+    batches = iter(dataset(server, on_bad_video="raise"))
+    with pytest.raises(SampleUnavailable, match=r"sample 6 of epoch 0: a.mp4 at frame 3: truncated"):
+        list(batches)
+
+
+GARBAGE = {
+    "no message": lambda frames: [b"\xc1garbage", *frames[1:]],
+    "an array too short": lambda frames: [frames[0], bytes(frames[1])[:-1], frames[2]],
+    "an array less": lambda frames: frames[:2],
+    "an array more": lambda frames: [*frames, b"x"],
+    "another sample's provenance": lambda frames: [
+        bytes(frames[0]).replace(b"catalogue-1", b"catalogue-9"),
+        *frames[1:],
+    ],
+}
+
+
+@pytest.mark.parametrize("damage", GARBAGE.values(), ids=GARBAGE.keys())
+def test_what_no_server_of_ours_sends_is_refused(server, damage):
+    server.alter = damage
+    with pytest.raises(ProtocolError):
+        next(iter(dataset(server)))
+
+
+def test_a_frame_larger_than_the_layout_allows_never_reaches_memory(server):
+    server.alter = lambda frames: [frames[0], bytes(2 << 20), frames[2]]
+    with pytest.raises(ServerLost):
+        next(iter(dataset(server, timeout_seconds=1.0)))
+
+
+# --- loader workers ---------------------------------------------------------------------------------------------------
+
+
+def loader(stream, workers, method="fork", **options):
+    context = method if workers else None
+    return DataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=context, **options)
+
+
+@pytest.mark.parametrize(
+    ("workers", "method"),
+    [(0, None), (1, "fork"), (2, "fork"), (1, "spawn"), pytest.param(2, "spawn", marks=pytest.mark.slow)],
+)
+def test_loader_workers_give_the_same_batches_and_the_epoch_advances(server, workers, method):
+    stream = dataset(server)
+    loaded = loader(stream, workers, method)
+    for epoch in (0, 1):
+        batches = list(loaded)
+        assert places(batches) == epoch_places(epoch)
+        for batch in batches:
+            assert_true_bytes(batch)
+        direct = dataset(server, epoch=epoch)
+        assert [batch.resume_state for batch in batches] == [batch.resume_state for batch in direct]
+    assert len(stream) == len(loaded) == 5
+
+
+def test_more_loader_workers_than_batches(server):
+    assert places(loader(dataset(server, batch_size=12), 2)) == epoch_places(0, 0, 12)
+
+
+def test_persistent_workers_advance_and_obey_set_epoch(server):
+    stream = dataset(server)
+    loaded = loader(stream, 2, persistent_workers=True)
+    assert places(loaded) == epoch_places(0)
+    assert places(loaded) == epoch_places(1)
+    for _ in loaded:
+        break
+    stream.set_epoch(9)
+    assert places(loaded) == epoch_places(9)
+    del loaded
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_the_state_of_a_batch_holds_for_any_number_of_loader_workers(server, workers):
+    state = [batch.resume_state for batch in loader(dataset(server), 2)][1]
+    again = dataset(server)
+    again.load_state_dict(state)
+    loaded = loader(again, workers)
+    assert places(loaded) == epoch_places(0, 8)
+    assert places(loaded) == epoch_places(1)
+
+
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_the_parents_state_is_refused_after_loader_workers_and_names_the_remedy(server, method):
+    stream = dataset(server)
+    assert stream.state_dict()["position"] == 0
+    for batch in loader(stream, 1, method):
+        kept = batch.resume_state
+        break
+    with pytest.raises(UsageError, match=r"Batch\.resume_state"):
+        stream.state_dict()
+    stream.load_state_dict(kept)
+    assert stream.state_dict() == kept
+
+
+@pytest.mark.slow  # PyTorch waits five seconds for a worker that failed
+def test_an_error_in_a_loader_worker_comes_out(server):
+    server.catalogue = "catalogue-2"
+    state = next(iter(dataset(server))).resume_state
+    server.catalogue = "catalogue-1"
+    stream = dataset(server)
+    stream.load_state_dict(state)
+    with pytest.raises(StateMismatch, match=r"catalogue-2.*catalogue-1"):
+        list(loader(stream, 1))
+
+
+def test_a_copy_is_a_dataset_of_its_own(server):
+    stream = dataset(server)
+    list(stream)
+    other = copy.deepcopy(stream)
+    path = stream._progress._path
+    assert other.epoch == 1
+    other.set_epoch(4)
+    assert stream.epoch == 1
+    del stream
+    gc.collect()
+    assert not os.path.exists(path)
+    assert places(other) == epoch_places(4)
+
+
+# --- buffers ----------------------------------------------------------------------------------------------------------
+
+
+def test_no_batch_changes_while_a_view_of_it_lives(server):
+    kept = []
+    for batch in dataset(server, batch_size=2):
+        kept.append((batch.epoch, batch.indices[1], batch.voxels[1, :, 0]))
+        del batch
+    for epoch, index, view in kept:
+        np.testing.assert_array_equal(view.numpy(), expected("voxels", SEED, epoch, index)[:, 0])
+
+
+def test_buffers_are_used_again_when_nothing_looks_at_them():
+    with FakeServer(sequences=200, credit=4) as server:
+        addresses = [batch.voxels.data_ptr() for batch in dataset(server, batch_size=2)]
+    assert len(addresses) == 100
+    assert len(set(addresses)) <= 4 // 2 + 3
+
+
+def test_recipes_may_be_given_as_objects(server):
+    recipe = Recipe(voxels_per_clip=1, bins=1, crop_height_px=2, crop_width_px=2)
+    assert next(iter(dataset(server, recipe=recipe))).voxels.shape == (4, 1, 1, 2, 2)

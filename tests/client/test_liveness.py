@@ -1,0 +1,49 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_client.liveness import Due, Liveness, Patience
+from v2v_protocol.errors import UsageError
+
+PATIENCE = Patience(timeout_seconds=60, ping_seconds=2, rewant_seconds=10)
+
+
+def timeline(until: float, *, pong: bool) -> list[tuple[float, Due]]:
+    """What is done in a silence, with a clock that jumps to whatever is due next."""
+    liveness, now, done = Liveness(PATIENCE, 0.0), 0.0, []
+    while now < until:
+        now += liveness.next_due(now)
+        due = liveness.due(now)
+        assert due is not None, "woken for nothing"
+        done.append((now, due))
+        if due is Due.GIVE_UP:
+            break
+        if pong:
+            liveness.heard(now, answer=False)
+    return done
+
+
+def test_a_dead_server_is_pinged_then_asked_again_then_given_up():
+    done = timeline(100, pong=False)
+    assert done[:5] == [(2, Due.PING), (4, Due.PING), (6, Due.PING), (8, Due.PING), (10, Due.WANT_AGAIN)]
+    assert done[-1] == (60, Due.GIVE_UP)
+
+
+def test_a_server_that_only_answers_pings_is_asked_again_and_never_given_up():
+    done = timeline(200, pong=True)
+    assert Due.GIVE_UP not in [due for _, due in done]
+    assert [now for now, due in done if due is Due.WANT_AGAIN] == [10 * n for n in range(1, 21)]
+
+
+@given(st.floats(0, 1e6), st.floats(0, 50))
+def test_time_spent_elsewhere_is_no_silence(away, listened):
+    liveness = Liveness(PATIENCE, 0.0)
+    liveness.pause(listened)
+    liveness.listen(listened + away)
+    assert liveness.silence(listened + away) == pytest.approx(listened, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["timeout_seconds", "ping_seconds", "rewant_seconds"])
+def test_times_are_positive(name):
+    with pytest.raises(UsageError, match=name):
+        Patience(**{name: 0.0})

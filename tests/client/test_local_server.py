@@ -1,0 +1,71 @@
+import psutil
+import pytest
+
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import ServerLost, UsageError
+
+BEGIN = """
+import pathlib, signal, subprocess, sys
+flags = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+"""
+LISTEN = "pathlib.Path(flags['--port-file']).write_text('tcp://127.0.0.1:' + flags['--workers'])\n"
+CHILD = "subprocess.Popen([sys.executable, '-c', 'import signal; signal.pause()'])\n"
+POLITE = "signal.pause()\n"
+DEAF = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """Replaces ``python -m v2v_server`` by a program of the test's own."""
+
+    def write(text):
+        package = tmp_path / "v2v_server"
+        package.mkdir()
+        (package / "__main__.py").write_text(BEGIN + text)
+        monkeypatch.chdir(tmp_path)
+
+    return write
+
+
+def test_it_is_up_inside_the_block_and_gone_after_it_with_its_children(program):
+    program(CHILD + LISTEN + POLITE)
+    with LocalServer("videos", workers=7) as server:
+        assert server.address == "tcp://127.0.0.1:7"
+        tree = [psutil.Process(server.pid), *psutil.Process(server.pid).children(recursive=True)]
+        assert len(tree) == 2
+        pids = {process.pid for process in tree}
+        assert server.cpu_seconds().keys() == pids
+        assert server.rss_bytes().keys() == pids
+        assert all(size > 0 for size in server.rss_bytes().values())
+    assert not any(process.is_running() for process in tree)
+    with pytest.raises(UsageError, match="does not run"):
+        server.cpu_seconds()
+    server.stop()
+
+
+def test_a_server_that_does_not_leave_is_killed(program):
+    program(DEAF + LISTEN + "while True: signal.pause()\n")
+    with LocalServer("videos", stop_seconds=0.2) as server:
+        process = psutil.Process(server.pid)
+    assert not process.is_running()
+
+
+@pytest.mark.parametrize(("status", "error"), [(2, UsageError), (3, ServerLost)])
+def test_a_server_that_dies_is_quoted(program, status, error):
+    program(f"sys.stderr.write('v2v-serve: no such folder: ' + flags['--videos'] + '\\n'); sys.exit({status})")
+    with pytest.raises(error, match=f"status {status} .*no such folder: videos"), LocalServer("videos"):
+        pass
+
+
+def test_a_server_that_does_not_listen_in_time_is_stopped(program):
+    program(POLITE)
+    before = len(psutil.Process().children())
+    with pytest.raises(ServerLost, match=r"does not listen after 0\.3 s"), LocalServer("videos", start_seconds=0.3):
+        pass
+    assert len(psutil.Process().children()) == before
+
+
+def test_flags_reach_the_server(program):
+    program(LISTEN.replace("flags['--workers']", "flags['--rows']") + POLITE)
+    with LocalServer("videos", flags=["--rows", "9"]) as server:
+        assert server.address.endswith(":9")

@@ -1,0 +1,162 @@
+"""What torchdata's StatefulDataLoader does to a dataset, done by hand.
+
+In every loader worker it loads that worker's own state, makes an iterator, and asks for the state after each batch and
+after the end. A loader whose state says that its epoch was finished makes such workers, drops them unused, and makes
+fresh ones from the dataset of the main process.
+"""
+
+import multiprocessing
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch.utils.data._utils.worker as torch_worker
+
+from tests.client.fake_server import FakeServer
+from v2v_client import UsageError, V2VStreamDataset
+
+WORKERS = 2
+FORK = multiprocessing.get_context("fork")
+
+
+@dataclass
+class Outcome:
+    """One loader worker: the indices of each batch with the state after it, and the state after the end."""
+
+    batches: list[tuple[int, tuple[int, ...], dict[str, Any]]]
+    ended: dict[str, Any] | None
+    error: str = ""
+
+
+def _worker(dataset, worker, workers, seed, state, most, connection):
+    torch_worker._worker_info = torch_worker.WorkerInfo(
+        id=worker, num_workers=workers, seed=seed + worker, dataset=dataset
+    )
+    outcome = Outcome([], None)
+    try:
+        if state is not None:
+            dataset.load_state_dict(state)
+        batches = iter(dataset)
+        dataset.state_dict()
+        connection.send("ready")
+        connection.recv()
+        for _ in range(most):
+            batch = next(batches, None)
+            if batch is None:
+                outcome.ended = dataset.state_dict()
+                break
+            outcome.batches.append((batch.epoch, batch.indices, dataset.state_dict()))
+    except UsageError as error:
+        outcome.error = str(error)
+    connection.send(outcome)
+    connection.close()
+    os._exit(0)
+
+
+def run(dataset, seed, states=(None, None), most=(99, 99)):
+    """One iteration of a loader: its workers' outcomes. They begin to read only when all have begun to iterate."""
+    started = []
+    for worker in range(WORKERS):
+        here, there = FORK.Pipe()
+        process = FORK.Process(
+            target=_worker, args=(dataset, worker, WORKERS, seed, states[worker], most[worker], there)
+        )
+        process.start()
+        there.close()
+        started.append((process, here))
+    outcomes = []
+    ready = [here.recv() for _, here in started]
+    for (_, here), said in zip(started, ready, strict=True):
+        if said == "ready":
+            here.send("go")
+    for (process, here), said in zip(started, ready, strict=True):
+        outcomes.append(here.recv() if said == "ready" else said)
+        process.join()
+        process.close()
+        here.close()
+    return outcomes
+
+
+def in_order(outcomes):
+    """What the training loop sees: a batch of each worker in turn."""
+    rows = [[(epoch, indices) for epoch, indices, _ in outcome.batches] for outcome in outcomes]
+    longest = max(len(row) for row in rows)
+    return [row[turn] for turn in range(longest) for row in rows if turn < len(row)]
+
+
+def whole(epoch, first=0):
+    return [(epoch, tuple(range(4 * batch, 4 * batch + 4))) for batch in range(first, 5)]
+
+
+@pytest.fixture
+def server():
+    with FakeServer(sequences=23, credit=8) as running:
+        yield running
+
+
+def dataset(server, **options):
+    return V2VStreamDataset(server.address, **({"batch_size": 4, "timeout_seconds": 20.0} | options))
+
+
+def test_workers_go_on_where_each_of_them_was(server):
+    first = run(dataset(server), 100, most=(2, 1))
+    states = [outcome.batches[-1][2] for outcome in first]
+    rest = run(dataset(server), 200, states)
+    # Worker 0 delivered batches 0 and 2, worker 1 batch 1.
+    assert [row[:2] for row in rest[0].batches] == [whole(0)[4]]
+    assert [row[:2] for row in rest[1].batches] == [whole(0)[3]]
+
+
+def test_the_initial_state_of_workers_begins_the_epoch(server):
+    stream = dataset(server)
+    begun = run(stream, 100, most=(0, 0))
+    assert in_order(run(stream, 200)) == whole(0)
+    assert begun[0].batches == []
+
+
+def test_states_after_the_end_begin_a_full_next_epoch(server):
+    first = run(dataset(server), 100)
+    assert in_order(first) == whole(0)
+    assert in_order(run(dataset(server), 200, [outcome.ended for outcome in first])) == whole(1)
+
+
+def test_a_finished_loader_restored_begins_a_full_next_epoch(server):
+    first = run(dataset(server), 100)
+    states = [outcome.batches[-1][2] for outcome in first]
+    restored = dataset(server)
+    dropped = run(restored, 200, states, most=(0, 0))
+    assert [outcome.batches for outcome in dropped] == [[], []]
+    assert in_order(run(restored, 300)) == whole(1)
+
+
+def test_the_end_of_an_epoch_that_was_not_seen_is_delivered_as_nothing(server):
+    first = run(dataset(server), 100)
+    states = [outcome.batches[-1][2] for outcome in first]
+    restored = dataset(server)
+    assert [outcome.batches for outcome in run(restored, 200, states)] == [[], []]
+    assert in_order(run(restored, 300)) == whole(1)
+
+
+def test_a_late_worker_begins_the_epoch_of_its_siblings(server):
+    """All workers of an iteration deliver one epoch, even where one has finished it before another begins."""
+    stream = dataset(server, batch_size=20)  # one batch: worker 1 has none, and is done at once
+    for epoch in (0, 1):
+        outcomes = run(stream, 100 + epoch)
+        assert in_order(outcomes) == [(epoch, tuple(range(20)))]
+
+
+def test_the_state_of_a_worker_is_refused_anywhere_else(server):
+    state = run(dataset(server), 100, most=(1, 1))[1].batches[-1][2]
+    with pytest.raises(UsageError, match=r"loader worker 1 of 2 .* Batch\.resume_state"):
+        dataset(server).load_state_dict(state)
+    swapped = run(dataset(server), 200, [state, state])
+    assert "loader worker 1 of 2" in swapped[0].error
+    other_batch = run(dataset(server, batch_size=5), 300, [None, state])
+    assert "batch_size 4" in other_batch[1].error
+
+
+def test_the_state_of_a_rank_is_taken_up_by_workers(server):
+    batches = iter(dataset(server))
+    state = [next(batches).resume_state for _ in range(2)][-1]
+    assert in_order(run(dataset(server), 100, [state, state])) == whole(0, first=2)

@@ -1,0 +1,52 @@
+"""Recipes and specs for property tests: any that the limits admit."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
+
+
+def _range(low: float, high: float) -> st.SearchStrategy[tuple[float, float]]:
+    ends = st.floats(low, high)
+    return st.tuples(ends, ends).map(lambda pair: (min(pair), max(pair)))
+
+
+_SHARE = st.floats(0.0, 1.0)
+
+recipes = st.builds(
+    Recipe,
+    voxels_per_clip=st.integers(1, 500),
+    bins=st.integers(1, 20),
+    frames_per_bin=st.integers(1, 20),
+    lead_frames=st.integers(0, 1),
+    lead_voxels=st.integers(0, 1),
+    crop_height_px=st.integers(1, 16_384),
+    crop_width_px=st.integers(1, 16_384),
+    resize_scale=_range(0.01, 100.0),
+    flip_probability=_SHARE,
+    pause_probability=_SHARE,
+    pause_stay_probability=_SHARE,
+    contrast_probability=_SHARE,
+    contrast_scale=_range(0.0, 100.0),
+    gamma=st.floats(0.05, 20.0),
+    log_eps=st.floats(1e-12, 1.0),
+    threshold=_range(1e-6, 1e6),
+    threshold_ratio=_range(1e-6, 1e6),
+    threshold_source=st.sampled_from(("sample", "video")),
+    noise_sigma=_range(0.0, 1e6),
+    noise_scales_with_threshold=st.booleans(),
+    hot_pixel_share=_range(0.0, 1.0),
+    hot_pixel_sigma=_range(0.0, 1e9),
+    noise_unit=st.sampled_from(("frame", "second")),
+)
+
+specs = st.builds(
+    StreamSpec,
+    recipe=recipes,
+    voxel_dtype=st.sampled_from(VOXEL_DTYPES),
+    shuffle=st.booleans(),
+    max_sequences_per_video=st.integers(1, 1_000_000),
+    on_bad_video=st.sampled_from(ON_BAD_VIDEO),
+)

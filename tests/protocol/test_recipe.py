@@ -1,0 +1,214 @@
+"""Recipe: presets, validation, and the frame arithmetic of the paper's configurations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import RecipeError
+from v2v_protocol.recipe import PRESETS, Recipe, preset
+
+FIELDS = {field.name: field.default for field in dataclasses.fields(Recipe)}
+WHOLE = [name for name, default in FIELDS.items() if type(default) is int]
+NUMBERS = [name for name, default in FIELDS.items() if isinstance(default, float)]
+RANGES = [name for name, default in FIELDS.items() if isinstance(default, tuple)]
+FLAGS = [name for name, default in FIELDS.items() if isinstance(default, bool)]
+WORDS = [name for name, default in FIELDS.items() if isinstance(default, str)]
+
+
+def test_every_field_is_of_a_kind_that_these_tests_cover() -> None:
+    assert sorted(WHOLE + NUMBERS + RANGES + FLAGS + WORDS) == sorted(FIELDS)
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "needed", "voxels", "targets"),
+    [
+        ("paper", 201, 40, range(5, 201, 5)),
+        ("paper-fixed-thresholds", 201, 40, range(5, 201, 5)),
+        ("paper-contrast", 201, 40, range(5, 201, 5)),
+        ("paper-flow", 201, 40, range(0, 201, 5)),
+        ("paper-eraft", 206, 41, range(5, 206, 5)),
+        ("noise-free", 201, 40, range(5, 201, 5)),
+    ],
+)
+def test_frames_of_the_presets(name: str, needed: int, voxels: int, targets: range) -> None:
+    recipe = preset(name)
+    assert recipe.frames_needed == needed
+    assert recipe.frames_per_sequence == recipe.steps == needed - 1
+    assert recipe.voxels_per_clip + recipe.lead_voxels == voxels
+    assert recipe.target_steps == tuple(targets)
+
+
+@given(st.integers(1, 60), st.integers(1, 8), st.integers(1, 5), st.integers(0, 1), st.integers(0, 1))
+def test_targets_close_the_voxels_they_are_paired_with(
+    voxels: int, bins: int, per_bin: int, lead_frames: int, lead_voxels: int
+) -> None:
+    recipe = Recipe(
+        voxels_per_clip=voxels,
+        bins=bins,
+        frames_per_bin=per_bin,
+        lead_frames=lead_frames,
+        lead_voxels=lead_voxels,
+    )
+    targets, span = recipe.target_steps, bins * per_bin
+    assert len(targets) == voxels + lead_frames
+    assert targets[-1] == recipe.steps == (voxels + lead_voxels) * span
+    assert targets[0] >= 0
+    # Counted from the back, frame i ends voxel i; with a lead frame the first voxel of the clip begins at targets[0].
+    assert targets[-voxels:] == tuple((lead_voxels + 1 + voxel) * span for voxel in range(voxels))
+    if lead_frames:
+        assert targets[0] == lead_voxels * span
+
+
+# --- presets ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_paper_preset_holds_the_released_values() -> None:
+    paper = preset("paper")
+    assert paper == Recipe()
+    assert paper.threshold == (0.05, 2.0)
+    assert paper.threshold_ratio == (1.0, 1.5)
+    assert paper.noise_sigma == (0.0, 0.1)
+    assert paper.hot_pixel_share == (0.0, 0.001)
+    assert paper.hot_pixel_sigma == (0.0, 10.0)
+    assert (paper.gamma, paper.log_eps) == (2.2, 0.001)
+    assert (paper.pause_probability, paper.pause_stay_probability) == (0.0102, 0.9791)
+    # Share of frames in which the camera stands still, from the chain's stationary distribution: about a third.
+    share = paper.pause_probability / (paper.pause_probability + 1 - paper.pause_stay_probability)
+    assert share == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_presets_differ_from_paper_only_where_they_say() -> None:
+    def changed(name: str) -> set[str]:
+        return {key for key, value in preset(name).to_dict().items() if value != preset("paper").to_dict()[key]}
+
+    assert changed("paper-fixed-thresholds") == {"threshold_source"}
+    assert changed("paper-contrast") == {"contrast_probability"}
+    assert changed("paper-flow") == {"lead_frames"}
+    assert changed("paper-eraft") == {"lead_frames", "lead_voxels"}
+    assert changed("noise-free") == {"noise_sigma", "hot_pixel_share", "hot_pixel_sigma", "pause_probability"}
+
+
+@pytest.mark.parametrize("name", ["papers", "", None, 7, ["paper"]])
+def test_unknown_preset_lists_the_known_ones(name: object) -> None:
+    with pytest.raises(RecipeError, match="known: paper, ") as caught:
+        preset(name)
+    assert repr(name) in str(caught.value)
+
+
+def test_near_preset_is_named() -> None:
+    with pytest.raises(RecipeError, match="did you mean 'paper-eraft'"):
+        preset("paper-erraft")
+
+
+# --- plain values -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_to_dict_reads_back(name: str) -> None:
+    assert Recipe.from_dict(preset(name).to_dict()) == preset(name)
+
+
+def test_from_dict_starts_at_the_named_preset() -> None:
+    recipe = Recipe.from_dict({"preset": "paper-eraft", "bins": 3})
+    assert recipe == preset("paper-eraft").replace(bins=3)
+    assert Recipe.from_dict({}) == preset("paper")
+
+
+def test_one_number_fixes_a_range() -> None:
+    assert Recipe(threshold=0.3).threshold == (0.3, 0.3)  # type: ignore[arg-type]
+    assert Recipe.from_dict({"threshold": [1, 2]}).threshold == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("make", [Recipe.from_dict, lambda values: Recipe().replace(**values)])
+def test_unknown_key_is_refused_with_the_nearest_known_one(make: Any) -> None:
+    with pytest.raises(RecipeError, match=r"unknown recipe key 'noise_sigm' \(did you mean 'noise_sigma'\?\)"):
+        make({"noise_sigm": 0.1})
+
+
+@pytest.mark.parametrize("key", ["self", "cls", "changes", "__class__", "", "\0"])
+def test_no_key_escapes_as_another_error(key: str) -> None:
+    """A key named like a parameter must not become a TypeError: recipes come from the wire."""
+    with pytest.raises(RecipeError, match="unknown recipe key"):
+        Recipe.from_dict({key: 1})
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def refuse(name: str, value: Any) -> str:
+    with pytest.raises(RecipeError, match=rf"^recipe {name} = ") as caught:
+        Recipe().replace(**{name: value})
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", NUMBERS + RANGES)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, True, "0.1", None, 10**400, 1j, b"1"])
+def test_what_is_no_finite_number_is_refused(name: str, value: Any) -> None:
+    refuse(name, value)
+
+
+@pytest.mark.parametrize("name", RANGES)
+@pytest.mark.parametrize("value", [[], [1.0], [1.0, 1.0, 1.0], [math.nan, 1.0], [0.5, True], [[1.0], 1.0], {1.0: 2.0}])
+def test_what_is_no_pair_is_refused(name: str, value: Any) -> None:
+    refuse(name, value)
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_a_range_is_given_lowest_first(name: str) -> None:
+    assert "lowest value comes first" in refuse(name, [1.0, 0.5])
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("value", [1.0, True, "1", None, [1], np.int64(1)])
+def test_what_is_no_whole_number_is_refused(name: str, value: Any) -> None:
+    refuse(name, value)
+
+
+@pytest.mark.parametrize("name", FLAGS)
+@pytest.mark.parametrize("value", [0, 1, "true", None])
+def test_what_is_no_flag_is_refused(name: str, value: Any) -> None:
+    refuse(name, value)
+
+
+@pytest.mark.parametrize("name", WORDS)
+@pytest.mark.parametrize("value", ["", "samples", None, 1, True])
+def test_what_is_no_known_word_is_refused(name: str, value: Any) -> None:
+    refuse(name, value)
+
+
+@pytest.mark.parametrize("name", WHOLE + NUMBERS + RANGES)
+def test_every_number_has_a_limit_on_both_sides(name: str) -> None:
+    kind = int if name in WHOLE else float
+    for extreme in (-(10**12), 10**12):
+        assert "is outside" in refuse(name, kind(extreme))
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_both_ends_of_a_range_are_limited(name: str) -> None:
+    assert f"{10.0**12} is outside" in refuse(name, [1.0, 10.0**12])
+    assert f"{-(10.0**12)} is outside" in refuse(name, [-(10.0**12), 1.0])
+
+
+def test_the_frames_of_a_sample_are_limited() -> None:
+    assert Recipe(voxels_per_clip=1_000_000, bins=1).frames_needed == 1_000_001
+    with pytest.raises(RecipeError, match=re.escape("needs 1000002 frames")):
+        Recipe(voxels_per_clip=1_000_000, bins=1, lead_voxels=1)
+    with pytest.raises(RecipeError, match="the limit is 1000001"):
+        Recipe(voxels_per_clip=1_000_000, bins=1024, frames_per_bin=1024)
+
+
+def test_recipes_are_values() -> None:
+    assert hash(Recipe(threshold=[0.1, 0.2])) == hash(Recipe(threshold=(0.1, 0.2)))  # type: ignore[arg-type]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Recipe().bins = 3  # type: ignore[misc]

@@ -1,0 +1,156 @@
+"""StreamSpec: its digest names it, and its canonical form is the whole of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given
+
+from tests.protocol.recipes import specs
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.recipe import PRESETS, Recipe, preset
+from v2v_protocol.spec import StreamSpec
+
+OTHER_RECIPE_VALUES: dict[str, Any] = {
+    "voxels_per_clip": 41,
+    "bins": 6,
+    "frames_per_bin": 2,
+    "lead_frames": 1,
+    "lead_voxels": 1,
+    "crop_height_px": 129,
+    "crop_width_px": 127,
+    "resize_scale": [1.0, 1.3],
+    "flip_probability": 0.25,
+    "pause_probability": 0.01,
+    "pause_stay_probability": 0.5,
+    "contrast_probability": 0.1,
+    "contrast_scale": [1.0, 2.0],
+    "gamma": 1.0,
+    "log_eps": 0.002,
+    "threshold": [0.05, 1.0],
+    "threshold_ratio": [1.0, 1.6],
+    "threshold_source": "video",
+    "noise_sigma": [0.0, 0.2],
+    "noise_scales_with_threshold": True,
+    "hot_pixel_share": [0.0, 0.002],
+    "hot_pixel_sigma": [1.0, 10.0],
+    "noise_unit": "second",
+}
+OTHER_SPEC_VALUES: dict[str, Any] = {
+    "recipe": preset("paper-flow"),
+    "voxel_dtype": "int16",
+    "shuffle": False,
+    "max_sequences_per_video": 11,
+    "on_bad_video": "raise",
+}
+
+
+def test_digests_are_stable() -> None:
+    """A saved position names this digest: if it changes, so must NUMERICS_VERSION or the digest's own version."""
+    assert StreamSpec().digest == "32a6125cc83642374a10b3667bd15137"
+    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "219aa1305b4fb866bf83565ce4867a58"
+
+
+def test_canonical_form_of_the_default() -> None:
+    assert StreamSpec().canonical().startswith(b'{"max_sequences_per_video":10,"on_bad_video":"substitute","recipe":{"')
+    assert b'"resize_scale":[1.0,1.0]' in StreamSpec().canonical()
+
+
+def test_every_field_is_covered() -> None:
+    assert OTHER_RECIPE_VALUES.keys() == {field.name for field in dataclasses.fields(Recipe)}
+    assert OTHER_SPEC_VALUES.keys() == {field.name for field in dataclasses.fields(StreamSpec)}
+
+
+def test_every_field_changes_the_digest() -> None:
+    digests = {StreamSpec().digest}
+    for name, value in OTHER_RECIPE_VALUES.items():
+        digests.add(StreamSpec.from_dict({"recipe": {name: value}}).digest)
+    for name, value in OTHER_SPEC_VALUES.items():
+        digests.add(StreamSpec.from_dict({name: value}).digest)
+    # lead_frames alone is the preset paper-flow: one digest comes twice.
+    assert len(digests) == 1 + len(OTHER_RECIPE_VALUES) + len(OTHER_SPEC_VALUES) - 1
+
+
+@given(specs)
+def test_canonical_form_reads_back_equal(spec: StreamSpec) -> None:
+    again = StreamSpec.from_dict(json.loads(spec.canonical()))
+    assert again == spec
+    assert again.canonical() == spec.canonical()
+    assert again.digest == spec.digest
+
+
+@given(specs)
+def test_a_spec_travels_as_plain_values(spec: StreamSpec) -> None:
+    again = StreamSpec.from_dict(msgpack.unpackb(msgpack.packb(spec.to_dict())))
+    assert again == spec
+    assert again.digest == spec.digest
+
+
+@given(specs, specs)
+def test_equal_specs_and_only_those_have_equal_digests(one: StreamSpec, other: StreamSpec) -> None:
+    assert (one == other) == (one.digest == other.digest)
+
+
+def test_minus_zero_is_zero() -> None:
+    plain, minus = StreamSpec(Recipe(noise_sigma=(0.0, 0.0))), StreamSpec(Recipe(noise_sigma=(-0.0, 0.0)))
+    assert plain == minus
+    assert plain.digest == minus.digest
+
+
+def test_whole_numbers_stand_for_floats() -> None:
+    assert StreamSpec.from_dict({"recipe": {"gamma": 2, "threshold": 1}}).digest == (
+        StreamSpec(Recipe(gamma=2.0, threshold=(1.0, 1.0))).digest
+    )
+
+
+# --- what a consumer may ask for --------------------------------------------------------------------------------------
+
+
+def test_missing_fields_take_the_default_spec() -> None:
+    default = StreamSpec(recipe=preset("paper-flow"), voxel_dtype="int16", shuffle=False)
+    assert StreamSpec.from_dict({}, default) == default
+    assert StreamSpec.from_dict({"shuffle": None, "recipe": None}, default) == default
+    assert StreamSpec.from_dict({"voxel_dtype": "int8"}, default) == dataclasses.replace(default, voxel_dtype="int8")
+
+
+def test_recipe_fields_change_the_default_recipe_unless_a_preset_is_named() -> None:
+    default = StreamSpec(recipe=preset("paper-eraft"))
+    assert StreamSpec.from_dict({"recipe": {"bins": 3}}, default).recipe == preset("paper-eraft").replace(bins=3)
+    assert StreamSpec.from_dict({"recipe": {"bins": 3, "preset": "paper"}}, default).recipe == Recipe(bins=3)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_recipe_may_be_a_presets_name(name: str) -> None:
+    assert StreamSpec.from_dict({"recipe": name}).recipe == preset(name)
+
+
+@pytest.mark.parametrize("recipe", [{"self": 1}, {"preset": "paper", "self": 1}, {b"bins": 1}, {1: 2}])
+def test_odd_recipe_keys_are_refused_as_such(recipe: Any) -> None:
+    with pytest.raises(RecipeError, match="unknown recipe key"):
+        StreamSpec.from_dict({"recipe": recipe})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"voxels": 1}, "unknown spec key 'voxels'; known: recipe, voxel_dtype"),
+        ({b"shuffle": True}, "unknown spec key"),
+        ({"voxel_dtype": "int32"}, "voxel_dtype = 'int32': choose one of int8, int16, float32"),
+        ({"voxel_dtype": ["int8"]}, "voxel_dtype"),
+        ({"on_bad_video": "skip"}, "on_bad_video = 'skip': choose one of substitute, raise"),
+        ({"shuffle": 1}, "shuffle = 1: give true or false"),
+        ({"max_sequences_per_video": 0}, "max_sequences_per_video = 0"),
+        ({"max_sequences_per_video": True}, "max_sequences_per_video = True"),
+        ({"max_sequences_per_video": 1.0}, "max_sequences_per_video = 1.0"),
+        ({"max_sequences_per_video": 1_000_001}, "from 1 to 1000000"),
+        ({"recipe": 5}, "unknown recipe preset 5"),
+        ({"recipe": ["paper"]}, "unknown recipe preset"),
+    ],
+)
+def test_refusals(values: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        StreamSpec.from_dict(values)

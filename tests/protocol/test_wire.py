@@ -1,0 +1,345 @@
+"""The wire: what we say comes back equal; what anybody else says is a message or a ProtocolError, never more."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import example as with_example
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.protocol.wire_messages import MESSAGES, WRONG, example, messages
+from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
+from v2v_protocol.messages import Goodbye, Lease, Ping, Refused, Result, SampleHeader, Want
+from v2v_protocol.wire import (
+    ARRAY_DTYPES,
+    LARGEST_ARRAY_BYTES,
+    LARGEST_HEADER_BYTES,
+    LARGEST_TUPLE,
+    decode,
+    decode_sample,
+    encode,
+    encode_sample,
+)
+
+by_name = pytest.mark.parametrize("cls", MESSAGES, ids=lambda cls: cls.__name__)
+
+
+def plain(message: Any) -> dict[str, Any]:
+    fields: dict[str, Any] = msgpack.unpackb(bytes(encode(message)[0]))
+    return fields
+
+
+def refuse(fields: Any, error: type[ProtocolError] = ProtocolError, match: str | None = None) -> None:
+    with pytest.raises(error, match=match):
+        decode(msgpack.packb(fields))
+
+
+def message_or_refusal(data: bytes) -> None:
+    try:
+        message = decode(data)
+    except ProtocolError as error:
+        assert len(str(error)) < 5000  # noqa: PT017 - the length of what was quoted is the point
+    else:
+        assert type(message) in MESSAGES
+
+
+# --- round trips ------------------------------------------------------------------------------------------------------
+
+
+@by_name
+def test_every_message_travels_unchanged(cls: type[Any]) -> None:
+    assert decode(encode(example(cls))[0]) == example(cls)
+
+
+@given(messages)
+@settings(max_examples=200)
+def test_any_message_travels_unchanged(message: Any) -> None:
+    header = bytes(encode(message)[0])
+    for buffer in (header, bytearray(header), memoryview(header)):
+        again = decode(buffer)
+        assert again == message
+        assert type(again) is type(message)
+
+
+def test_whole_numbers_are_read_as_floats_where_floats_belong() -> None:
+    again = decode(msgpack.packb(plain(Result(1, 2, 0.5)) | {"cpu_seconds": 3}))
+    assert isinstance(again, Result)
+    assert type(again.cpu_seconds) is float
+
+
+# --- whatever arrives -------------------------------------------------------------------------------------------------
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=500)
+def test_arbitrary_bytes(data: bytes) -> None:
+    message_or_refusal(data)
+
+
+_keys = st.sampled_from(["v", "t", "spec", "lease", "index"]) | st.text(max_size=3) | st.binary(max_size=3)
+_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_keys, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(_keys, _values, max_size=6), st.booleans())
+@settings(max_examples=100)
+def test_arbitrary_maps(fields: dict[Any, Any], right_version: bool) -> None:
+    message_or_refusal(msgpack.packb(fields | {"v": PROTOCOL_VERSION} if right_version else fields))
+
+
+@given(st.data())
+@settings(max_examples=600)
+def test_damaged_messages(data: st.DataObject) -> None:
+    """Bytes changed, cut out, put in: near misses of every message, which reach further than noise does."""
+    header = bytearray(encode(example(data.draw(st.sampled_from(MESSAGES))))[0])
+    for _ in range(data.draw(st.integers(1, 3))):
+        position = data.draw(st.integers(0, max(0, len(header) - 1)))
+        how = data.draw(st.sampled_from(("change", "cut", "insert", "truncate")))
+        if how == "change" and header:
+            header[position] = data.draw(st.integers(0, 255))
+        elif how == "cut":
+            del header[position : position + data.draw(st.integers(1, 5))]
+        elif how == "insert":
+            header[position:position] = data.draw(st.binary(min_size=1, max_size=9))
+        else:
+            del header[position:]
+    message_or_refusal(bytes(header))
+
+
+@given(st.data())
+@settings(max_examples=300)
+def test_messages_with_a_replaced_field(data: st.DataObject) -> None:
+    fields = plain(example(data.draw(st.sampled_from(MESSAGES))))
+    fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(_values)
+    message_or_refusal(msgpack.packb(fields))
+
+
+@pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1a", b"\x81\x91", b"\x92\x01"])
+@pytest.mark.parametrize("depth", [1, 15, 16, 17, 200, 990, 1020, 1024, 200_000])
+def test_nesting(opening: bytes, depth: int) -> None:
+    """Depths that the decoder takes, but that no repr() survives."""
+    for before in (b"\x82\xa1v\x01\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping\xa1v\x01\xa1x", b""):
+        message_or_refusal(before + opening * depth + b"\x90")
+
+
+def test_a_field_nested_too_deeply_is_refused_before_anybody_looks_at_it() -> None:
+    nested: Any = 1
+    for _ in range(100):
+        nested = {"recipe": nested}
+    refuse({"v": 1, "t": "hello", "spec": nested, "arrays": [], "batch_size": 1, "seed": 1}, LimitExceeded, "nested")
+
+
+# --- form -------------------------------------------------------------------------------------------------------------
+
+
+@by_name
+def test_no_field_may_be_missing(cls: type[Any]) -> None:
+    for field in dataclasses.fields(cls):
+        fields = plain(example(cls))
+        del fields[field.name]
+        refuse(fields, match=f"expected .*{field.name}")
+
+
+@by_name
+def test_no_field_may_be_added(cls: type[Any]) -> None:
+    for key in ("more", "", "self", b"lease"):
+        refuse(plain(example(cls)) | {key: 1}, match="fields .*, expected ")
+
+
+@by_name
+def test_every_field_is_of_its_type(cls: type[Any]) -> None:
+    for field in dataclasses.fields(cls):
+        for value in WRONG[str(field.type)]:
+            refuse(plain(example(cls)) | {field.name: value}, match=rf"\.{field.name}: expected ")
+
+
+@by_name
+@pytest.mark.parametrize("version", [0, 2, -1, 2**64 - 1, 1.0, True, "1", None, [1], {"v": 1}])
+def test_other_versions_are_refused_with_both_numbers(cls: type[Any], version: Any) -> None:
+    refuse(plain(example(cls)) | {"v": version}, VersionMismatch, f"this side version {PROTOCOL_VERSION}")
+
+
+@pytest.mark.parametrize("name", ["Ping", "", "sample-header", None, 1, ["ping"], {"t": "ping"}, b"ping"])
+def test_other_types_are_refused(name: Any) -> None:
+    refuse({"v": PROTOCOL_VERSION, "t": name}, match="unknown message type")
+
+
+@pytest.mark.parametrize("fields", [None, 1, "ping", [], {}, {"v": 1}, {"t": "ping"}, {b"v": 1, b"t": "ping"}])
+def test_what_is_no_map_with_version_and_type(fields: Any) -> None:
+    refuse(fields, match="no version or type")
+
+
+def test_nothing_may_follow_a_message() -> None:
+    with pytest.raises(ProtocolError, match="ExtraData"):
+        decode(bytes(encode(Ping())[0]) + b"\0")
+    with pytest.raises(ProtocolError, match="not a message"):
+        decode(b"")
+
+
+def test_extension_types_and_bad_text_are_refused() -> None:
+    for value in (msgpack.Timestamp(1, 2), msgpack.ExtType(5, b"x")):
+        refuse({"v": 1, "t": "refused", "code": value, "text": ""}, match="code: expected str")
+        refuse({"v": value, "t": "ping"}, VersionMismatch)
+    with pytest.raises(ProtocolError, match="UnicodeDecodeError"):
+        decode(b"\x82\xa1v\x01\xa1t\xa2\xff\xfe")
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_oversize_header_is_refused_unread() -> None:
+    with pytest.raises(LimitExceeded, match=f"{LARGEST_HEADER_BYTES + 1} bytes; the limit is {LARGEST_HEADER_BYTES}"):
+        decode(bytes(LARGEST_HEADER_BYTES + 1))
+    with pytest.raises(LimitExceeded, match=r"a refused header of .* the limit is"):
+        encode(Refused("malformed", "x" * LARGEST_HEADER_BYTES))
+
+
+def test_the_largest_header_passes() -> None:
+    room = LARGEST_HEADER_BYTES - len(encode(Refused("", "x" * 100_000))[0]) + 100_000
+    message = Refused("", "x" * room)
+    assert len(encode(message)[0]) == LARGEST_HEADER_BYTES
+    assert decode(encode(message)[0]) == message
+
+
+def test_lists_are_limited() -> None:
+    assert decode(encode(Want(0, tuple(range(LARGEST_TUPLE))))[0]) == Want(0, tuple(range(LARGEST_TUPLE)))
+    refuse(plain(Want(0, (0,) * (LARGEST_TUPLE + 1))), LimitExceeded, f"the limit is {LARGEST_TUPLE}")
+
+
+def test_a_list_that_only_claims_to_be_huge_is_refused() -> None:
+    for claim in (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"):
+        with pytest.raises(ProtocolError, match="not a message"):
+            decode(b"\x84\xa1v\x01\xa1t\xa4want\xa5epoch\x00\xa7indices" + claim)
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+def header(names: Any, dtypes: Any, shapes: Any) -> SampleHeader:
+    return SampleHeader(0, 0, tuple(names), tuple(dtypes), tuple(shapes), {}, "w", 0.0)
+
+
+_arrays = st.dictionaries(
+    st.text(max_size=5),
+    st.tuples(st.sampled_from(ARRAY_DTYPES), st.lists(st.integers(1, 4), min_size=1, max_size=8)),
+    max_size=8,
+)
+
+
+@given(_arrays, st.integers(0, 2**32 - 1))
+def test_arrays_travel_unchanged(layout: dict[str, tuple[str, list[int]]], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    arrays = {
+        name: np.frombuffer(rng.bytes(math.prod(shape) * np.dtype(dtype).itemsize), dtype).reshape(shape)
+        for name, (dtype, shape) in layout.items()
+    }
+    frames = encode_sample(
+        epoch=3, index=2**48 - 1, arrays=arrays, provenance={"video": "a"}, worker="w", cpu_seconds=0.25
+    )
+    message = decode(frames[0])
+    assert isinstance(message, SampleHeader)
+    assert (message.epoch, message.index, message.worker, message.cpu_seconds) == (3, 2**48 - 1, "w", 0.25)
+    again = decode_sample(message, [bytes(frame) for frame in frames[1:]])
+    assert list(again) == list(arrays)
+    for name, array in arrays.items():
+        assert again[name].dtype == array.dtype
+        assert again[name].shape == array.shape
+        assert again[name].tobytes() == array.tobytes()
+
+
+def test_nothing_is_copied_and_nothing_can_be_written() -> None:
+    voxels = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    frames = encode_sample(epoch=0, index=0, arrays={"v": voxels}, provenance={}, worker="", cpu_seconds=0.0)
+    assert np.shares_memory(np.frombuffer(frames[1], np.uint8), voxels)
+    buffer = bytearray(frames[1])
+    read = decode_sample(header("v", ["int16"], [3, 2, 3, 4]), [buffer])["v"]
+    assert np.shares_memory(read, np.frombuffer(buffer, np.uint8))
+    with pytest.raises(ValueError, match="read-only"):
+        read[0] = 0
+
+
+def test_only_listed_dtypes_and_contiguous_arrays_are_sent() -> None:
+    good = np.zeros((4, 4), np.int16)
+    for bad in (good.astype(np.float64), good.astype(bool), good[:, ::2], good.T[1:], good.astype(object)):
+        with pytest.raises(LimitExceeded, match="array v: dtype"):
+            encode_sample(epoch=0, index=0, arrays={"v": bad}, provenance={}, worker="", cpu_seconds=0.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "dtypes", "shapes", "payload"),
+    [
+        ("a", ["int8"], [1, 3], []),
+        ("a", [], [1, 3], [b"abc"]),
+        ([], ["int8"], [1, 3], [b"abc"]),
+        ("a", ["int8"], [1, 3], [b"abc", b"abc"]),
+        ("aa", ["int8"] * 2, [1, 1, 1, 1], [b"a", b"a"]),
+        ("abcdefghi", ["int8"] * 9, [1, 1] * 9, [b"a"] * 9),
+        ("a", ["int8"], [1, 3], [b"ab"]),
+        ("a", ["int8"], [1, 3], [b"abcd"]),
+        ("a", ["int16"], [1, 3], [b"abc"]),
+        ("a", ["float64"], [1, 1], [bytes(8)]),
+        ("a", ["object"], [1, 1], [bytes(8)]),
+        ("a", ["O"], [1, 1], [bytes(8)]),
+        ("a", ["int8,int8"], [1, 1], [bytes(2)]),
+        ("a", [">i2"], [1, 1], [bytes(2)]),
+        ("a", [""], [1, 1], [bytes(8)]),
+        ("a", ["int8"], [], [b""]),
+        ("a", ["int8"], [0], [b"a"]),
+        ("a", ["int8"], [2, 3], [b"abc"]),
+        ("a", ["int8"], [1], [b"abc"]),
+        ("a", ["int8"], [1, 3, 1], [b"abc"]),
+        ("a", ["int8"], [9, *[1] * 9], [b"a"]),
+        ("a", ["int8"], [2**64 - 1, 1], [b"a"]),
+        # No extent of zero: the product says nothing about the other extents then.
+        ("a", ["int8"], [1, 0], [b""]),
+        ("a", ["int8"], [2, 0, 2**64 - 1], [b""]),
+        ("a", ["int8"], [3, 2**63, 0, 2**63], [b""]),
+        # Products that wrap around to something harmless in 64 bits.
+        ("a", ["int8"], [2, 2**32, 2**32], [b""]),
+        ("a", ["int8"], [3, 2**32, 2**32, 1], [b""]),
+        ("a", ["int16"], [1, 2**63 + 1], [b"ab"]),
+        ("a", ["float32"], [2, 2**62 + 1, 1], [b"abcd"]),
+        ("a", ["int8"], [1, 2**64 - 1], [b""]),
+        ("a", ["int8"], [8, *[2**64 - 1] * 8], [b""]),
+    ],
+)
+def test_disagreements_are_the_peers_fault(names: Any, dtypes: Any, shapes: Any, payload: list[bytes]) -> None:
+    with pytest.raises(ProtocolError, match=r"^sample: "):
+        decode_sample(header(names, dtypes, shapes), payload)
+
+
+def test_an_array_above_the_limit_is_named_with_both_numbers() -> None:
+    with pytest.raises(LimitExceeded, match=f"{LARGEST_ARRAY_BYTES + 1} bytes; the limit is {LARGEST_ARRAY_BYTES}"):
+        decode_sample(header("a", ["int8"], [1, LARGEST_ARRAY_BYTES + 1]), [b""])
+
+
+@given(
+    st.lists(st.text(max_size=2), max_size=3),
+    st.lists(st.sampled_from((*ARRAY_DTYPES, "float64", "O")), max_size=3),
+    st.lists(st.integers(0, 3) | st.integers(0, 2**64 - 1), max_size=9),
+    st.lists(st.binary(max_size=12), max_size=3),
+)
+@with_example(["a"], ["int8"], [2, 0, 2**64 - 1], [b""])
+@settings(max_examples=300)
+def test_arbitrary_samples(names: list[str], dtypes: list[str], shapes: list[int], payload: list[bytes]) -> None:
+    try:
+        arrays = decode_sample(header(names, dtypes, shapes), payload)
+    except ProtocolError:
+        return
+    assert [array.tobytes() for array in arrays.values()] == payload
+
+
+def test_one_message_of_each_kind_is_small() -> None:
+    """A lease is the largest header in use; what polls and goodbyes cost is a handful of bytes."""
+    assert len(encode(Goodbye())[0]) < 20
+    assert len(encode(example(Lease))[0]) < 400

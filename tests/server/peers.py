@@ -1,0 +1,163 @@
+"""Fake consumers and workers around a dispatcher, and a post office that carries its instructions out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from tests.server.corpus import SMALL_SPEC, corpus, video
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.messages import (
+    Begun,
+    Hello,
+    JobFailed,
+    Lease,
+    Message,
+    Refused,
+    Result,
+    SampleHeader,
+    Unavailable,
+    Want,
+    Welcome,
+    WorkerHello,
+)
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import Buffer, decode, encode
+from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, ToConsumer, ToWorker
+from v2v_server.video.catalogue import Catalogue
+
+DEADLINE = 60.0
+IDLE = 600.0
+CREDIT = 2
+"""Leases a fake worker holds at a time, as the real one does."""
+
+
+def sample_frames(epoch: int, index: int, worker: bytes = b"w") -> list[Buffer]:
+    """A whole SampleHeader message of one small array."""
+    header = SampleHeader(epoch, index, ("voxels",), ("int8",), (1, 3), {}, worker.decode(), 0.1)
+    return [*encode(header), memoryview(b"abc")]
+
+
+@dataclass
+class Peers:
+    """A dispatcher and everybody who talks to it.
+
+    Attributes:
+        dispatcher: the one under test.
+        now: the time everybody agrees on.
+        frames: what each consumer was sent, in raw frames.
+        heard: the same, decoded.
+        leases: what each worker holds, oldest first; a worker works in this order.
+        told: what else each worker was told.
+        given_up: workers that were to be killed.
+    """
+
+    dispatcher: Dispatcher
+    now: float = 0.0
+    frames: dict[bytes, list[Sequence[Buffer]]] = field(default_factory=dict)
+    heard: dict[bytes, list[Message]] = field(default_factory=dict)
+    leases: dict[bytes, deque[Lease]] = field(default_factory=dict)
+    told: dict[bytes, list[Message]] = field(default_factory=dict)
+    given_up: list[bytes] = field(default_factory=list)
+
+    # --- carrying -----------------------------------------------------------------------------------------------------
+
+    def carry_out(self, instructions: list[Instruction]) -> None:
+        for instruction in instructions:
+            match instruction:
+                case ToConsumer(identity, frames):
+                    self.frames.setdefault(identity, []).append(frames)
+                    self.heard.setdefault(identity, []).append(decode(frames[0]))
+                case ToWorker(identity, frames):
+                    message = decode(frames[0])
+                    if isinstance(message, Lease):
+                        self.leases.setdefault(identity, deque()).append(message)
+                    else:
+                        self.told.setdefault(identity, []).append(message)
+                case GiveUp(identity, _):
+                    self.given_up.append(identity)
+
+    def consumer_says(self, identity: bytes, message: Message) -> list[Message]:
+        """Sends a consumer's message; returns what that consumer heard in reply."""
+        before = len(self.heard.get(identity, []))
+        self.carry_out(self.dispatcher.from_consumer(identity, encode(message), self.now))
+        return self.heard.get(identity, [])[before:]
+
+    def worker_says(self, identity: bytes, message: Message, *payload: Buffer) -> None:
+        self.carry_out(self.dispatcher.from_worker(identity, [*encode(message), *payload], self.now))
+
+    def tick(self, seconds: float) -> None:
+        self.now += seconds
+        self.carry_out(self.dispatcher.tick(self.now))
+
+    # --- what peers do ------------------------------------------------------------------------------------------------
+
+    def hello(self, identity: bytes = b"c", *, batch_size: int = 4, seed: int = 0, **spec: Any) -> Welcome:
+        (welcome,) = self.consumer_says(identity, Hello(spec, ("voxels",), batch_size, seed))
+        if not isinstance(welcome, Welcome):
+            raise AssertionError(welcome)
+        return welcome
+
+    def want(self, *indices: int, identity: bytes = b"c", epoch: int = 0) -> list[Message]:
+        return self.consumer_says(identity, Want(epoch, indices))
+
+    def join(self, identity: bytes = b"w", credit: int = CREDIT) -> None:
+        self.leases[identity] = deque()
+        self.worker_says(identity, WorkerHello(identity.decode(), "host", 1, NUMERICS_VERSION, credit))
+
+    def begin(self, identity: bytes = b"w") -> Lease:
+        lease = self.leases[identity][0]
+        self.worker_says(identity, Begun(lease.lease))
+        return lease
+
+    def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1) -> Lease:
+        """Answers the oldest lease."""
+        lease = self.leases[identity].popleft()
+        payload = sample_frames(lease.epoch, lease.indices[0], identity)
+        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *payload)
+        return lease
+
+    def fail(self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7) -> Lease:
+        lease = self.leases[identity].popleft()
+        self.worker_says(identity, JobFailed(lease.lease, frame, reason))
+        return lease
+
+    def die(self, identity: bytes = b"w", blame: str | None = None) -> list[Lease]:
+        """The worker's process ends; returns the leases it held."""
+        held = list(self.leases.pop(identity, ()))
+        self.carry_out(self.dispatcher.worker_lost(identity, blame, self.now))
+        return held
+
+    def work_off(self, identity: bytes = b"w") -> None:
+        """The worker finishes everything it is given."""
+        while self.leases[identity]:
+            self.begin(identity)
+            self.finish(identity)
+
+    # --- what came of it ----------------------------------------------------------------------------------------------
+
+    def samples(self, identity: bytes = b"c") -> list[tuple[int, int]]:
+        """(epoch, index) of the samples a consumer got."""
+        return [(m.epoch, m.index) for m in self.heard.get(identity, []) if isinstance(m, SampleHeader)]
+
+    def unavailable(self, identity: bytes = b"c") -> list[Unavailable]:
+        return [message for message in self.heard.get(identity, []) if isinstance(message, Unavailable)]
+
+    def refusals(self, identity: bytes = b"c") -> list[Refused]:
+        return [message for message in self.heard.get(identity, []) if isinstance(message, Refused)]
+
+
+def peers(catalogue: Catalogue | None = None, spec: StreamSpec = SMALL_SPEC, max_credit_bytes: int = 2 << 30) -> Peers:
+    """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
+    videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
+    return Peers(
+        Dispatcher(
+            videos if catalogue is None else catalogue,
+            spec,
+            lease_deadline_seconds=DEADLINE,
+            session_idle_seconds=IDLE,
+            max_credit_bytes=max_credit_bytes,
+        )
+    )

@@ -1,0 +1,264 @@
+"""Configuration: file and flags, refusals that name the flag, and no open port by accident."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.spec import StreamSpec
+from v2v_server.config import DEFAULT_BIND, ServeConfig, read_yaml_mapping, recipe_setting
+
+
+def load(tmp_path: Path, text: str | None = None, **flags: Any) -> ServeConfig:
+    """The configuration from a YAML text, if any, and flags."""
+    if text is None:
+        return ServeConfig.load(None, flags)
+    file = tmp_path / "serve.yaml"
+    file.write_text(text, encoding="utf-8")
+    return ServeConfig.load(str(file), flags)
+
+
+# --- file and flags ---------------------------------------------------------------------------------------------------
+
+
+def test_defaults(tmp_path: Path) -> None:
+    config = load(tmp_path, videos="clips", workers=None)
+    assert config == ServeConfig(videos="clips")
+    assert (config.workers, config.bind, config.insecure) == (2, DEFAULT_BIND, False)
+    assert config.spec == StreamSpec()
+
+
+def test_a_flag_wins_over_the_file_and_the_file_over_the_default(tmp_path: Path) -> None:
+    config = load(tmp_path, "videos: a\nworkers: 5\nrows: top:0.54\nshuffle: false\n", workers=7, rows=None)
+    assert (config.videos, config.workers, config.rows, config.shuffle) == ("a", 7, "top:0.54", False)
+    assert config.max_credit_bytes == ServeConfig(videos="a").max_credit_bytes
+
+
+def test_the_spec_is_made_of_the_spec_settings(tmp_path: Path) -> None:
+    text = """
+videos: a
+recipe: {preset: paper-flow, threshold: [0.1, 0.2]}
+voxel_dtype: int16
+shuffle: false
+max_sequences_per_video: 3
+on_bad_video: raise
+"""
+    recipe = preset("paper-flow").replace(threshold=(0.1, 0.2))
+    assert load(tmp_path, text).spec == StreamSpec(recipe, "int16", False, 3, "raise")
+    assert load(tmp_path, text, recipe="paper").spec.recipe == Recipe()
+
+
+def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
+    assert load(tmp_path, "", videos="a") == ServeConfig(videos="a")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("worker: 3", r"unknown key 'worker' \(did you mean 'workers'\?\); known: videos, workers"),
+        ("spec: 1", "unknown key 'spec'"),
+        ("zzz: 1", "unknown key 'zzz'; known"),
+        ("- a", "expected keys and values, found list"),
+        ("5: 6", "expected keys and values, found dict"),
+        ("a: [", "--config .*: not YAML"),
+        ("a: 2001-99-99", "--config .*: not YAML"),
+        ("workers: '2'", "--workers = '2': expected a value of kind int"),
+        ("workers: true", "--workers = True: expected a value of kind int"),
+        ("workers: 2.0", "--workers = 2.0"),
+        ("workers: -1", "--workers -1: give a whole number from 0 to 4096"),
+        ("workers: 4097", "--workers 4097"),
+        ("max_credit_bytes: 0", "--max-credit-bytes 0"),
+        ("max_credit_bytes: 1e9", "--max-credit-bytes = "),
+        ("insecure: 1", "--insecure = 1: expected a value of kind bool"),
+        ("shuffle: 'no'", "--shuffle = 'no'"),
+        ("bind: 5555", "--bind = 5555: expected a value of kind str"),
+        ("list: [a]", r"--list = \['a'\]: expected a value of kind str"),
+        ("rows: top", "rows 'top'"),
+        ("rows: top:1.5", "rows 0:1.5"),
+        ("lease_deadline_seconds: 0", "--lease-deadline-seconds 0: give a positive number of seconds"),
+        ("lease_deadline_seconds: .nan", "--lease-deadline-seconds nan"),
+        ("lease_deadline_seconds: .inf", "--lease-deadline-seconds inf"),
+        ("lease_deadline_seconds: true", "--lease-deadline-seconds True"),
+        ("session_idle_seconds: soon", "--session-idle-seconds soon"),
+        ("session_idle_seconds: -1", "--session-idle-seconds -1"),
+        ("voxel_dtype: int32", "voxel_dtype = 'int32'"),
+        ("on_bad_video: skip", "on_bad_video = 'skip'"),
+        ("max_sequences_per_video: 0", "max_sequences_per_video = 0"),
+        ("recipe: papr", r"unknown recipe preset 'papr' \(did you mean 'paper'\?\)"),
+        ("recipe: {self: 1}", "unknown recipe key 'self'"),
+        ("recipe: {1: 2}", "unknown recipe key '1'"),
+        ("recipe: {threshold: [1]}", r"recipe threshold = \[1\]"),
+        ("videos: ''", "--videos is missing"),
+        ("videos: 7", "--videos = 7"),
+    ],
+)
+def test_refusals_name_the_flag(tmp_path: Path, text: str, message: str) -> None:
+    flags = {} if text.startswith("videos") else {"videos": "a"}
+    with pytest.raises(UsageError, match=message):
+        load(tmp_path, text, **flags)
+
+
+def test_no_videos() -> None:
+    with pytest.raises(UsageError, match="--videos is missing"):
+        ServeConfig.load(None, {})
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--config .*: No such file"):
+        read_yaml_mapping("--config", str(tmp_path / "none.yaml"))
+    with pytest.raises(UsageError, match=r"--config .*: Is a directory"):
+        read_yaml_mapping("--config", str(tmp_path))
+    (tmp_path / "latin.yaml").write_bytes(b"a: \xe9")
+    with pytest.raises(UsageError, match=r"--recipe .*: not YAML"):
+        read_yaml_mapping("--recipe", str(tmp_path / "latin.yaml"))
+    with pytest.raises(UsageError, match="--config"):
+        read_yaml_mapping("--config", "a\0b")
+
+
+# --- addresses --------------------------------------------------------------------------------------------------------
+
+PRIVATE = [
+    "tcp://127.0.0.1:5555",
+    "tcp://127.0.0.1:*",
+    "tcp://127.0.0.1:0",
+    "tcp://127.1.2.3:1",
+    "tcp://localhost:65535",
+    "tcp://[::1]:5555",
+    "tcp://[::1]:*",
+    "ipc:///tmp/socket",
+    "ipc://@abstract",
+]
+REACHABLE = [
+    "tcp://0.0.0.0:5555",
+    "tcp://*:5555",
+    "tcp://*:*",
+    "tcp://[::]:5555",
+    "tcp://[::ffff:0.0.0.0]:5555",
+    "tcp://192.168.1.7:5555",
+    "tcp://8.8.8.8:5555",
+    "tcp://eth0:5555",
+    "tcp://lo:5555",
+    "tcp://example.org:5555",
+    "tcp://localhost.example.org:5555",
+    "tcp://127.0.0.1.example.org:5555",
+    "tcp://127.0.0.1@0.0.0.0:5555",
+    "tcp://127.0.0.1#@0.0.0.0:5555",
+    "tcp://127.0.0.1;0.0.0.0:5555",
+    "tcp://0:5555",
+    "tcp://0177.0.0.1:5555",
+    "tcp://127.1:5555",
+    "tcp://::1:5555:5555",
+    "tcp://[127.0.0.1:5555",
+    "tcp://[::1:5555",
+    "tcp://[fe80::1%lo]:5555",
+]
+MALFORMED = [
+    "127.0.0.1:5555",
+    "tcp://",
+    "tcp://127.0.0.1",
+    "tcp://:5555",
+    "tcp://127.0.0.1:",
+    "tcp://127.0.0.1:65536",
+    "tcp://127.0.0.1:-1",
+    "tcp://127.0.0.1:5555/",
+    "tcp://127.0.0.1:\u00b2",
+    "tcp://127.0.0.1:\u0665",
+    "tcp://127.0.0.1:55 55",
+    "tcp://[::1]",
+    "http://127.0.0.1:80",
+    "inproc://x",
+    "ipc://",
+    "5555",
+]
+
+
+@pytest.mark.parametrize("flag", ["bind", "worker_bind"])
+@pytest.mark.parametrize("address", PRIVATE)
+def test_this_host_needs_no_word(flag: str, address: str) -> None:
+    assert getattr(ServeConfig.load(None, {"videos": "a", flag: address}), flag) == address
+
+
+@pytest.mark.parametrize("flag", ["bind", "worker_bind"])
+@pytest.mark.parametrize("address", REACHABLE)
+def test_other_hosts_are_let_in_only_in_so_many_words(flag: str, address: str) -> None:
+    with pytest.raises(UsageError, match=rf"--{flag.replace('_', '-')} .*--insecure"):
+        ServeConfig.load(None, {"videos": "a", flag: address})
+    assert getattr(ServeConfig.load(None, {"videos": "a", flag: address, "insecure": True}), flag) == address
+
+
+@pytest.mark.parametrize("insecure", [True, False])
+@pytest.mark.parametrize("address", MALFORMED)
+def test_what_is_no_address(address: str, insecure: bool) -> None:
+    with pytest.raises(UsageError, match=r"--bind .*: write tcp://HOST:PORT"):
+        ServeConfig.load(None, {"videos": "a", "bind": address, "insecure": insecure})
+
+
+@given(st.text(max_size=20) | st.text(alphabet="[]:*@/.0127%#;", max_size=16))
+def test_any_text_is_an_address_or_a_refusal(text: str) -> None:
+    for address in (text, f"tcp://{text}", f"tcp://{text}:5555", f"tcp://127.0.0.1:{text}"):
+        try:
+            ServeConfig(videos="a", bind=address)
+        except UsageError:
+            continue
+        assert address.startswith(("tcp://127.", "tcp://[::1]:", "tcp://localhost:", "ipc://", "tcp://::1:")), address
+
+
+def test_an_empty_worker_address_is_a_private_one_and_an_empty_bind_is_none() -> None:
+    assert ServeConfig(videos="a", worker_bind="").worker_bind == ""
+    with pytest.raises(UsageError, match="--bind ''"):
+        ServeConfig(videos="a", bind="")
+
+
+# --- --recipe and --set -----------------------------------------------------------------------------------------------
+
+
+def test_nothing_asked_leaves_the_file_its_say() -> None:
+    assert recipe_setting(None, []) is None
+
+
+def test_settings_change_the_named_preset(tmp_path: Path) -> None:
+    assert recipe_setting("paper-eraft", []) == preset("paper-eraft")
+    assert recipe_setting(None, ["bins=3"]) == Recipe(bins=3)
+    asked = recipe_setting(
+        "paper-flow", ["threshold=[0.2, 0.5]", " gamma = 2 ", "noise_scales_with_threshold=true", "noise_unit=second"]
+    )
+    assert asked == preset("paper-flow").replace(
+        threshold=(0.2, 0.5), gamma=2.0, noise_scales_with_threshold=True, noise_unit="second"
+    )
+    file = tmp_path / "recipe.yaml"
+    file.write_text("preset: paper-eraft\nbins: 3\n", encoding="utf-8")
+    assert recipe_setting(str(file), ["bins=4"]) == preset("paper-eraft").replace(bins=4)
+    assert StreamSpec.from_dict({"recipe": recipe_setting(str(file), [])}).recipe.bins == 3
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("bins", "--set bins: write KEY=VALUE"),
+        ("", "--set : write KEY=VALUE"),
+        ("bins=[", r"--set bins=\[: '\[' is not a value"),
+        ("gamma=2001-99-99", "is not a value"),
+        ("bin=3", "unknown recipe key 'bin'"),
+        ("self=3", "unknown recipe key 'self'"),
+        ("=3", "unknown recipe key ''"),
+        ("bins=", "recipe bins = None"),
+        ("bins=3.5", "recipe bins = 3.5"),
+        ("bins=yes", "recipe bins = True"),
+        ("gamma=.nan", "recipe gamma = nan"),
+        ("preset=papr", "unknown recipe preset"),
+    ],
+)
+def test_settings_that_make_no_sense(setting: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        recipe_setting(None, [setting])
+
+
+def test_an_unknown_preset() -> None:
+    with pytest.raises(RecipeError, match="unknown recipe preset 'papr'"):
+        recipe_setting("papr", [])

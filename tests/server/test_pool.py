@@ -1,0 +1,269 @@
+"""The pool with harmless programs in the place of workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from v2v_protocol.errors import WorkerCrashLoop
+from v2v_server import pool as pool_module
+from v2v_server.pool import Death, Pool
+
+SLEEPS = "import time\ntime.sleep(600)"
+LEAVES = "import sys\nsys.exit(3)"
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool]]:
+    """Makes a pool of programs given as Python text; all are gone at the end."""
+    pools: list[Pool] = []
+
+    def make(workers: int, program: str) -> Pool:
+        monkeypatch.setattr(
+            pool_module, "_command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
+        )
+        pools.append(Pool(workers, Path("/corpus"), "tcp://127.0.0.1:1", "label"))
+        return pools[-1]
+
+    yield make
+    for each in pools:
+        each.stop(join_seconds=0.0, terminate_seconds=0.0)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Waits for a condition without sleeping through it; a minute is long enough for anything here."""
+    deadline = time.monotonic() + 60.0
+    pause = threading.Event()
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError("the condition never came true")
+        pause.wait(0.005)
+
+
+def all_dead(pool: Pool) -> None:
+    until(lambda: pool.running == 0)
+
+
+def is_gone(pid: int) -> bool:
+    """Neither running nor a zombie."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+# --- starting and watching --------------------------------------------------------------------------------------------
+
+
+def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    assert (pool.running, pool.pids()) == (0, [])
+    assert pool.check(0.0, 0) == []
+    assert pool.running == 2
+    pids = pool.pids()
+
+    def names() -> list[bytes]:
+        # The last argument; a process has none to show until its program has been loaded.
+        return [Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").split(b"\0")[-1] for pid in pids]
+
+    until(lambda: b"" not in names())
+    assert names() == [b"label-0.1", b"label-1.1"]
+    assert pool.check(100.0, 0) == []
+    assert pool.pids() == pids
+
+
+def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
+    pool = start(0, SLEEPS)
+    assert pool.check(0.0, 0) == []
+    pool.stop()
+
+
+def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    (pid,) = pool.pids()
+    assert os.getpgid(pid) == pid != os.getpgid(0)
+
+
+@pytest.mark.parametrize(
+    ("number", "blamed"),
+    [
+        (signal.SIGKILL, False),
+        (signal.SIGTERM, False),
+        (signal.SIGHUP, False),
+        (signal.SIGSEGV, True),
+        (signal.SIGBUS, True),
+        (signal.SIGABRT, True),
+        (signal.SIGFPE, True),
+        (signal.SIGILL, True),
+    ],
+)
+def test_a_crash_is_blamed_and_a_kill_is_not(
+    start: Callable[[int, str], Pool], number: signal.Signals, blamed: bool
+) -> None:
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    os.kill(pool.pids()[0], number)
+    all_dead(pool)
+    (death,) = pool.check(1.0, 0)
+    assert death.identity == b"label-0.1"
+    assert death.status == f"was ended by {number.name}"
+    assert (death.blame is not None) == blamed
+    if death.blame is not None:
+        assert number.name in death.blame
+
+
+@pytest.mark.parametrize("status", [0, 1, 3])
+def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], status: int) -> None:
+    pool = start(1, f"import sys\nsys.exit({status})")
+    pool.check(0.0, 0)
+    all_dead(pool)
+    assert pool.check(0.0, 0) == [Death(b"label-0.1", f"exited with status {status}", None)]
+
+
+def test_a_signal_without_a_name(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    os.kill(pool.pids()[0], signal.SIGRTMIN + 3)
+    all_dead(pool)
+    (death,) = pool.check(1.0, 0)
+    assert death.status == f"was ended by signal {signal.SIGRTMIN + 3}"
+    assert death.blame is None
+
+
+def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    pool.check(0.0, 0)
+    hung, other = pool.pids()
+    pool.give_up(b"label-9.9")
+    pool.give_up(b"label-0.1")
+    until(lambda: pool.running == 1)
+    assert pool.check(0.0, 0) == []
+    assert pool.pids() == [other]
+    assert pool.check(100.0, 0) == []
+    assert pool.running == 2
+    assert is_gone(hung)
+    # The next life of the slot is a new worker: its death is reported.
+    os.kill(pool.pids()[0], signal.SIGKILL)
+    until(lambda: pool.running == 1)
+    assert [death.identity for death in pool.check(200.0, 0)] == [b"label-0.2"]
+
+
+# --- restarting -------------------------------------------------------------------------------------------------------
+
+
+def kill_one(pool: Pool) -> None:
+    os.kill(pool.pids()[0], signal.SIGKILL)
+    all_dead(pool)
+
+
+def test_each_death_in_a_row_doubles_the_wait(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    now = 0.0
+    pool.check(now, 0)
+    for wait in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0):
+        kill_one(pool)
+        pool.check(now, 0)
+        pool.check(now + 0.99 * wait, 0)
+        assert pool.running == 0
+        now += 1.01 * wait
+        pool.check(now, 0)
+        assert pool.running == 1
+
+
+def test_the_wait_is_bounded_however_large_the_pool() -> None:
+    """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
+    pool = Pool(1000, Path("/corpus"), "tcp://127.0.0.1:1", "label")
+    for slot in pool._slots[:1]:
+        slot.start_at = 0.0
+    for slot in pool._slots[1:]:
+        slot.start_at = float("inf")
+    pool._deaths_in_a_row = pool.crash_budget - 1
+    dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
+    dead.wait()
+    pool._slots[0].process, pool._slots[0].identity = dead, b"label-0.1"
+    (death,) = pool.check(100.0, 0)
+    assert death.identity == b"label-0.1"
+    assert pool._slots[0].start_at == 110.0
+
+
+def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, LEAVES)
+    assert pool.crash_budget == 7
+    now = 0.0
+    for _ in range(pool.crash_budget):
+        pool.check(now, 0)
+        all_dead(pool)
+        assert len(pool.check(now, 0)) == 1
+        now += 60.0
+    pool.check(now, 0)
+    all_dead(pool)
+    with pytest.raises(WorkerCrashLoop, match=r"8 server workers died in a row .* \(limit 7\).*exited with status 3"):
+        pool.check(now, 0)
+
+
+def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    now = 0.0
+    for samples in range(2 * pool.crash_budget):
+        pool.check(now, samples)
+        kill_one(pool)
+        # The first death after progress waits the shortest time again.
+        assert len(pool.check(now, samples + 1)) == 1
+        now += 0.21
+
+
+# --- stopping ---------------------------------------------------------------------------------------------------------
+
+
+def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, "import time\ntime.sleep(0.05)")
+    pool.check(0.0, 0)
+    pids = pool.pids()
+    pool.stop(join_seconds=60.0)
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool], tmp_path: Path) -> None:
+    stubborn = (
+        "import signal, sys, time\n"
+        "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
+        "    signal.signal(number, signal.SIG_IGN)\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[1], 'w').close()\n"
+        "time.sleep(600)\n"
+    )
+    pool = start(2, stubborn)
+    pool.check(0.0, 0)
+    pids = pool.pids()
+    until(lambda: len(list(tmp_path.iterdir())) == 2)
+    pool.stop(join_seconds=0.0, terminate_seconds=0.1)
+    assert pool.running == 0
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    pool.check(0.0, 0)
+    pids = pool.pids()
+    os.kill(pids[0], signal.SIGKILL)
+    pool.stop(join_seconds=0.0)
+    pool.stop()
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_the_programs_of_real_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = pool_module._command("tcp://127.0.0.1:5556", Path("/a folder"), "w-0.1")
+    assert command[:4] == [sys.executable, "-m", "v2v_server.cli", "worker"]
+    assert command[4:] == [
+        *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
+        *("--parent-pid", str(os.getpid())),
+    ]

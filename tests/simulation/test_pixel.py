@@ -1,0 +1,245 @@
+"""The kernel against its numpy definition (bit for bit) and against the slow oracle."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.simulation import oracle, reference
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_server.simulation import noise, simulate, simulate_clip, simulate_log
+from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.intensity import log_table
+from v2v_server.simulation.voxel import rounding_tolerance
+
+PLAIN = SampleParams(0.2, 0.2, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+
+
+def moving_frames(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Drifting texture: smooth, with steps at some pixels; the same bytes under every numpy."""
+    row, column = np.arange(height)[:, None], np.arange(width)[None, :]
+    return np.stack(
+        [((row * 3 + column * 5 + t * 7 + seed + (row * column * (t // 4)) % 17) % 256).astype(np.uint8)
+         for t in range(count)]
+    )  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    voxels=st.integers(1, 3),
+    bins=st.integers(1, 3),
+    frames_per_bin=st.integers(1, 3),
+    thresholds=st.tuples(st.floats(1e-3, 3.0), st.floats(1e-3, 3.0)),
+    noise_sigma=st.sampled_from([0.0, 0.01, 0.1, 1.0]),
+    hot_share=st.sampled_from([0.0, 0.05, 1.0]),
+    dtype=st.sampled_from(["int8", "int16", "float32"]),
+    seconds=st.booleans(),
+    pause=st.booleans(),
+    key=st.tuples(*[st.integers(0, 2**32 - 1)] * 4),
+)
+def test_kernel_equals_its_numpy_definition(
+    height, width, voxels, bins, frames_per_bin, thresholds, noise_sigma, hot_share, dtype, seconds, pause, key
+):
+    recipe = Recipe(
+        voxels_per_clip=voxels, bins=bins, frames_per_bin=frames_per_bin, crop_height_px=height, crop_width_px=width,
+        noise_unit="second" if seconds else "frame",
+    )  # fmt: skip
+    threshold_pos, threshold_neg = (float(np.float32(c)) for c in thresholds)
+    hot_count = int(hot_share * height * width)
+    pauses = ((1, max(1, recipe.steps // 2)),) if pause else ()
+    params = SampleParams(
+        threshold_pos, threshold_neg, noise_sigma, hot_count, 3.0, pauses, 1.0, 0, 0, False, 0.0, key
+    )
+    frames = moving_frames(recipe.frames_needed, height, width)
+    step_seconds = np.linspace(0.01, 0.5, recipe.steps) if seconds else None
+    got = simulate_clip(frames, params, recipe, dtype, step_seconds)
+
+    shown = frames[params.source_index(recipe.steps)].reshape(recipe.steps + 1, -1)
+    durations = np.ones(recipe.steps) if step_seconds is None else step_seconds
+    expected, saturated = reference.simulate(
+        log_table(2.2, 1e-3)[shown],
+        key,
+        threshold_pos=threshold_pos,
+        threshold_neg=threshold_neg,
+        noise_scale=noise_sigma * np.sqrt(durations) if noise_sigma else None,
+        hot_count=hot_count,
+        hot_sigma=3.0,
+        hot_scale=durations,
+        frames_per_bin=frames_per_bin,
+        dtype=dtype,
+    )
+    assert got.voxels.shape == (voxels, bins, height, width)
+    assert got.voxels.dtype == dtype
+    np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
+    assert got.saturated_bins == saturated
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(("height", "width"), [(16, 32), (31, 33), (1, 1), (1, 1025), (32, 48)])
+def test_log_frames_of_any_size_and_precision_equal_the_definition(precision, height, width):
+    steps = 15
+    level = np.sin(np.arange((steps + 1) * height * width) * 0.37).reshape(steps + 1, height, width) * 2
+    got = simulate_log(
+        level, threshold_pos=0.1, threshold_neg=0.15, noise_sigma=0.2, hot_pixel_count=1, hot_pixel_sigma=2.0,
+        bins=3, seed=5, dtype="float32", precision=precision,
+    )  # fmt: skip
+    expected, _ = reference.simulate(
+        level.reshape(steps + 1, -1).astype(precision), noise_key_of_seed(5), threshold_pos=0.1, threshold_neg=0.15,
+        noise_scale=np.full(steps, 0.2), hot_count=1, hot_sigma=2.0, hot_scale=np.ones(steps), frames_per_bin=1,
+        dtype="float32",
+    )  # fmt: skip
+    np.testing.assert_array_equal(got.voxels.reshape(steps, -1), expected)
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.1, 0.2, 1 / 3, 0.7, 1.0])
+@pytest.mark.parametrize("offset", [-6.9, -3.3, 0.0, 2.7])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_ramp_of_k_thresholds_gives_k_events(threshold, offset, sign):
+    threshold = float(np.float32(threshold))
+    steps = 40
+    ramp = offset + sign * 20 * threshold * np.arange(steps + 1) / steps
+    frames = np.broadcast_to(ramp[:, None, None], (steps + 1, 24, 25))
+    got = simulate_log(frames, threshold_pos=threshold, bins=5, seed=1, dtype="int16")
+    np.testing.assert_array_equal(got.voxels.sum((0, 1)), np.full((24, 25), 20 * sign))
+
+
+def test_a_ramp_of_two_log_units_at_a_tenth_gives_twenty_events():
+    ramp = np.broadcast_to(np.linspace(-5, -3, 11)[:, None, None], (11, 128, 128))
+    assert (simulate_log(ramp, threshold_pos=0.1, bins=5).voxels.sum((0, 1)) == 20).all()
+
+
+def test_exact_multiples_count_from_any_exact_residual():
+    # Every step moves by exactly one threshold: one event per step, whatever the residual starts at.
+    threshold = 0.1
+    ramp = np.arange(31) * threshold - 3
+    frames = np.broadcast_to(ramp[:, None, None], (31, 64, 64))
+    got = simulate_log(frames, threshold_pos=threshold, bins=1).voxels
+    assert np.abs(got.astype(int).sum((0, 1)) - 30).max() == 0
+
+
+def test_a_static_scene_is_silent_after_the_first_bin():
+    frames = np.broadcast_to(moving_frames(1, 64, 64), (21, 64, 64))
+    voxels = simulate(frames, threshold_pos=0.1, threshold_neg=0.13, bins=5).voxels.reshape(20, 64, 64)
+    assert not voxels[1:].any()
+    assert np.count_nonzero(voxels[0]) <= 1
+
+
+def test_equal_thresholds_swap_polarity_with_inverted_intensity():
+    level = np.cumsum(np.cos(np.arange(51 * 200) * 1.7).reshape(51, 10, 20), axis=0)
+    up = simulate_log(level, threshold_pos=0.1, threshold_neg=0.2, bins=1, dtype="float32").voxels
+    down = simulate_log(-level, threshold_pos=0.2, threshold_neg=0.1, bins=1, dtype="float32").voxels
+    # The start of the residual is mirrored too, so only totals are comparable, to one event.
+    assert np.abs(up.sum((0, 1)) + down.sum((0, 1))).max() <= 10
+    key = noise_key_of_seed(0)
+    start = noise.start_uniforms(key, 200).astype(np.float64)
+    forward = oracle.simulate(
+        level.reshape(51, -1), np.zeros((50, 200)), start, threshold_pos=0.1, threshold_neg=0.2, tolerance=0.0
+    )
+    mirrored = oracle.simulate(
+        -level.reshape(51, -1), np.zeros((50, 200)), 1 - start, threshold_pos=0.2, threshold_neg=0.1, tolerance=0.0
+    )
+    np.testing.assert_array_equal(forward.voxels, -mirrored.voxels)
+    np.testing.assert_array_equal(forward.voxels, up.reshape(50, 200))
+
+
+def test_events_account_for_every_change():
+    steps, pixels = 60, 150
+    level = oracle.log_intensity(moving_frames(steps + 1, 10, 15).reshape(steps + 1, -1), 2.2, 1e-3)
+    key = noise_key_of_seed(3)
+    normals = noise.standard_normals(key, steps, pixels).astype(np.float64) * 0.1
+    start = noise.start_uniforms(key, pixels).astype(np.float64)
+    trace = oracle.simulate(
+        level, normals, start, threshold_pos=0.2, threshold_neg=0.3, tolerance=rounding_tolerance(0.2, 0.3)
+    )
+    change = level[-1] - level[0] + normals.sum(0)
+    np.testing.assert_allclose(trace.signed_change, change + trace.residual_start - trace.residual_end, atol=1e-12)
+    assert -0.3 < trace.residual_low < trace.residual_high < 0.2
+    # The kernel's voxels leave a residual in the same range: conservation seen from outside.
+    got = simulate(
+        moving_frames(steps + 1, 10, 15), threshold_pos=0.2, threshold_neg=0.2, noise_sigma=0.1, bins=1, seed=3,
+        dtype="float32",
+    )  # fmt: skip
+    equal = oracle.simulate(level, normals, start, threshold_pos=0.2, threshold_neg=0.2, tolerance=2.0**-20)
+    left = equal.residual_start + change - 0.2 * got.voxels.reshape(steps, -1).sum(0)
+    assert np.abs(left).max() < 0.2 + 1e-5
+
+
+def test_a_paused_camera_sees_noise_but_no_change():
+    recipe = Recipe(voxels_per_clip=4, crop_height_px=32, crop_width_px=32)
+    frames = moving_frames(2, 32, 32)
+    paused = ((2, recipe.steps - 1),)
+    still = SampleParams(0.1, 0.1, 0.0, 0, 0.0, paused, 1.0, 0, 0, False, 0.0, (9, 8, 7, 6))
+    voxels = simulate_clip(frames, still, recipe, "int8").voxels.reshape(recipe.steps, 32, 32)
+    assert voxels[0].any()
+    assert not voxels[1:].any()
+    noisy = SampleParams(0.1, 0.1, 0.1, 0, 0.0, paused, 1.0, 0, 0, False, 0.0, (9, 8, 7, 6))
+    voxels = simulate_clip(frames, noisy, recipe, "int8").voxels.reshape(recipe.steps, 32, 32)
+    assert all(step.any() for step in voxels)
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [("int8", 127), ("int16", 32767)])
+def test_saturation_is_clipped_and_counted_never_wrapped(dtype, limit):
+    step = limit * 1.5 * 0.05
+    level = np.stack([np.zeros((1, 3)), [[step, -step, 0.01]], np.zeros((1, 3))])
+    got = simulate_log(level, threshold_pos=0.05, bins=1, dtype=dtype)
+    assert got.voxels[:, 0, 0, :2].tolist() == [[limit, -limit], [-limit, limit]]
+    assert got.saturated_bins == 4
+    exact = simulate_log(level, threshold_pos=0.05, bins=1, dtype="float32")
+    assert exact.saturated_bins == 0
+    assert abs(exact.voxels[0, 0, 0, 0] - limit * 1.5) <= 1
+
+
+def test_hot_pixels_fire_and_no_other_pixel_does():
+    frames = np.full((11, 50, 50), 80, np.uint8)
+    got = simulate(frames, threshold_pos=0.5, hot_pixel_count=25, hot_pixel_sigma=50.0, seed=2, dtype="float32").voxels
+    position, normal = noise.hot_pixels(noise_key_of_seed(2), 25, 2500)
+    total = got.sum((0, 1)).ravel()
+    np.testing.assert_allclose(total[position], normal * 50.0 / 0.5 * 10, atol=1)
+    total[position] = 0
+    assert np.count_nonzero(total) <= 1
+
+
+GOLDEN = {
+    "int8": "",
+    "int16": "",
+    "float32": "",
+}
+
+
+def digest(dtype: str) -> str:
+    """Digest of the voxels and saturated bins of one fixed clip with every effect on."""
+    recipe = Recipe(voxels_per_clip=6, frames_per_bin=2, crop_height_px=37, crop_width_px=45)
+    params = SampleParams(
+        0.05000000074505806, 0.06499999761581421, 0.07, 9, 5.0, ((11, 7), (40, 3)), 1.0, 0, 0, False, 0.0,
+        (0x01234567, 0x89ABCDEF, 0xDEADBEEF, 0x00C0FFEE),
+    )  # fmt: skip
+    voxels, saturated = simulate_clip(moving_frames(61, 37, 45), params, recipe, dtype)
+    return hashlib.sha256(voxels.astype(voxels.dtype.newbyteorder("<")).tobytes() + str(saturated).encode()).hexdigest()
+
+
+@pytest.mark.parametrize("dtype", sorted(GOLDEN))
+def test_golden_voxels(dtype):
+    assert digest(dtype) == GOLDEN[dtype]
+
+
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path):
+    code = "from tests.simulation.test_pixel import digest; print(digest('int8'), digest('float32'))"
+    environment = os.environ | {
+        "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path),
+    }  # fmt: skip
+    root = Path(__file__).parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=root, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert run.stdout.split() == [GOLDEN["int8"], GOLDEN["float32"]]

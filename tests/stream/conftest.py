@@ -1,0 +1,83 @@
+"""A folder of small real video files, and servers over it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.clips import damaged, panned_luma, write_clip
+from v2v_client import Batch, V2VStreamDataset
+from v2v_protocol.recipe import Recipe
+
+SMALL = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
+"""Needs 21 frames; everything else as in the paper."""
+SMALL_FLAGS = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
+"""The same for a server: it refuses to start when its own recipe gives no sequence."""
+
+
+@pytest.fixture(scope="session")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven clips in several codecs and folders: 25 sequences under SMALL."""
+    folder = tmp_path_factory.mktemp("clips")
+    (folder / "deep" / "er").mkdir(parents=True)
+    for number, (name, frames, options) in enumerate(
+        (
+            ("a.mp4", 90, {"gop": 30, "b_frames": 2}),
+            ("b.mkv", 64, {"gop": 12}),
+            ("deep/c.mp4", 101, {"codec": "libx265", "gop": 25, "options": {"x265-params": "log-level=none"}}),
+            ("deep/d.webm", 61, {"codec": "libvpx-vp9", "gop": 20}),
+            ("deep/er/e.mov", 121, {"pixel_format": "yuv444p", "gop": 40}),
+            ("deep/er/f.mp4", 45, {"gop": 45, "audio": True}),
+            ("deep/er/g.avi", 70, {"codec": "mpeg4", "gop": 15}),
+        )
+    ):
+        luma = panned_luma(frames, 48, 64, step=(1 + number % 2, 1 + number % 3))
+        write_clip(folder / name, luma, **options)  # type: ignore[arg-type]
+    return folder
+
+
+@pytest.fixture
+def clips_with_a_broken_one(clips: Path, tmp_path: Path) -> Path:
+    """Four good clips and one with garbage in the middle, which its container does not know of."""
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    for number in range(4):
+        write_clip(folder / f"good{number}.mp4", panned_luma(64, step=(1, 1 + number)), gop=16)
+    write_clip(tmp_path / "whole.mp4", panned_luma(126), gop=126)
+    damaged(tmp_path / "whole.mp4", folder / "broken.mp4", 50)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _no_process_left() -> Iterator[None]:
+    """Whatever a test starts is gone when it ends."""
+    before = set(psutil.Process().children(recursive=True))
+    yield
+    left = [process for process in psutil.Process().children(recursive=True) if process not in before]
+    left = [process for process in left if "resource_tracker" not in " ".join(process.cmdline())]
+    psutil.wait_procs(left, timeout=10)
+    assert not [process for process in left if process.is_running()]
+
+
+def server_workers(pid: int) -> list[psutil.Process]:
+    """The worker processes of a server (it has other helpers, which come and go)."""
+    return [child for child in psutil.Process(pid).children() if "worker" in child.cmdline()]
+
+
+def digest(batch: Batch) -> str:
+    """Of the identities and all bytes of a batch, provenance included."""
+    sha = hashlib.sha256(repr((batch.epoch, batch.indices)).encode())
+    sha.update(batch.voxels.numpy().tobytes())
+    sha.update(batch.frames.numpy().tobytes())
+    for provenance in batch.provenance:
+        sha.update(repr(provenance.to_dict()).encode())
+    return sha.hexdigest()
+
+
+def epoch_of(address: str, *, seed: int = 3, epoch: int = 0, batch_size: int = 3) -> list[Batch]:
+    """All batches of one epoch under SMALL."""
+    return list(V2VStreamDataset(address, batch_size=batch_size, recipe=SMALL, seed=seed, epoch=epoch))

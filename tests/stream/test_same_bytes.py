@@ -1,0 +1,98 @@
+"""The promise: the same (spec, seed, epoch, index) gives the same bytes, whoever makes the sample."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.spec import StreamSpec
+from v2v_server.remake import remake
+from v2v_server.video.catalogue import open_catalogue
+
+
+@pytest.fixture(scope="module")
+def reference(clips: Path) -> list[str]:
+    """Digests of the batches of two epochs, made by one worker."""
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        return [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_any_number_of_workers_gives_the_same_epochs(clips: Path, reference: list[str], workers: int) -> None:
+    with LocalServer(clips, workers=workers, flags=SMALL_FLAGS) as server:
+        batches = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+    assert [digest(batch) for batch in batches] == reference
+    assert len(reference) == len(set(reference))
+
+
+def test_batch_size_changes_no_sample(clips: Path) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        threes = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=3)])
+        fours = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=4)])
+    common = min(len(threes), len(fours))
+    assert common >= 20
+    np.testing.assert_array_equal(threes[:common], fours[:common])
+
+
+def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        workers = server_workers(server.pid)
+        assert len(workers) == 2
+        got = []
+        for number, batch in enumerate(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)):
+            got.append(digest(batch))
+            if number < 2:
+                os.kill(workers[number].pid, signal.SIGKILL)
+        got += [digest(batch) for batch in epoch_of(server.address, epoch=1)]
+    assert got == reference
+
+
+def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None:
+    """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
+    with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
+        stopped = server_workers(server.pid)[0]
+        stopped.suspend()
+        got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+        stopped.wait(timeout=20)
+    assert got == reference
+
+
+def test_one_process_makes_the_same_samples(clips: Path) -> None:
+    catalogue = open_catalogue(clips)
+    try:
+        with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+            batch = epoch_of(server.address, seed=5, epoch=2)[1]
+        for row, index in enumerate(batch.indices):
+            sample = remake(catalogue, StreamSpec(recipe=SMALL), seed=5, epoch=2, index=index)
+            np.testing.assert_array_equal(batch.voxels[row].numpy(), sample.arrays["voxels"])
+            np.testing.assert_array_equal(batch.frames[row].numpy(), sample.arrays["frames"])
+            assert batch.provenance[row] == sample.provenance
+    finally:
+        catalogue.close()
+
+
+def test_v2v_simulate_makes_the_same_sample(clips: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "small.yaml"
+    recipe.write_text("preset: paper\nvoxels_per_clip: 4\ncrop_height_px: 32\n", encoding="utf-8")
+    command = [sys.executable, "-m", "v2v_server.cli", "simulate", str(clips), "--recipe", str(recipe)]
+    command += ["--set", "crop_width_px=40", "--seed", "3", "--index", "7", "--out", str(tmp_path / "sample.npz")]
+    subprocess.run([*command, "--picture", str(tmp_path / "sample.png")], check=True, capture_output=True)
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        batch = epoch_of(server.address)[2]
+    with np.load(tmp_path / "sample.npz") as sample:
+        np.testing.assert_array_equal(sample["voxels"], batch.voxels[1].numpy())
+        np.testing.assert_array_equal(sample["frames"], batch.frames[1].numpy())
+        provenance = json.loads(str(sample["provenance"]))
+    assert provenance == json.loads(json.dumps(batch.provenance[1].to_dict()))
+    assert provenance["id"]["index"] == 7 == batch.indices[1]
+    assert (tmp_path / "sample.png").stat().st_size > 1000

@@ -1,0 +1,198 @@
+"""The service as its users meet it: start, stop, bad input, bad peers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import zmq
+
+from tests.clips import panned_luma, write_clip
+from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of, server_workers
+from v2v_client.local_server import LocalServer
+from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.messages import Hello, Ping, Pong, Refused, Want, Welcome
+from v2v_protocol.wire import decode, encode
+
+
+@pytest.fixture
+def raw(clips: Path) -> Iterator[tuple[zmq.Socket[bytes], str]]:
+    """A bare socket on a running server, and its address."""
+    with (
+        LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server,
+        zmq.Context() as context,
+        context.socket(zmq.DEALER) as dealer,
+    ):
+        dealer.setsockopt(zmq.LINGER, 0)
+        dealer.setsockopt(zmq.RCVTIMEO, 20_000)
+        dealer.connect(server.address)
+        yield dealer, server.address
+
+
+def _ask(dealer: zmq.Socket[bytes], *frames: bytes) -> object:
+    dealer.send_multipart(frames)
+    return decode(dealer.recv_multipart()[0])
+
+
+def test_garbage_on_the_port_disturbs_nobody(raw: tuple[zmq.Socket[bytes], str]) -> None:
+    dealer, address = raw
+    host, port = address.removeprefix("tcp://").split(":")
+    with socket.create_connection((host, int(port))) as plain:
+        plain.sendall(os.urandom(4096))
+    for frames in ([b""], [b"\xc1" * 50], [os.urandom(1000)], [b"a", b"b", b"c"], [encode(Pong())[0]]):
+        answer = _ask(dealer, *map(bytes, frames))
+        assert isinstance(answer, Refused)
+        assert answer.code == "malformed"
+    assert _ask(dealer, bytes(encode(Ping())[0])) == Pong()
+    assert len(epoch_of(address)) == 8
+
+
+def test_another_protocol_version_is_told_both_numbers(raw: tuple[zmq.Socket[bytes], str]) -> None:
+    dealer, _ = raw
+    ping = bytes(encode(Ping())[0])
+    other = ping.replace(b"\xa1v" + bytes([PROTOCOL_VERSION]), b"\xa1v\x63")
+    assert other != ping
+    answer = _ask(dealer, other)
+    assert isinstance(answer, Refused)
+    assert answer.code == "version"
+    assert "99" in answer.text
+    assert str(PROTOCOL_VERSION) in answer.text
+
+
+def test_a_refused_want_changes_nothing(raw: tuple[zmq.Socket[bytes], str]) -> None:
+    dealer, _ = raw
+    hello = Hello({"recipe": SMALL.to_dict()}, ("voxels",), 2, 0)
+    welcome = _ask(dealer, *map(bytes, encode(hello)))
+    assert isinstance(welcome, Welcome)
+    too_many = _ask(dealer, *map(bytes, encode(Want(0, tuple(range(welcome.credit + 1))))))
+    assert isinstance(too_many, Refused)
+    assert too_many.code == "credit"
+    outside = _ask(dealer, *map(bytes, encode(Want(0, (welcome.sequences,)))))
+    assert isinstance(outside, Refused)
+    assert outside.code == "range"
+    dealer.send_multipart(encode(Want(0, (0,))))
+    assert len(dealer.recv_multipart()) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_everything_cleanly(clips: Path, tmp_path: Path, number: signal.Signals) -> None:
+    port_file = tmp_path / "port"
+    server = _start(clips, "--port-file", str(port_file), *SMALL_FLAGS)
+    try:
+        _wait_for(server, port_file)
+        address = port_file.read_text(encoding="utf-8").strip()
+        workers = server_workers(server.pid)
+        assert len(workers) == 2
+        server.send_signal(number)
+        assert server.wait(timeout=20) == 0
+    finally:
+        _end(server)
+    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert not port_file.exists()
+    with socket.socket() as probe:
+        host, port = address.removeprefix("tcp://").split(":")
+        assert probe.connect_ex((host, int(port))) != 0
+
+
+def test_workers_do_not_outlive_a_killed_server(clips: Path, tmp_path: Path) -> None:
+    port_file = tmp_path / "port"
+    server = _start(clips, "--port-file", str(port_file), *SMALL_FLAGS)
+    try:
+        _wait_for(server, port_file)
+        workers = server_workers(server.pid)
+        server.kill()
+        server.wait(timeout=20)
+    finally:
+        _end(server)
+    assert not psutil.wait_procs(workers, timeout=10)[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--videos", "{clips}/nowhere"], "nowhere: there is no such folder"),
+        (["--videos", "{empty}"], "no video found"),
+        ([], "--videos is missing"),
+        (["--videos", "{clips}", "--set", "tresholds=1"], "unknown recipe key 'tresholds' (did you mean 'threshold'?)"),
+        (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe preset 'papper' (did you mean 'paper'?)"),
+        (["--videos", "{clips}", "--set", "crop_width_px=128"], "no video gives a sequence"),
+        (["--videos", "{clips}", "--bind", "tcp://0.0.0.0:5555"], "--insecure"),
+        (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
+        (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:{taken}"], "Address already in use"),
+        (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),
+        (["--videos", "{clips}", "--rows", "middle"], "rows"),
+        (["--videos", "{clips}", "--workers", "-1"], "--workers -1"),
+        (["--videos", "{clips}", "--port-file", "{clips}/no/such/folder/port"], "--port-file"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_status_2(
+    clips: Path, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        names = {"clips": clips, "empty": tmp_path, "taken": taken.getsockname()[1]}
+        small = ["--set", "voxels_per_clip=4", "--set", "crop_height_px=32"]
+        small += [] if "crop_width_px=128" in arguments else ["--set", "crop_width_px=40"]
+        command = [sys.executable, "-m", "v2v_server", *(part.format(**names) for part in arguments), *small]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2, done.stderr
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_start_says_which_videos_give_nothing_and_what_would_admit_them(clips: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "short"
+    folder.mkdir()
+    write_clip(folder / "long.mp4", panned_luma(60, 48, 64))
+    write_clip(folder / "short.mp4", panned_luma(12, 48, 64))
+    (folder / "noise.mp4").write_bytes(os.urandom(500))
+    port_file = tmp_path / "port"
+    flags = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32")
+    server = _start(folder, "--port-file", str(port_file), *flags)
+    try:
+        _wait_for(server, port_file)
+    finally:
+        server.terminate()
+        said = server.communicate(timeout=20)[1]
+    assert "2 videos" in said
+    assert "1 give 2 sequences of 21 frames" in said
+    assert "short.mp4: 12 frames, the recipe needs 21" in said
+    assert "voxels_per_clip at most 2" in said
+    assert "noise.mp4" in said
+
+
+def _start(videos: Path, *flags: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "v2v_server", "--videos", str(videos), "--workers", "2"]
+    return subprocess.Popen(
+        [*command, "--bind", "tcp://127.0.0.1:*", *flags],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _wait_for(server: subprocess.Popen[str], port_file: Path) -> None:
+    import time
+
+    deadline = time.monotonic() + 60
+    while not port_file.exists():
+        assert server.poll() is None, server.stderr.read() if server.stderr else ""
+        assert time.monotonic() < deadline
+        try:
+            server.wait(0.05)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+def _end(server: subprocess.Popen[str]) -> None:
+    if server.poll() is None:
+        server.kill()
+    server.communicate(timeout=20)

@@ -1,0 +1,96 @@
+"""Who may import whom. Read from the source, so that an import inside a function counts as well."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks", "examples")
+
+FORBIDDEN: dict[str, set[str]] = {
+    "v2v_server": {"torch", "v2v_client", "trainer", "benchmarks", "examples"},
+    "v2v_client": {"v2v_server", "trainer", "benchmarks", "examples", "av", "numba", "cv2"},
+    "trainer": {"v2v_server", "benchmarks", "examples"},
+}
+PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
+
+
+def imported(source: str) -> set[str]:
+    """Top-level names of everything a module imports, wherever in it: statements, and import_module("...") calls."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add("." if node.level else str(node.module))
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            function = node.func
+            called = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+            if called in ("import_module", "__import__"):
+                names.add(str(node.args[0].value))
+    return {name.split(".")[0] for name in names}
+
+
+def modules(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def test_the_reader_of_imports_sees_them_all() -> None:
+    source = """
+import a.b, c as d
+from e.f import g
+def h():
+    import i
+    if True:
+        from j import k
+    importlib.import_module("l.m")
+    __import__("n")
+from . import o
+"""
+    assert imported(source) == {"a", "c", "e", "i", "j", "l", "n", ""}
+
+
+@pytest.mark.parametrize("package", ["v2v_protocol", *FORBIDDEN])
+def test_there_is_something_to_read(package: str) -> None:
+    assert modules(package)
+
+
+@pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
+def test_the_protocol_needs_next_to_nothing(path: Path) -> None:
+    assert imported(path.read_text(encoding="utf-8")) - PROTOCOL_MAY == set()
+
+
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_packages_keep_apart(package: str) -> None:
+    for path in modules(package):
+        crossed = imported(path.read_text(encoding="utf-8")) & FORBIDDEN[package]
+        assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
+
+
+def test_imports_are_absolute() -> None:
+    for package in PACKAGES:
+        for path in modules(package):
+            assert "" not in imported(path.read_text(encoding="utf-8")), path.relative_to(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("module", "without"),
+    [
+        ("v2v_protocol.wire", ("torch", "zmq", "av", "numba", "cv2", "yaml")),
+        ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
+        ("v2v_server.dispatcher", ("torch", "zmq", "numba", "cv2")),
+    ],
+)
+def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:
+    """What others import on their own account counts too."""
+    program = f"import sys, {module}\nprint(*sorted({set(without)!r} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

@@ -1,0 +1,303 @@
+"""Every frame delivered is exactly the frame that was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.clips import damaged, panned_luma, truncated, write_clip
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.video import decode
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.luma import range_table
+from v2v_server.video.probe import VideoFacts, probe
+
+FRAMES = 50
+X265 = "log-level=none:pools=1:frame-threads=1"
+UNEVEN = np.cumsum(np.arange(FRAMES) % 7 * 11 + 5).tolist()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A way to store the panned photograph."""
+
+    name: str
+    codec: str = "libx264"
+    pixel_format: str = "yuv420p"
+    shift: int = 0
+    full_range: bool = False
+    lossless: bool = False
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+KINDS = (
+    Kind("plain.mp4"),
+    Kind("b_frames.mp4", more={"b_frames": 3}),
+    Kind("b_frames.mkv", more={"b_frames": 3}),
+    Kind("b_frames.ts", more={"b_frames": 3}),
+    Kind("b_frames.flv", more={"b_frames": 3}),
+    Kind("b_frames.avi", more={"b_frames": 3}),
+    Kind("plain.avi"),
+    Kind("raw.h264", more={"b_frames": 3}),
+    Kind("open_gop.mp4", more={"b_frames": 3, "options": {"x264-params": "open-gop=1"}}),
+    Kind("open_gop.mkv", more={"b_frames": 3, "options": {"x264-params": "open-gop=1:bframes=5:b-pyramid=normal"}}),
+    Kind("gradual_refresh.mp4", more={"options": {"intra-refresh": "1"}}),
+    Kind("ten_bits_422.mp4", pixel_format="yuv422p10le", shift=2, more={"b_frames": 2}),
+    Kind("yuv444.mp4", pixel_format="yuv444p", more={"b_frames": 2}),
+    Kind("full_range.mp4", pixel_format="yuvj420p", full_range=True, more={"b_frames": 2}),
+    Kind("uneven_times.mkv", more={"b_frames": 2, "pts": UNEVEN}),
+    Kind("uneven_times.mp4", more={"b_frames": 2, "pts": UNEVEN}),
+    Kind("sound.mp4", more={"b_frames": 2, "audio": True}),
+    Kind("lossless.mp4", lossless=True, more={"b_frames": 3, "options": {"qp": "0"}}),
+    Kind("hevc.mp4", "libx265", more={"b_frames": 3, "options": {"x265-params": f"{X265}:open-gop=1"}}),
+    Kind("hevc10.mkv", "libx265", "yuv420p10le", 2, more={"b_frames": 3, "options": {"x265-params": X265}}),
+    Kind("hevc12.mp4", "libx265", "yuv444p12le", 4, more={"options": {"x265-params": X265}}),
+    Kind("vp8.webm", "libvpx", more={"options": {"auto-alt-ref": "1", "lag-in-frames": "16", "b": "60k"}}),
+    Kind("vp9.webm", "libvpx-vp9", more={"options": {"auto-alt-ref": "1", "lag-in-frames": "16", "cpu-used": "8"}}),
+    Kind("mpeg4.mp4", "mpeg4", more={"b_frames": 2}),
+    Kind("mpeg4.avi", "mpeg4", more={"b_frames": 2}),
+    Kind("mpeg2.mpg", "mpeg2video", more={"b_frames": 2}),
+    Kind("mpeg2.mkv", "mpeg2video", "yuv422p", more={"b_frames": 2}),
+    Kind("mjpeg.avi", "mjpeg", "yuvj422p", full_range=True),
+    Kind("mjpeg.mov", "mjpeg", "yuvj420p", full_range=True),
+    Kind("ffv1.mkv", "ffv1", lossless=True),
+    Kind("ffv1_16.mkv", "ffv1", "yuv420p16le", 8, lossless=True),
+    Kind("huffyuv.avi", "huffyuv", "yuv422p", lossless=True),
+    Kind("rgb.mov", "png", "rgb24", full_range=True, lossless=True, more={"full_range": None}),
+)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A stored clip with what must come out of it."""
+
+    path: Path
+    kind: Kind
+    facts: VideoFacts
+    luma: npt.NDArray[np.uint8]
+    reference: npt.NDArray[np.uint8]
+
+
+def reference_grey(path: Path) -> npt.NDArray[np.uint8]:
+    """The slow oracle: swscale's grey of every frame, read in one go."""
+    with av.open(str(path)) as container:
+        return np.stack([frame.reformat(format="gray").to_ndarray() for frame in container.decode(video=0)])
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.name)
+def clip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Clip:
+    kind = request.param
+    luma = panned_luma(FRAMES, 54, 70, full_range=kind.full_range)
+    path = tmp_path_factory.mktemp("clips") / kind.name
+    options = {"full_range": kind.full_range} | kind.more
+    stored = luma.astype(np.uint16) << kind.shift if kind.shift else luma
+    write_clip(path, stored, codec=kind.codec, pixel_format=kind.pixel_format, **options)
+    return Clip(path, kind, probe(path), luma, reference_grey(path))
+
+
+def test_the_whole_clip_is_the_independent_reference(clip: Clip) -> None:
+    facts, kind = clip.facts, clip.kind
+    assert (facts.frames, facts.height_px, facts.width_px) == (FRAMES, 54, 70)
+    assert facts.full_range == kind.full_range
+    whole = decode_luma(clip.path, facts.index, 0, FRAMES)
+    assert whole.frames.flags.c_contiguous
+    assert whole.frames.dtype == np.uint8
+    # Deeper formats are rounded once here, and dithered or truncated by swscale.
+    difference = np.abs(whole.frames.astype(int) - clip.reference)
+    assert difference.max() <= (1 if kind.shift else 0)
+
+
+def test_the_pan_is_recognised(clip: Clip) -> None:
+    whole = decode_luma(clip.path, clip.facts.index, 0, FRAMES)
+    known = clip.luma if clip.kind.full_range else range_table(8, False)[clip.luma]
+    if clip.kind.lossless:
+        np.testing.assert_array_equal(whole.frames, known)
+    # Frame i is nearer to picture i than to its neighbours: nothing is displaced, dropped or doubled.
+    for number in range(1, FRAMES - 1):
+        errors = [np.abs(whole.frames[number].astype(int) - known[number + by]).mean() for by in (-1, 0, 1)]
+        assert np.argmin(errors) == 1
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_range_and_window_equals_sequential_decoding(clip: Clip, data: st.DataObject) -> None:
+    start = data.draw(st.integers(0, FRAMES - 1))
+    count = data.draw(st.integers(1, min(12, FRAMES - start)))
+    height, width = clip.facts.height_px, clip.facts.width_px
+    top, left = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
+    window = (top, left, data.draw(st.integers(1, height - top)), data.draw(st.integers(1, width - left)))
+    part = clip.facts.index.slice(start, count)
+    got = decode_luma(clip.path, part, start, count, window)
+    whole = decode_luma(clip.path, clip.facts.index, 0, FRAMES).frames if clip.kind.shift else clip.reference
+    wanted = whole[start : start + count, top : top + window[2], left : left + window[3]]
+    np.testing.assert_array_equal(got.frames, wanted)
+    assert got.frames.flags.c_contiguous
+    assert got.codec == clip.facts.codec
+
+
+def test_presentation_times(clip: Clip) -> None:
+    seconds = decode_luma(clip.path, clip.facts.index, 3, 20).seconds
+    if not clip.facts.index.seekable:
+        assert np.isnan(seconds).all()
+        return
+    stated = clip.kind.more.get("pts")
+    wanted = np.diff(stated[3:23]) / 1000 if stated else np.full(19, 1 / 25)
+    np.testing.assert_allclose(np.diff(seconds), wanted, atol=0.0011)  # matroska and flv count milliseconds
+
+
+def test_which_files_are_not_seekable(clip: Clip) -> None:
+    without_pts = {"b_frames.avi", "mpeg4.avi", "raw.h264"}
+    assert clip.facts.index.seekable == (clip.kind.name not in without_pts)
+
+
+def test_which_decoders_are_bit_exact(clip: Clip) -> None:
+    by_standard = not clip.kind.codec.startswith(("mpeg", "mjpeg"))
+    assert decode_luma(clip.path, clip.facts.index, 0, 1).bit_exact == by_standard
+
+
+def test_av1(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "clip.mp4"
+    options = {"preset": "12", "svtav1-params": "lp=1"}
+    write_clip(path, panned_luma(40, 64, 96, full_range=False), codec="libsvtav1", options=options)
+    capfd.readouterr()  # the encoder introduces itself
+    facts, reference = probe(path), reference_grey(path)
+    assert facts.codec == "av1"
+    for start in (0, 5, 12, 27, 39):
+        got = decode_luma(path, facts.index, start, min(6, 40 - start))
+        np.testing.assert_array_equal(got.frames, reference[start : start + 6])
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, -90])
+@pytest.mark.parametrize("hflip", [False, True])
+def test_rotation_metadata(tmp_path: Path, degrees: int, hflip: bool) -> None:
+    luma = panned_luma(10, 48, 64)
+    path = write_clip(
+        tmp_path / "clip.mp4", luma, full_range=True, options={"qp": "0"}, rotation_degrees=degrees, hflip=hflip
+    )
+    with av.open(str(path)) as container:
+        stated = next(container.decode(video=0)).rotation
+    facts = probe(path)
+    upright = decode_luma(path, facts.index, 0, 10).frames
+    # A display matrix mirrors the stored picture first and turns the result.
+    flipped = luma[:, :, ::-1] if hflip else luma
+    if not hflip:
+        np.testing.assert_array_equal(upright, np.rot90(flipped, stated // 90, axes=(1, 2)))
+    candidates = [np.rot90(flipped, turn, axes=(1, 2)) for turn in range(4)]
+    assert sum(np.array_equal(upright, candidate) for candidate in candidates) == 1
+    assert (facts.height_px, facts.width_px) == upright.shape[1:]
+    assert facts.rotation_degrees == stated
+    window = decode_luma(path, facts.index, 2, 5, (3, 7, 11, 13)).frames
+    np.testing.assert_array_equal(window, upright[2:7, 3:14, 7:20])
+
+
+def test_a_seek_is_really_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_clip(tmp_path / "clip.mp4", panned_luma(60), b_frames=2)
+    index = probe(path).index
+    plain = decode_luma(path, index, 45, 5)
+
+    def refuse(stack: object) -> None:
+        raise AssertionError("decoded from the beginning")
+
+    monkeypatch.setattr(decode, "_decode_plainly", refuse)
+    np.testing.assert_array_equal(decode_luma(path, index, 45, 5).frames, plain.frames)
+
+
+def test_a_container_that_lies_about_keyframes(tmp_path: Path) -> None:
+    """The index calls a P-frame a keyframe: the decoder does not, and counting from the beginning wins."""
+    path = write_clip(tmp_path / "clip.mp4", panned_luma(40), gop=100, options={"qp": "0"})
+    index = probe(path).index
+    reference = decode_luma(path, index, 0, 40).frames
+    lying = type(index)(
+        index.first, index.pts, np.array([0, 20]), index.pts[[0, 20]], index.time_base, 48, 64, seekable=True
+    )
+    np.testing.assert_array_equal(decode_luma(path, lying, 25, 5).frames, reference[25:30])
+
+
+def test_truncated_file(tmp_path: Path) -> None:
+    whole = write_clip(tmp_path / "whole.mkv", panned_luma(60), options={"qp": "0"})
+    index = probe(whole).index
+    short = truncated(whole, tmp_path / "short.mkv", 0.5)
+    with pytest.raises(VideoError) as caught:
+        decode_luma(short, index, 0, 60)
+    assert caught.value.frame is not None
+    assert 10 < caught.value.frame < 45
+    good = decode_luma(short, index, 0, caught.value.frame).frames
+    np.testing.assert_array_equal(good, decode_luma(whole, index, 0, caught.value.frame).frames)
+
+
+@pytest.mark.parametrize(
+    ("codec", "options"),
+    [
+        ("libx264", {"sc_threshold": "0"}),
+        ("libx265", {"x265-params": f"{X265}:scenecut=0"}),
+        ("libvpx", {}),
+        ("libvpx-vp9", {"cpu-used": "8"}),
+        ("mpeg4", {"sc_threshold": "1000000"}),
+        ("mpeg2video", {"sc_threshold": "1000000"}),
+        ("ffv1", {}),
+    ],
+)
+def test_damage_is_refused_and_does_not_spread(tmp_path: Path, codec: str, options: dict[str, str]) -> None:
+    whole = write_clip(tmp_path / "whole.mkv", panned_luma(60), gop=12, codec=codec, options=options, full_range=None)
+    bad = damaged(whole, tmp_path / "bad.mkv", packet=17)
+    index = probe(bad).index
+    assert len(index) == 60
+    reference = decode_luma(whole, index, 0, 60).frames
+    np.testing.assert_array_equal(decode_luma(bad, index, 0, 16).frames, reference[:16])
+    for start in (15, 19, 21):
+        with pytest.raises(VideoError) as caught:
+            decode_luma(bad, index, start, 3)
+        assert caught.value.frame is not None
+        assert start <= caught.value.frame < start + 3
+    np.testing.assert_array_equal(decode_luma(bad, index, 24, 36).frames, reference[24:])
+
+
+def test_a_picture_of_another_size(tmp_path: Path) -> None:
+    small = write_clip(tmp_path / "small.mp4", panned_luma(20, 32, 48))
+    large = write_clip(tmp_path / "large.mp4", panned_luma(20, 48, 64))
+    with pytest.raises(VideoError, match="48x32 px here and 64x48 px at first"):
+        decode_luma(small, probe(large).index, 0, 5)
+
+
+def test_the_size_changes_in_mid_file(tmp_path: Path) -> None:
+    parts = [
+        write_clip(tmp_path / f"{number}.h264", panned_luma(20, *size))
+        for number, size in enumerate([(48, 64), (32, 96)])
+    ]
+    path = tmp_path / "joined.h264"
+    path.write_bytes(b"".join(part.read_bytes() for part in parts))
+    index = probe(path).index
+    assert decode_luma(path, index, 0, 20).frames.shape == (20, 48, 64)
+    with pytest.raises(VideoError) as caught:
+        decode_luma(path, index, 10, 20)
+    assert caught.value.frame == 20
+
+
+@pytest.mark.parametrize(("start", "count"), [(0, 0), (-1, 3), (0, 21), (20, 1)])
+def test_ranges_outside_the_index(tmp_path: Path, start: int, count: int) -> None:
+    path = write_clip(tmp_path / "clip.mp4", panned_luma(20))
+    with pytest.raises(UsageError, match=r"holds 0 \.\. 19"):
+        decode_luma(path, probe(path).index, start, count)
+
+
+@pytest.mark.parametrize("window", [(0, 0, 49, 64), (0, 1, 48, 64), (-1, 0, 4, 4), (0, 0, 0, 4)])
+def test_windows_outside_the_picture(tmp_path: Path, window: tuple[int, int, int, int]) -> None:
+    path = write_clip(tmp_path / "clip.mp4", panned_luma(5))
+    with pytest.raises(UsageError, match="64x48 px"):
+        decode_luma(path, probe(path).index, 0, 5, window)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "clip.mp4", panned_luma(5))
+    index = probe(path).index
+    path.unlink()
+    with pytest.raises(VideoError, match="cannot be opened: No such file"):
+        decode_luma(path, index, 0, 5)

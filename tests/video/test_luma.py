@@ -1,0 +1,58 @@
+"""The range tables against their definition."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from av.video.frame import VideoFrame
+from av.video.reformatter import ColorRange
+
+from v2v_server.video.luma import LumaFormat, range_table
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_limited_range_table_is_the_rounded_line(bits: int) -> None:
+    scale = 2 ** (bits - 8)
+    for value, grey in enumerate(range_table(bits, False)):
+        exact = Fraction((value - 16 * scale) * 255, 219 * scale)
+        assert grey == min(255, max(0, int(exact + Fraction(1, 2)) if exact > 0 else 0))
+
+
+def test_full_range_tables() -> None:
+    np.testing.assert_array_equal(range_table(8, True), np.arange(256))
+    ten = range_table(10, True)
+    assert (ten[0], ten[1023]) == (0, 255)
+    assert np.all(np.diff(ten.astype(int)) >= 0)
+
+
+def test_limited_range_equals_swscale_for_every_value() -> None:
+    luma = np.repeat(np.arange(256, dtype=np.uint8)[None], 16, axis=0)
+    frame = VideoFrame.from_ndarray(np.concatenate([luma, np.full((8, 256), 128, np.uint8)]), format="yuv420p")
+    frame.color_range = ColorRange.MPEG
+    grey = frame.reformat(format="gray").to_ndarray()
+    np.testing.assert_array_equal(range_table(8, False)[luma], grey)
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "stated", "full"),
+    [
+        ("yuv420p", ColorRange.UNSPECIFIED, False),
+        ("yuv420p", ColorRange.JPEG, True),
+        ("yuv420p", ColorRange.MPEG, False),
+        ("yuvj420p", ColorRange.UNSPECIFIED, True),
+        ("gray", ColorRange.UNSPECIFIED, True),
+        ("gray", ColorRange.MPEG, False),
+        ("yuv420p10le", ColorRange.UNSPECIFIED, False),
+    ],
+)
+def test_range_rule(pixel_format: str, stated: ColorRange, full: bool) -> None:
+    frame = VideoFrame(16, 16, pixel_format)
+    frame.color_range = stated
+    assert LumaFormat.of(frame).full_range == full
+
+
+@pytest.mark.parametrize("pixel_format", ["rgb24", "pal8", "gbrp", "yuyv422", "ya8"])
+def test_formats_without_a_luma_plane(pixel_format: str) -> None:
+    assert not LumaFormat.of(VideoFrame(16, 16, pixel_format)).has_plane

@@ -1,0 +1,35 @@
+"""The consumer's side: a PyTorch dataset that receives finished batches from a v2v server.
+
+from v2v_client import V2VStreamDataset
+
+for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
+    batch.voxels  # int8 [B, T, bins, H, W]
+"""
+
+from v2v_client.batch import Batch
+from v2v_client.dataset import V2VStreamDataset
+from v2v_protocol.errors import (
+    ProtocolError,
+    RecipeError,
+    RemoteError,
+    SampleUnavailable,
+    ServerLost,
+    StateMismatch,
+    UsageError,
+    V2VError,
+    VersionMismatch,
+)
+
+__all__ = [
+    "Batch",
+    "ProtocolError",
+    "RecipeError",
+    "RemoteError",
+    "SampleUnavailable",
+    "ServerLost",
+    "StateMismatch",
+    "UsageError",
+    "V2VError",
+    "V2VStreamDataset",
+    "VersionMismatch",
+]

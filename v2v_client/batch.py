@@ -1,0 +1,76 @@
+"""One batch, as the trainer sees it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from v2v_protocol.sample import Provenance
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Batch:
+    """Samples of one batch, in the order of the epoch.
+
+    Attributes:
+        voxels: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``; None when not asked for. Positive
+            counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
+        frames: [B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated; None when not asked for.
+        indices: global index of each sample.
+        epoch: of the samples.
+        provenance: where each sample came from.
+        resume_state: the state after this batch, for :meth:`v2v_client.dataset.V2VStreamDataset.load_state_dict`:
+            save that of the last batch you trained on. It holds for any number of loader workers.
+        wait_seconds: how long the consumer (with a DataLoader: the loader worker) waited for this batch.
+        cpu_seconds: processor time that the server's workers spent on it.
+    """
+
+    voxels: torch.Tensor | None
+    frames: torch.Tensor | None
+    indices: tuple[int, ...]
+    epoch: int
+    provenance: tuple[Provenance, ...]
+    resume_state: Mapping[str, Any]
+    wait_seconds: float
+    cpu_seconds: float
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __repr__(self) -> str:
+        arrays = "".join(
+            f"{name}: {str(tensor.dtype).removeprefix('torch.')}{list(tensor.shape)} on {tensor.device}, "
+            for name, tensor in self.arrays.items()
+        )
+        some = ", ".join(map(str, self.indices[:3])) + (", ..." if len(self) > 3 else "")
+        return f"Batch({arrays}epoch {self.epoch}, indices {some})"
+
+    @property
+    def arrays(self) -> dict[str, torch.Tensor]:
+        """The tensors that were asked for, by name."""
+        named = {"voxels": self.voxels, "frames": self.frames}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the tensors."""
+        return sum(tensor.nbytes for tensor in self.arrays.values())
+
+    def pin_memory(self) -> Batch:
+        """A copy in page-locked memory; what ``DataLoader(pin_memory=True)`` calls."""
+        return self._with({name: tensor.pin_memory() for name, tensor in self.arrays.items()})
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Batch:
+        """This batch with its tensors on ``device``.
+
+        Args:
+            non_blocking: True returns before the copy is done; it only helps from page-locked memory.
+        """
+        return self._with({name: item.to(device, non_blocking=non_blocking) for name, item in self.arrays.items()})
+
+    def _with(self, arrays: dict[str, torch.Tensor]) -> Batch:
+        return dataclasses.replace(self, voxels=arrays.get("voxels"), frames=arrays.get("frames"))

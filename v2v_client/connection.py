@@ -1,0 +1,398 @@
+"""The consumer's end of the wire: one DEALER socket, and what to do when nothing comes.
+
+Rules
+    Hello is answered by Welcome. It is sent again, ever more rarely, until it is: either may have been lost.
+    A server that does not know us (it was restarted, or forgot us while we were silent) refuses what we send; then we
+    say Hello with the resolved spec, and it must offer the same stream as before.
+    After every Welcome, and whenever nothing was answered for ``rewant_seconds`` although pongs come,
+    everything unanswered is asked for again. That can make a sample twice; the reorder window drops the second.
+    Nothing heard for ``timeout_seconds`` of listening: ServerLost.
+
+Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
+answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again.
+
+A connection belongs to the process that made it; its ZeroMQ context is made when it is opened, never before a fork.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy.typing as npt
+import zmq
+
+from v2v_client.liveness import Due, Liveness, Patience
+from v2v_client.state import Stream
+from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost, UsageError
+from v2v_protocol.messages import (
+    ErrorCode,
+    Goodbye,
+    Hello,
+    Message,
+    Ping,
+    Pong,
+    Refused,
+    SampleHeader,
+    Unavailable,
+    Want,
+    Welcome,
+)
+from v2v_protocol.sample import Provenance, SampleId, array_layout
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_sample, encode
+
+_GOODBYE_LINGER_MS = 250
+"""How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
+_MOST_CREDIT_REFUSALS = 3
+
+Layout = dict[str, tuple[str, tuple[int, ...]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """One sample off the wire.
+
+    Attributes:
+        index: global index.
+        arrays: read-only views of the received message, by name.
+        provenance: where it came from.
+        worker: name of the server worker that made it.
+        cpu_seconds: processor time that took there.
+    """
+
+    index: int
+    arrays: Mapping[str, npt.NDArray[Any]]
+    provenance: Provenance
+    worker: str
+    cpu_seconds: float
+
+
+class Connection:
+    """A consumer's session with a server, for one epoch.
+
+    Args:
+        address: ``tcp://host:port``.
+        hello: what to ask for.
+        epoch: of the samples to ask for.
+        pinned: the stream that the server must offer; None takes what it offers.
+        pinned_by: what pinned it, in words, for the message of a mismatch.
+        patience: when to ping, to ask again and to give up.
+        clock: seconds, never going back.
+
+    Attributes:
+        stream: what the server offers; set by :meth:`open`.
+        credit: most samples asked for and not received.
+        layout: dtype and shape of each array of one sample.
+        strays: samples of another epoch, dropped.
+    """
+
+    stream: Stream
+    layout: Layout
+
+    def __init__(
+        self,
+        address: str,
+        hello: Hello,
+        epoch: int,
+        *,
+        pinned: Stream | None = None,
+        pinned_by: str = "this dataset",
+        patience: Patience | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._address = address
+        self._hello = hello
+        self._epoch = epoch
+        self._pinned = pinned
+        self._pinned_by = pinned_by
+        self._patience = patience or Patience()
+        self._clock = clock
+        self._process = os.getpid()
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._socket: zmq.Socket[bytes] | None = None
+        self._liveness = Liveness(self._patience, clock())
+        self._asked: dict[int, None] = {}  # sent and not answered, in that order
+        self._queued: deque[int] = deque()  # to be sent when the credit allows
+        self._welcome_due: float | None = None  # when to say Hello again; None once welcomed
+        self._hello_wait = 0.0
+        self._asked_again = False
+        self._credit_refusals = 0
+        self._last: int | None = None  # last sample received
+        self.credit = 0
+        self.strays = 0
+
+    # --- opening and closing ------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Says Hello and waits for the Welcome.
+
+        The largest frame the socket accepts is known only with the layout. So where no stream is pinned yet, a first
+        socket that accepts nothing larger than a header asks for it.
+
+        Raises:
+            ServerLost: no answer within the deadline.
+            RemoteError: the server refuses the spec.
+            StateMismatch: it offers another stream than the pinned one.
+            UsageError: the address, or the arrays, are not understood.
+        """
+        self._context = zmq.Context()
+        try:
+            if self._pinned is None:
+                self._connect(LARGEST_HEADER_BYTES)
+                self._await_welcome()
+                self._pinned = self.stream
+                self._disconnect()
+            self._hello = replace(self._hello, spec=self._pinned.spec)
+            self.layout = self._layout(self._pinned)
+            largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
+            self._connect(max(LARGEST_HEADER_BYTES, largest))
+            self._await_welcome()
+        except BaseException:
+            self.close()
+            raise
+
+    def _layout(self, stream: Stream) -> Layout:
+        spec = stream.resolved
+        return array_layout(spec.recipe, spec.voxel_dtype, self._hello.arrays)
+
+    def _connect(self, largest_frame_bytes: int) -> None:
+        if self._context is None:
+            raise ServerLost(f"{self._address}: this connection is closed")
+        socket = self._context.socket(zmq.DEALER)
+        self._socket = socket
+        socket.setsockopt(zmq.ROUTING_ID, b"\x01" + os.urandom(15))  # a first byte of 0 is ZeroMQ's own
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, 0)
+        socket.setsockopt(zmq.SNDHWM, 0)
+        socket.setsockopt(zmq.IPV6, 1)
+        socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        try:
+            socket.connect(self._address)
+        except zmq.ZMQError as error:
+            raise UsageError(f"address {self._address!r}: {error}; give tcp://host:port") from error
+
+    def _await_welcome(self) -> None:
+        self._begin_hello()
+        while self._welcome_due is not None:
+            self._step(wait=True)
+
+    def _begin_hello(self) -> None:
+        self._hello_wait = self._patience.ping_seconds
+        self._welcome_due = self._clock() + self._hello_wait
+        self._send(self._hello)
+
+    def _disconnect(self) -> None:
+        """Leaves the server, telling it where that does not take long."""
+        socket, self._socket = self._socket, None
+        if socket is None:
+            return
+        try:
+            socket.send_multipart(encode(Goodbye()), flags=zmq.NOBLOCK)
+            linger = _GOODBYE_LINGER_MS
+        except zmq.ZMQError:  # nobody to tell
+            linger = 0
+        quiet = self._liveness.silence(self._clock()) >= self._patience.ping_seconds
+        socket.close(linger=0 if quiet else linger)
+
+    def close(self) -> None:
+        """Leaves the server and frees socket, context and thread. May be called again, and in a forked child, where
+        it does nothing."""
+        if os.getpid() != self._process:
+            return
+        context, self._context = self._context, None
+        try:
+            self._disconnect()
+        finally:
+            if context is not None:
+                context.term()
+
+    # --- asking and receiving -----------------------------------------------------------------------------------------
+
+    def want(self, indices: Iterable[int]) -> None:
+        """Asks for samples, as soon as the credit allows.
+
+        Raises:
+            ServerLost: this connection was closed.
+        """
+        self._queued.extend(indices)
+        if self._welcome_due is not None:
+            return
+        room = self.credit - len(self._asked)
+        now = [self._queued.popleft() for _ in range(min(room, len(self._queued)))]
+        if now:
+            self._asked.update(dict.fromkeys(now))
+            self._send(Want(self._epoch, tuple(now)))
+
+    def _want_again(self) -> None:
+        # In the order they were asked; after a Welcome with less credit, the rest waits its turn.
+        self._asked_again = self._asked_again or bool(self._asked)
+        self._queued.extendleft(reversed(self._asked))
+        self._asked.clear()
+        self.want(())
+
+    def receive(self, *, wait: bool = True) -> Arrival | None:
+        """The next sample to arrive, whichever it is.
+
+        Args:
+            wait: False returns None when none is here yet.
+
+        Raises:
+            ServerLost: nothing was heard for ``timeout_seconds``.
+            SampleUnavailable: the server cannot make a sample that was asked for.
+            RemoteError: the server refuses a request.
+            StateMismatch: after a restart the server offers another stream.
+            ProtocolError: it sent what no server of ours sends.
+        """
+        self._liveness.listen(self._clock())
+        try:
+            while True:
+                arrival, idle = self._step(wait=wait)
+                if arrival is not None or (idle and not wait):
+                    return arrival
+        finally:
+            self._liveness.pause(self._clock())
+
+    def _step(self, *, wait: bool) -> tuple[Arrival | None, bool]:
+        """Does what is due, then handles one message: (a sample if it was one, whether no message came)."""
+        now = self._clock()
+        self._attend(now)
+        seconds = self._liveness.next_due(now) if wait else 0.0
+        if self._welcome_due is not None and wait:
+            seconds = min(seconds, max(0.0, self._welcome_due - now))
+        frames = self._receive(seconds)
+        if frames is None:
+            return None, True
+        message = decode(frames[0].buffer)
+        answer = not isinstance(message, Pong)
+        self._liveness.heard(self._clock(), answer=answer)
+        if isinstance(message, SampleHeader):
+            return self._sample(message, frames[1:]), False
+        if len(frames) != 1:
+            raise ProtocolError(f"{self._address} sent {type(message).__name__} with {len(frames) - 1} frames too many")
+        self._handle(message)
+        return None, False
+
+    def _attend(self, now: float) -> None:
+        """Pings, asks again or gives up, as the silence demands."""
+        due = self._liveness.due(now)
+        if due is Due.GIVE_UP:
+            raise self._lost(now)
+        if self._welcome_due is not None:
+            if now >= self._welcome_due:
+                self._hello_wait *= 2
+                self._welcome_due = now + self._hello_wait
+                self._send(self._hello)
+        elif due is Due.PING:
+            # A server answers anybody's Ping; that it forgot us shows only when something is asked, be it nothing.
+            self._send(Want(self._epoch, ()))
+            self._send(Ping())
+        elif due is Due.WANT_AGAIN:
+            self._want_again()
+            self._send(Ping())
+
+    def _handle(self, message: Message) -> None:
+        match message:
+            case Pong():
+                pass
+            case Welcome():
+                self._welcomed(message)
+            case Refused(code=ErrorCode.UNKNOWN_SESSION):
+                # Every request that was under way is refused: one Hello answers them all.
+                if self._welcome_due is None:
+                    self._begin_hello()
+            case Refused(code=ErrorCode.CREDIT) if self._may_exceed_credit():
+                # It still makes what it had sent before we asked again. What it refused stays asked for, in our
+                # account, and goes out again with the rest at the next quiet moment.
+                self._credit_refusals += 1
+            case Refused():
+                raise RemoteError(message.code, f"{self._address} refused: {message.text}")
+            case Unavailable():
+                if message.epoch == self._epoch and message.index in self._asked:
+                    raise SampleUnavailable(
+                        "unavailable",
+                        f"{self._address} cannot make sample {message.index} of epoch {message.epoch}: {message.text}",
+                    )
+                self.strays += 1
+            case _:
+                raise ProtocolError(f"{self._address} sent {type(message).__name__}, which no server sends a consumer")
+
+    def _may_exceed_credit(self) -> bool:
+        return self._asked_again and self._credit_refusals < _MOST_CREDIT_REFUSALS
+
+    def _welcomed(self, welcome: Welcome) -> None:
+        stream = Stream.of(welcome)
+        if welcome.credit < 1:
+            raise ProtocolError(f"{self._address} grants a credit of {welcome.credit} samples")
+        if self._pinned is not None:
+            self._pinned.require_same(stream, ours=self._pinned_by, theirs=self._address)
+        self.stream, self.credit = stream, welcome.credit
+        self._welcome_due = None
+        self._want_again()
+
+    def _sample(self, header: SampleHeader, payload: list[zmq.Frame]) -> Arrival | None:
+        if header.epoch != self._epoch:
+            self.strays += 1
+            return None
+        arrays = decode_sample(header, [frame.buffer for frame in payload])
+        found = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+        if found != self.layout:
+            raise ProtocolError(
+                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {found}; asked: {self.layout}"
+            )
+        provenance = Provenance.from_dict(header.provenance)
+        identity = SampleId(
+            spec_digest=self.stream.spec_digest,
+            catalogue_digest=self.stream.catalogue_digest,
+            numerics_version=self.stream.numerics_version,
+            seed=self._hello.seed,
+            epoch=header.epoch,
+            index=header.index,
+        )
+        if provenance.id != identity:
+            raise ProtocolError(f"{self._address} sent {provenance.id} in answer to {identity}")
+        self._asked.pop(header.index, None)
+        self._credit_refusals = 0
+        self._last = header.index
+        self.want(())
+        return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds)
+
+    # --- the socket ---------------------------------------------------------------------------------------------------
+
+    def _send(self, message: Message) -> None:
+        if self._socket is None:
+            raise ServerLost(f"{self._address}: this connection is closed")
+        try:
+            self._socket.send_multipart(encode(message), flags=zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            raise ServerLost(f"{self._address}: cannot send: {error}") from error
+
+    def _receive(self, seconds: float) -> list[zmq.Frame] | None:
+        if self._socket is None:
+            raise ServerLost(f"{self._address}: this connection is closed")
+        try:
+            if not self._socket.poll(math.ceil(seconds * 1000), zmq.POLLIN):
+                return None
+            return self._socket.recv_multipart(flags=zmq.NOBLOCK, copy=False)
+        except zmq.Again:  # readiness is a hint
+            return None
+        except zmq.ZMQError as error:
+            raise ServerLost(f"{self._address}: cannot receive: {error}") from error
+
+    def _lost(self, now: float) -> ServerLost:
+        last = (
+            "no sample was received" if self._last is None else f"last sample: epoch {self._epoch}, index {self._last}"
+        )
+        return ServerLost(
+            f"{self._address}: nothing heard for {self._liveness.silence(now):.0f} s; {last}; start v2v-serve there, "
+            f"or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
+        )
+
+
+def _item_bytes(dtype: str) -> int:
+    return {"int8": 1, "uint8": 1, "int16": 2, "float16": 2, "float32": 4}[dtype]

@@ -1,0 +1,98 @@
+"""When a silent server is asked whether it lives, asked again for what may be lost, and given up. Pure.
+
+Only time spent listening counts: a trainer that validates for ten minutes has not been kept waiting by the server.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from v2v_protocol.errors import UsageError
+
+
+class Due(Enum):
+    """What the silence calls for."""
+
+    PING = "ping"
+    WANT_AGAIN = "want again"
+    GIVE_UP = "give up"
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """
+    Attributes:
+        ping_seconds: silence after which the server is asked whether it lives, and again as often.
+        rewant_seconds: time without an answer to any request after which all of them are sent again, although the
+            server lives: a cut of the network can swallow messages in either direction.
+        timeout_seconds: silence after which the server is given up.
+
+    Raises:
+        UsageError: a time that is not positive.
+    """
+
+    timeout_seconds: float = 60.0
+    ping_seconds: float = 2.0
+    rewant_seconds: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("timeout_seconds", "ping_seconds", "rewant_seconds"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} = {getattr(self, name)!r}: give a positive number of seconds")
+
+
+class Liveness:
+    """What one connection heard, and when. ``now`` is seconds on the caller's clock, which never goes back."""
+
+    def __init__(self, patience: Patience, now: float) -> None:
+        self._patience = patience
+        self._heard = now
+        self._answered = now
+        self._pinged = now
+        self._listened_until = now
+
+    def listen(self, now: float) -> None:
+        """The caller begins to listen; the time since :meth:`pause` does not count."""
+        away = max(0.0, now - self._listened_until)
+        self._heard += away
+        self._answered += away
+        self._pinged += away
+
+    def pause(self, now: float) -> None:
+        """The caller stops listening."""
+        self._listened_until = now
+
+    def heard(self, now: float, *, answer: bool) -> None:
+        """Something came; ``answer`` when it answers a request, so that nothing needs to be asked again yet."""
+        self._heard = self._pinged = now
+        if answer:
+            self._answered = now
+
+    def silence(self, now: float) -> float:
+        """Seconds for which nothing was heard while listening."""
+        return now - self._heard
+
+    def due(self, now: float) -> Due | None:
+        """What to do now; asking for it counts as doing it."""
+        if now - self._heard >= self._patience.timeout_seconds:
+            return Due.GIVE_UP
+        if now - self._answered >= self._patience.rewant_seconds:
+            self._answered = self._pinged = now
+            return Due.WANT_AGAIN
+        if now - self._pinged >= self._patience.ping_seconds:
+            self._pinged = now
+            return Due.PING
+        return None
+
+    def next_due(self, now: float) -> float:
+        """Seconds until :meth:`due` has something to do, at least 0."""
+        return max(
+            0.0,
+            min(
+                self._heard + self._patience.timeout_seconds,
+                self._answered + self._patience.rewant_seconds,
+                self._pinged + self._patience.ping_seconds,
+            )
+            - now,
+        )

@@ -1,0 +1,165 @@
+"""Which epoch a dataset is in, agreed between a process and its loader workers.
+
+``DataLoader(num_workers=...)`` copies the dataset into processes of its own, by fork or by pickling, and tells the
+original nothing. But an epoch must begin when the last loader worker has finished the one before, a late worker must
+begin the epoch that its siblings began, and the original must know that its own state is stale. So all copies share a
+log: a small temporary file (not shared memory: that may be missing or tiny in a container) to which each appends
+whole lines, which the kernel keeps apart, and from which each computes the same answers:
+
+    set     an epoch to be in, and the state to start it from: from the user, or a state that was loaded
+    main    the original itself iterates
+    start   a loader worker begins an iteration; the first of an iteration to do so decides the epoch for all of it
+    finish  a loader worker has delivered its share; when all have, the next epoch begins
+    stream  what a server offered first; all others must offer the same
+
+The order of the lines is the order of the events; no lock, no clock.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import uuid
+import weakref
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from multiprocessing.context import get_spawning_popen
+from typing import Any
+
+from v2v_client.state import ResumeState, Stream
+
+
+@dataclass(slots=True)
+class Standing:
+    """What the log says so far.
+
+    Attributes:
+        epoch: the epoch that the next iteration delivers.
+        state: where it begins; None at its beginning.
+        stream: what the samples are made of, once known.
+        stale: loader workers have begun to iterate since the original last knew where it stood.
+    """
+
+    epoch: int = 0
+    state: ResumeState | None = None
+    stream: Stream | None = None
+    stale: bool = False
+    tokens: set[str] = field(default_factory=set)
+    starts: dict[tuple[str, int], int] = field(default_factory=dict)
+    decisions: dict[tuple[str, int], tuple[int, ResumeState | None]] = field(default_factory=dict)
+    finished: dict[tuple[str, int], set[int]] = field(default_factory=dict)
+
+    def apply(self, line: Mapping[str, Any]) -> None:
+        """One more line of the log."""
+        match line["kind"]:
+            case "set":
+                if line["token"] in self.tokens:
+                    return  # every loader worker loads its own copy of what is one event
+                self.tokens.add(line["token"])
+                self._begin(line["epoch"], line["state"])
+                self.stale = self.stale and line["keeps_stale"]
+            case "main":
+                self.stale = False
+            case "start":
+                mine = (line["iteration"], line["worker"])
+                self.starts[mine] = self.starts.get(mine, 0) + 1
+                self.decisions.setdefault((line["iteration"], self.starts[mine]), (self.epoch, self.state))
+                self.stale = True
+            case "finish":
+                if line["epoch"] == self.epoch:
+                    workers = self.finished.setdefault((line["iteration"], line["round"]), set())
+                    workers.add(line["worker"])
+                    if len(workers) == line["workers"]:
+                        self._begin(self.epoch + 1, None)
+            case "stream":
+                self.stream = self.stream or Stream(**line["stream"])
+
+    def _begin(self, epoch: int, state: Mapping[str, Any] | None) -> None:
+        self.epoch = epoch
+        self.state = None if state is None else ResumeState.from_dict(state)
+        self.finished = {}
+        if self.state is not None and self.state.stream is not None:
+            self.stream = self.state.stream
+
+
+class Progress:
+    """The log, as one process sees it. Pickled while a process is being spawned it stays the same log; copied in any
+    other way it becomes a log of its own, with the same lines."""
+
+    def __init__(self, epoch: int) -> None:
+        self._create()
+        self.set(epoch, None)
+
+    def _create(self) -> None:
+        descriptor, self._path = tempfile.mkstemp(prefix="v2v-progress-")
+        os.close(descriptor)
+        weakref.finalize(self, _remove, self._path, os.getpid())
+
+    def __getstate__(self) -> dict[str, Any]:
+        if get_spawning_popen() is not None:
+            return {"path": self._path}
+        return {"lines": list(self._lines())}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        if "path" in state:
+            self._path = state["path"]
+            return
+        self._create()
+        for line in state["lines"]:
+            self._append(**line)
+
+    def standing(self) -> Standing:
+        """What the log says now."""
+        standing = Standing()
+        for line in self._lines():
+            standing.apply(line)
+        return standing
+
+    def set(self, epoch: int, state: ResumeState | None, *, iteration: str | None = None) -> None:
+        """The next iteration delivers ``epoch``, from ``state`` on.
+
+        Args:
+            iteration: given by loader workers that all load the same state: counts once.
+        """
+        plain = None if state is None else state.to_dict()
+        token = iteration or uuid.uuid4().hex
+        self._append(kind="set", token=token, epoch=epoch, state=plain, keeps_stale=iteration is not None)
+
+    def main(self) -> None:
+        """The process that owns the dataset iterates by itself."""
+        self._append(kind="main")
+
+    def start(self, iteration: str, worker: int) -> tuple[int, int, ResumeState | None]:
+        """A loader worker begins: (its number of this start, the epoch, where the epoch begins)."""
+        self._append(kind="start", iteration=iteration, worker=worker)
+        standing = self.standing()
+        number = standing.starts[iteration, worker]
+        return number, *standing.decisions[iteration, number]
+
+    def finish(self, iteration: str, number: int, worker: int, workers: int, epoch: int) -> None:
+        """A loader worker has delivered its share of ``epoch``."""
+        self._append(kind="finish", iteration=iteration, round=number, worker=worker, workers=workers, epoch=epoch)
+
+    def pin(self, stream: Stream) -> None:
+        """A server offered ``stream``."""
+        plain = {name: getattr(stream, name) for name in stream.__slots__}
+        self._append(kind="stream", stream=plain | {"spec": dict(stream.spec)})
+
+    def _append(self, **line: Any) -> None:
+        descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
+        try:
+            os.write(descriptor, json.dumps(line).encode() + b"\n")
+        finally:
+            os.close(descriptor)
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        with open(self._path, encoding="utf-8") as file:
+            for line in file:
+                yield json.loads(line)
+
+
+def _remove(path: str, owner: int) -> None:
+    # A forked loader worker inherits the finalizer with everything else.
+    if os.getpid() == owner:
+        os.unlink(path)

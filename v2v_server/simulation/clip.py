@@ -1,0 +1,291 @@
+"""Simulating a clip: arguments checked, noise prepared, kernel called."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import VOXEL_DTYPES
+from v2v_server.simulation import noise
+from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.pixel import simulate_pixels
+from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
+
+_PRECISIONS: dict[str, type[np.floating[Any]]] = {"float32": np.float32, "float64": np.float64}
+
+
+class Voxels(NamedTuple):
+    """What a simulation returns.
+
+    Attributes:
+        voxels: [T, bins, H, W] signed event counts.
+        saturated_bins: how many bins were clipped to what the dtype holds.
+    """
+
+    voxels: npt.NDArray[Any]
+    saturated_bins: int
+
+
+def simulate(
+    frames: npt.NDArray[np.uint8],
+    *,
+    threshold_pos: float,
+    threshold_neg: float | None = None,
+    noise_sigma: float = 0.0,
+    hot_pixel_count: int = 0,
+    hot_pixel_sigma: float = 0.0,
+    start_residual: float | None = None,
+    bins: int = 5,
+    frames_per_bin: int = 1,
+    gamma: float = 2.2,
+    log_eps: float = 1e-3,
+    seed: int = 0,
+    dtype: str = "int8",
+    precision: str = "float32",
+) -> Voxels:
+    """Simulate an event camera that watches a clip.
+
+    Args:
+        frames: [n, H, W] uint8 grey levels; n - 1 is a multiple of ``bins * frames_per_bin``.
+        threshold_pos, threshold_neg: contrast thresholds, log-intensity units; equal when only one is given.
+        noise_sigma: standard deviation of the noise, log units per frame.
+        hot_pixel_count: how many pixels drift by themselves.
+        hot_pixel_sigma: standard deviation of their drift, log units per frame.
+        start_residual: every pixel's residual before the first step, log units; None draws it uniformly between
+            -threshold_neg and threshold_pos, as the paper does.
+        bins, frames_per_bin: shape of a voxel grid, see ``voxel.py``.
+        gamma, log_eps: see ``intensity.py``.
+        seed: 0 .. 2**64 - 1; the same seed gives the same bytes.
+        dtype: "int8", "int16" or "float32".
+        precision: arithmetic of the pixels, "float32" or "float64".
+
+    Returns:
+        voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins.
+
+    Raises:
+        UsageError: an argument of the wrong type, shape or range.
+    """
+    frames = np.asarray(frames)
+    if frames.ndim != 3 or frames.dtype != np.uint8:
+        raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give uint8 [n, H, W]")
+    _check_number("gamma", gamma, positive=True)
+    _check_number("log_eps", log_eps, positive=True)
+    return _simulate_array(
+        frames, _table(gamma, log_eps, _real(precision)), threshold_pos, threshold_neg, noise_sigma,
+        hot_pixel_count, hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype,
+    )  # fmt: skip
+
+
+def simulate_log(
+    log_frames: npt.NDArray[np.floating[Any]],
+    *,
+    threshold_pos: float,
+    threshold_neg: float | None = None,
+    noise_sigma: float = 0.0,
+    hot_pixel_count: int = 0,
+    hot_pixel_sigma: float = 0.0,
+    start_residual: float | None = None,
+    bins: int = 5,
+    frames_per_bin: int = 1,
+    seed: int = 0,
+    dtype: str = "int8",
+    precision: str = "float32",
+) -> Voxels:
+    """The same for log intensities.
+
+    Args:
+        log_frames: [n, H, W] floating point, natural log of intensity; rounded to ``precision`` first.
+
+    Other arguments, result and errors are those of :func:`simulate`.
+    """
+    log_frames = np.asarray(log_frames)
+    if log_frames.ndim != 3 or log_frames.dtype.kind != "f":
+        raise UsageError(f"log_frames {log_frames.dtype}{list(log_frames.shape)}: give floating point [n, H, W]")
+    real = _real(precision)
+    if not np.isfinite(log_frames).all():
+        raise UsageError("log_frames: a value is NaN or infinite; give the logarithm of positive intensities")
+    return _simulate_array(
+        log_frames.astype(real), np.empty(0, real), threshold_pos, threshold_neg, noise_sigma,
+        hot_pixel_count, hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype,
+    )  # fmt: skip
+
+
+def simulate_clip(
+    frames: npt.NDArray[np.uint8],
+    params: SampleParams,
+    recipe: Recipe,
+    voxel_dtype: str,
+    step_seconds: npt.NDArray[np.float64] | None = None,
+) -> Voxels:
+    """Simulate one drawn sample.
+
+    Args:
+        frames: [n, H, W] uint8, the decoded frames after ``apply_view``; n is at least the number of different
+            frames the clip shows.
+        params, recipe: the draw and its recipe.
+        voxel_dtype: "int8", "int16" or "float32".
+        step_seconds: [steps] duration of each step (``timing.py``); given exactly when ``noise_unit`` is "second".
+
+    Returns:
+        voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
+
+    Raises:
+        UsageError: too few frames, or ``step_seconds`` missing, unwanted or of the wrong length.
+    """
+    source_index = params.source_index(recipe.steps)
+    if frames.ndim != 3 or frames.dtype != np.uint8 or len(frames) <= source_index[-1]:
+        raise UsageError(
+            f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, uint8 [n, H, W]"
+        )
+    if (step_seconds is None) != (recipe.noise_unit == "frame"):
+        raise UsageError(
+            f"noise_unit is {recipe.noise_unit!r}: step_seconds is {'missing' if step_seconds is None else 'unwanted'}"
+        )
+    if step_seconds is None:
+        step_seconds = np.ones(recipe.steps)
+    elif step_seconds.shape != (recipe.steps,) or not (np.isfinite(step_seconds) & (step_seconds > 0)).all():
+        raise UsageError(
+            f"step_seconds {list(step_seconds.shape)}: give {recipe.steps} positive finite durations, one per step"
+        )
+    return _run(
+        frames, _table(recipe.gamma, recipe.log_eps, np.float32), source_index, params, step_seconds,
+        recipe.bins, recipe.frames_per_bin, voxel_dtype,
+    )  # fmt: skip
+
+
+def warm_up() -> None:
+    """Compile, or load from the cache, every variant of the kernel that a server worker needs."""
+    params = _params(0.2, 0.2, 0.1, 1, 1.0, 0)
+    frames = np.zeros((2, 1, 1), np.uint8)
+    for dtype in VOXEL_DTYPES:
+        _run(frames, _table(2.2, 1e-3, np.float32), np.arange(2), params, np.ones(1), 1, 1, dtype)
+
+
+def _simulate_array(
+    frames: npt.NDArray[Any],
+    table: npt.NDArray[Any],
+    threshold_pos: float,
+    threshold_neg: float | None,
+    noise_sigma: float,
+    hot_pixel_count: int,
+    hot_pixel_sigma: float,
+    start_residual: float | None,
+    bins: int,
+    frames_per_bin: int,
+    seed: int,
+    dtype: str,
+) -> Voxels:
+    threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
+    _check_number("threshold_pos", threshold_pos, positive=True)
+    _check_number("threshold_neg", threshold_neg, positive=True)
+    _check_number("noise_sigma", noise_sigma)
+    _check_number("hot_pixel_sigma", hot_pixel_sigma)
+    if start_residual is not None and not -threshold_neg <= start_residual <= threshold_pos:
+        raise UsageError(
+            f"start_residual = {start_residual!r}: give -threshold_neg .. threshold_pos, {-threshold_neg} .. {threshold_pos}"
+        )
+    _check_whole("bins", bins, 1, 2**31)
+    _check_whole("frames_per_bin", frames_per_bin, 1, 2**31)
+    _check_whole("seed", seed, 0, 2**64 - 1)
+    count, height, width = frames.shape
+    _check_whole("hot_pixel_count", hot_pixel_count, 0, height * width)
+    if height * width == 0 or count < 2 or (count - 1) % (bins * frames_per_bin):
+        raise UsageError(
+            f"{count} frames of {width}x{height} pixels: give k x bins x frames_per_bin + 1 frames, "
+            f"k > 0 (k x {bins * frames_per_bin} + 1), of at least one pixel"
+        )
+    steps = count - 1
+    params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed)
+    return _run(frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual)
+
+
+def _run(
+    frames: npt.NDArray[Any],
+    table: npt.NDArray[Any],
+    source_index: npt.NDArray[np.int64],
+    params: SampleParams,
+    step_seconds: npt.NDArray[np.float64],
+    bins: int,
+    frames_per_bin: int,
+    dtype: str,
+    start_residual: float | None = None,
+) -> Voxels:
+    _, height, width = frames.shape
+    steps, pixels, real = len(step_seconds), height * width, table.dtype.type
+    voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype)
+    # Noise of independent increments: its variance, not its deviation, grows with time.
+    noise_scale = params.noise_sigma * np.sqrt(step_seconds) if params.noise_sigma > 0.0 else np.empty(0)
+    hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
+    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels)
+    threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
+    if start_residual is None:
+        start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
+    else:
+        start_low, start_span = real(start_residual), real(0)
+    saturated = simulate_pixels(
+        np.ascontiguousarray(frames).reshape(len(frames), pixels),
+        table,
+        source_index,
+        np.array(params.noise_key, np.uint32),
+        noise_scale.astype(real),
+        position,
+        normal.astype(real) * real(params.hot_pixel_sigma),
+        step_seconds.astype(real),
+        threshold_pos,
+        threshold_neg,
+        real(rounding_tolerance(params.threshold_pos, params.threshold_neg)),
+        start_low,
+        start_span,
+        frames_per_bin,
+        real(LARGEST_COUNT[dtype]),
+        voxels.reshape(steps // frames_per_bin, pixels),
+    )
+    return Voxels(voxels, int(saturated))
+
+
+def _params(
+    threshold_pos: float, threshold_neg: float, noise_sigma: float, hot_count: int, hot_sigma: float, seed: int
+) -> SampleParams:
+    """A camera without a view."""
+    return SampleParams(
+        threshold_pos=threshold_pos,
+        threshold_neg=threshold_neg,
+        noise_sigma=noise_sigma,
+        hot_pixel_count=hot_count,
+        hot_pixel_sigma=hot_sigma,
+        pauses=(),
+        scale=1.0,
+        crop_top_px=0,
+        crop_left_px=0,
+        flip=False,
+        contrast=0.0,
+        noise_key=noise_key_of_seed(seed),
+    )
+
+
+def _table(gamma: float, log_eps: float, real: type[np.floating[Any]]) -> npt.NDArray[Any]:
+    return log_table(gamma, log_eps) if real is np.float32 else log_table_float64(gamma, log_eps)
+
+
+def _real(precision: str) -> type[np.floating[Any]]:
+    if precision not in _PRECISIONS:
+        raise UsageError(f"precision {precision!r}: choose one of {', '.join(_PRECISIONS)}")
+    return _PRECISIONS[precision]
+
+
+def _check_number(name: str, value: float, *, positive: bool = False) -> None:
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value < 0 or (positive and value == 0):
+        raise UsageError(f"{name} = {value!r}: give a finite number {'above' if positive else 'of at least'} 0")
+
+
+def _check_whole(name: str, value: int, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+        raise UsageError(f"{name} = {value!r}: give a whole number from {low} to {high}")

@@ -1,0 +1,190 @@
+"""From a recipe to one virtual camera: every draw of a sample, a pure function of (recipe, seed, epoch, index, video).
+
+Random bits are the raw 64-bit output of Philox4x64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3",
+SC 2011) as numpy implements it: key (seed, a constant), counter (block, purpose, index, epoch). Raw output is a stable
+interface of numpy; its distributions are not, so the mappings to numbers stand here, each an IEEE float64 expression
+or exact integer arithmetic. Each purpose owns a counter stream: a draw that is added later, or one that takes more
+numbers, shifts no other.
+
+    uniform [0, 1)     u = floor(raw / 2**11) * 2**-53
+    range [a, b]       min(a + u (b - a), b)
+    chance p           u < p
+    whole 0 .. n-1     floor(raw * n / 2**64), exact
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from enum import IntEnum
+
+import numpy as np
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Range, Recipe
+from v2v_protocol.sample import SampleParams
+
+_SAMPLE_KEY = 0x7632762073616D70
+_LEAST_CONTRAST = 2.0**-60
+"""Stands for a drawn contrast of 0, because 0.0 means "left alone"; it gives the same flat grey picture."""
+
+
+class Purpose(IntEnum):
+    """The counter stream of each draw. Numbers are never reused."""
+
+    THRESHOLD = 1
+    NOISE_SIGMA = 2
+    HOT_PIXELS = 3
+    PAUSES = 4
+    SCALE = 5
+    CROP = 6
+    FLIP = 7
+    CONTRAST = 8
+    NOISE_KEY = 9
+
+
+_Stream = Callable[[Purpose, int], list[int]]
+
+
+def draw(
+    recipe: Recipe,
+    *,
+    seed: int,
+    epoch: int,
+    index: int,
+    picture_height_px: int,
+    picture_width_px: int,
+    video_id: str,
+    video_thresholds: tuple[float, float] | None = None,
+) -> SampleParams:
+    """The virtual camera and view of one sample.
+
+    Args:
+        recipe: ranges to draw from.
+        seed, epoch, index: the sample's place in its stream (limits in ``v2v_protocol.sample``).
+        picture_height_px, picture_width_px: the usable picture of the video, upright, before any resize.
+        video_id: the catalogue id; used with ``threshold_source="video"`` only.
+        video_thresholds: (threshold_pos, threshold_neg) where the list file states them; likewise.
+
+    Returns:
+        the draw; its thresholds are float32 values.
+
+    Raises:
+        UsageError: the crop does not fit into the picture at the largest allowed scale.
+    """
+    if not admits(recipe, picture_height_px, picture_width_px):
+        needed = smallest_scale(recipe, picture_height_px, picture_width_px)
+        raise UsageError(
+            f"crop {recipe.crop_width_px}x{recipe.crop_height_px} does not fit into the picture "
+            f"{picture_width_px}x{picture_height_px} of {video_id} at the largest resize_scale "
+            f"{recipe.resize_scale[1]}: raise its upper end to {needed:.6g} or more, or make the crop smaller"
+        )
+
+    def stream(purpose: Purpose, count: int) -> list[int]:
+        return _raw((seed, _SAMPLE_KEY), (0, purpose, index, epoch), count)
+
+    crop = recipe.crop_height_px * recipe.crop_width_px
+    threshold_pos, threshold_neg = _thresholds(recipe, stream(Purpose.THRESHOLD, 3), video_id, video_thresholds)
+    noise_sigma = _in_range(recipe.noise_sigma, stream(Purpose.NOISE_SIGMA, 1)[0])
+    share, sigma = stream(Purpose.HOT_PIXELS, 2)
+    low, high = recipe.resize_scale
+    low = max(low, smallest_scale(recipe, picture_height_px, picture_width_px))
+    scale = _in_range((low, high), stream(Purpose.SCALE, 1)[0])
+    height, width = resized_size(picture_height_px, picture_width_px, scale)
+    top, left = stream(Purpose.CROP, 2)
+    degraded, contrast = stream(Purpose.CONTRAST, 2)
+    first, second = stream(Purpose.NOISE_KEY, 2)
+    return SampleParams(
+        threshold_pos=threshold_pos,
+        threshold_neg=threshold_neg,
+        noise_sigma=noise_sigma * threshold_pos if recipe.noise_scales_with_threshold else noise_sigma,
+        hot_pixel_count=math.floor(_in_range(recipe.hot_pixel_share, share) * crop + 0.5),
+        hot_pixel_sigma=_in_range(recipe.hot_pixel_sigma, sigma),
+        pauses=_pauses(recipe, stream),
+        scale=scale,
+        crop_top_px=_below(height - recipe.crop_height_px + 1, top),
+        crop_left_px=_below(width - recipe.crop_width_px + 1, left),
+        flip=_unit(stream(Purpose.FLIP, 1)[0]) < recipe.flip_probability,
+        contrast=(
+            max(_in_range(recipe.contrast_scale, contrast), _LEAST_CONTRAST)
+            if _unit(degraded) < recipe.contrast_probability
+            else 0.0
+        ),
+        noise_key=(first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32),
+    )
+
+
+def smallest_scale(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> float:
+    """The resize scale at which the crop just fits into the picture."""
+    return max(recipe.crop_height_px / picture_height_px, recipe.crop_width_px / picture_width_px)
+
+
+def admits(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> bool:
+    """True where some scale of the recipe makes the picture as large as the crop."""
+    return (
+        min(picture_height_px, picture_width_px) > 0
+        and smallest_scale(recipe, picture_height_px, picture_width_px) <= recipe.resize_scale[1]
+    )
+
+
+def resized_size(height_px: int, width_px: int, scale: float) -> tuple[int, int]:
+    """Height and width of the picture after the resize, each rounded half up."""
+    return math.floor(height_px * scale + 0.5), math.floor(width_px * scale + 0.5)
+
+
+def noise_key_of_seed(seed: int) -> tuple[int, int, int, int]:
+    """A noise key for a caller who has a seed but no stream: that of (seed, epoch 0, index 0)."""
+    first, second = _raw((seed, _SAMPLE_KEY), (0, Purpose.NOISE_KEY, 0, 0), 2)
+    return first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32
+
+
+def _thresholds(
+    recipe: Recipe, raw: list[int], video_id: str, listed: tuple[float, float] | None
+) -> tuple[float, float]:
+    if recipe.threshold_source == "video":
+        if listed is not None:
+            return float(np.float32(listed[0])), float(np.float32(listed[1]))
+        digest = hashlib.blake2b(video_id.encode("utf-8", "surrogateescape"), digest_size=16).digest()
+        video_key = int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
+        raw = _raw(video_key, (0, Purpose.THRESHOLD, 0, 0), 3)
+    one = _in_range(recipe.threshold, raw[0])
+    other = one * _in_range(recipe.threshold_ratio, raw[1])
+    first, second = float(np.float32(one)), float(np.float32(other))
+    return (first, second) if raw[2] >> 63 else (second, first)
+
+
+def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
+    """Runs of repeated frames of a Markov chain that starts in the running state."""
+    if recipe.pause_probability == 0.0:
+        return ()
+    runs: list[tuple[int, int]] = []
+    first = 0  # position of the current run's first repeat; 0 while the camera runs
+    for position, raw in enumerate(stream(Purpose.PAUSES, recipe.steps), start=1):
+        paused = _unit(raw) < (recipe.pause_stay_probability if first else recipe.pause_probability)
+        if paused and not first:
+            first = position
+        elif first and not paused:
+            runs.append((first, position - first))
+            first = 0
+    if first:
+        runs.append((first, recipe.steps + 1 - first))
+    return tuple(runs)
+
+
+def _raw(key: tuple[int, int], counter: tuple[int, int, int, int], count: int) -> list[int]:
+    words = np.random.Philox(key=np.array(key, np.uint64), counter=np.array(counter, np.uint64)).random_raw(count)
+    return [int(word) for word in words]
+
+
+def _unit(raw: int) -> float:
+    return (raw >> 11) * 2.0**-53
+
+
+def _in_range(ends: Range, raw: int) -> float:
+    low, high = ends
+    return min(low + _unit(raw) * (high - low), high)
+
+
+def _below(count: int, raw: int) -> int:
+    return (raw * count) >> 64

@@ -1,0 +1,169 @@
+"""The random numbers of a virtual camera's pixels: THE definition, in numpy.
+
+``pixel.py`` computes the same numbers inside its loops; the tests hold the two equal bit for bit. Every number is a
+pure function of (noise_key, purpose, counter), so it does not depend on the order of the loops, on the size of a
+block, or on any other pixel. All arithmetic is unsigned 32-bit integer (modulo 2**32) or IEEE binary32 with one
+rounding per operation, in the order written, and no function of a maths library but the square root, which IEEE 754
+rounds correctly: the same bits on every host.
+
+Words. ``scramble`` is a bijection of 32-bit words whose every output bit depends on every input bit ("triple32" of
+C. Wellons' hash prospector, public domain); the words k0..k3 are the noise key:
+
+    word(purpose, n) = S(S(S(S(S(n + purpose * 0x9E3779B9) + k0) + k1) + k2) + k3),    S = scramble
+
+For one key and purpose this is a bijection of n: no two pixels share a word.
+
+Two normals per pixel and pair of steps. For pixel p and steps 2m and 2m+1, * modulo 2**32, ^ exclusive or:
+
+    z = word(PIXEL_RADIUS, p) ^ word(PAIR_RADIUS, m)
+    x = M(z),    M = two rounds of z ^ z >> 16, z * 0x21F0AAAD and z ^ z >> 15, z * 0x735A2D97
+    y = (x ^ x >> 15 ^ word(PIXEL_ANGLE, p) ^ word(PAIR_ANGLE, m)) * 0xAC4C1B51
+
+(the multipliers are those of "lowbias32" and "triple32"). For a given x, y is a bijection of its own two words, so the
+pair is uniform over 64 bits; x keeps the y of neighbours apart. Then the transform of Box and Muller (1958):
+
+    u = (x mod 2**31, made odd) / 2**31 in (0, 1),    r = sqrt(-2 ln u),    t = signed(y) / 2**32 in [-1/2, 1/2)
+    normal(2m) = r cos(2 pi t),    normal(2m+1) = r sin(2 pi t)
+
+The smallest u is 2**-31: |normal| reaches 6.56. The logarithm splits u = 2**e (1 + f), 1 + f in [sqrt(1/2), sqrt(2)),
+with ln(1+f) = f P(f), P of degree 5 (relative error 7e-6); sin(pi t) = t S(t^2) and cos(pi t) = C(t^2), both of
+degree 3 (errors 6e-7, 7e-6), give cos(2 pi t) = 1 - 2 sin^2(pi t) and sin(2 pi t) = 2 sin(pi t) cos(pi t). A distribution
+needs no more: the variance is off by less than 1e-5, which 10^10 draws would not show. The coefficients are minimax
+fits by the algorithm of Remez, rounded to binary32.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Words = npt.NDArray[np.uint32]
+Reals = npt.NDArray[np.float32]
+NoiseKey = tuple[int, int, int, int]
+
+PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
+"""What a word is for."""
+
+# Numba's cache is keyed by the source of pixel.py alone: after changing a number below, save pixel.py too.
+GOLDEN = np.uint32(0x9E3779B9)
+SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))
+MIX_FACTORS = (np.uint32(0x21F0AAAD), np.uint32(0x735A2D97), np.uint32(0xAC4C1B51))
+
+SQRT_HALF_BITS = np.int32(0x3F3504F3)
+MINUS_2_LN_2 = np.float32(-1.3862943611198906)
+LOG_COEFFICIENTS = tuple(
+    # -2 P(f), constant term first: the factor -2 of the radius costs no operation here.
+    np.float32(-2.0 * c)
+    for c in (
+        1.0000045588267954, -0.4999021757482491, 0.33258023433429046,
+        -0.2540326889857934, 0.22055937623179397, -0.14292077126263117,
+    )
+)  # fmt: skip
+SIN_COEFFICIENTS = tuple(
+    np.float32(c) for c in (3.141582022152207, -5.167142796404795, 2.5418990277836127, -0.5546361973896712)
+)
+COS_COEFFICIENTS = tuple(
+    np.float32(c) for c in (0.99999329528942, -4.933938015595793, 4.041283830071049, -1.222127070751509)
+)
+
+
+def scramble(x: Words) -> Words:
+    """S: bijection of 32-bit words, three multiplications."""
+    x = x ^ (x >> np.uint32(17))
+    x = x * SCRAMBLE_FACTORS[0]
+    x = x ^ (x >> np.uint32(11))
+    x = x * SCRAMBLE_FACTORS[1]
+    x = x ^ (x >> np.uint32(15))
+    x = x * SCRAMBLE_FACTORS[2]
+    return x ^ (x >> np.uint32(14))
+
+
+def mix(z: Words, angle_word: Words) -> tuple[Words, Words]:
+    """x and y of the module's docstring, from the exclusive or of the two radius words and of the two angle words."""
+    x = z ^ (z >> np.uint32(16))
+    x = x * MIX_FACTORS[0]
+    x = x ^ (x >> np.uint32(15))
+    x = x * MIX_FACTORS[1]
+    return x, (x ^ (x >> np.uint32(15)) ^ angle_word) * MIX_FACTORS[2]
+
+
+def words(key: NoiseKey, purpose: int, counter: npt.ArrayLike) -> Words:
+    """word(purpose, n) of each counter n.
+
+    Args:
+        key: four words, 0 .. 2**32 - 1.
+        purpose: one of the constants above.
+        counter: any shape, 0 .. 2**32 - 1.
+
+    Returns:
+        the counter's shape (at least one dimension), uint32.
+    """
+    offset = np.uint32(purpose * int(GOLDEN) % 2**32)
+    word = scramble(np.atleast_1d(np.asarray(counter)).astype(np.uint32) + offset)
+    for part in key:
+        word = scramble(word + np.uint32(part))
+    return word
+
+
+def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
+    """Two independent standard normals of each pair of words: (r cos, r sin), float32."""
+    value = ((x & np.uint32(0x7FFFFFFF)) | np.uint32(1)).astype(np.int32).astype(np.float32)
+    bits = value.view(np.int32)
+    exponent = (bits - SQRT_HALF_BITS) >> np.int32(23)
+    fraction = (bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
+    log = (exponent - np.int32(31)).astype(np.float32) * MINUS_2_LN_2 + fraction * _horner(LOG_COEFFICIENTS, fraction)
+    radius = np.sqrt(log)
+
+    turn = y.view(np.int32).astype(np.float32) * np.float32(2.0**-32)
+    square = turn * turn
+    sine = turn * _horner(SIN_COEFFICIENTS, square)
+    twice = sine + sine
+    return radius * (np.float32(1) - twice * sine), radius * (twice * _horner(COS_COEFFICIENTS, square))
+
+
+def standard_normals(key: NoiseKey, steps: int, pixels: int, first_pixel: int = 0) -> Reals:
+    """The noise of every step, before it is scaled.
+
+    Returns:
+        [steps, pixels] float32; steps counted from 0 (the step from frame 0 to frame 1), pixels in row order.
+    """
+    pairs = (steps + 1) // 2
+    place = np.arange(first_pixel, first_pixel + pixels)
+    radius_words, angle_words = words(key, PIXEL_RADIUS, place), words(key, PIXEL_ANGLE, place)
+    pair_radius, pair_angle = words(key, PAIR_RADIUS, np.arange(pairs)), words(key, PAIR_ANGLE, np.arange(pairs))
+    normals = np.empty((2 * pairs, pixels), np.float32)
+    for pair in range(pairs):
+        x, y = mix(radius_words ^ pair_radius[pair], angle_words ^ pair_angle[pair])
+        normals[2 * pair], normals[2 * pair + 1] = box_muller(x, y)
+    return normals[:steps]
+
+
+def start_uniforms(key: NoiseKey, pixels: int) -> Reals:
+    """Where each pixel's residual starts between -threshold_neg (0) and +threshold_pos (1): [pixels] float32 in [0, 1),
+    multiples of 2**-24."""
+    return (words(key, START, np.arange(pixels)) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
+
+
+def hot_pixels(key: NoiseKey, count: int, pixels: int) -> tuple[npt.NDArray[np.int64], Reals]:
+    """The hot pixels: those of the smallest words, so they are distinct for any count up to all.
+
+    Args:
+        count: how many, 0 .. pixels.
+
+    Returns:
+        positions [count] int64, ascending, in row order; their standard normals [count] float32.
+    """
+    if count == 0:
+        return np.empty(0, np.int64), np.empty(0, np.float32)
+    place_words = words(key, HOT_PLACE, np.arange(pixels))
+    largest = np.partition(place_words, count - 1)[count - 1]
+    position = np.flatnonzero(place_words <= largest).astype(np.int64)
+    normal, _ = box_muller(words(key, HOT_RADIUS, position), words(key, HOT_ANGLE, position))
+    return position, normal
+
+
+def _horner(coefficients: tuple[np.float32, ...], x: Reals) -> Reals:
+    value = coefficients[-1] * x + coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        value = value * x + coefficient
+    return value

@@ -1,0 +1,300 @@
+"""The catalogue: which videos a corpus has, under stable names, and what each of them holds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, VideoChanged
+from v2v_server.video.index import FrameIndex
+from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.video.rows import Rows
+from v2v_server.video.store import Record, Store
+from v2v_server.video.survey import survey
+from v2v_server.video.tree import VIDEO_SUFFIXES, printable, video_files
+
+_WRITE_EVERY = 256
+
+Progress = Callable[[int, int], None]
+"""(files probed so far, files to probe)."""
+
+
+@dataclass(frozen=True, slots=True)
+class VideoEntry:
+    """A video that can be used.
+
+    Attributes:
+        id: relative POSIX path; its name for ever.
+        fingerprint: size and hash of head and tail.
+        frames: how many frames there are to decode.
+        width_px, height_px: size of the upright picture, before ``rows``.
+        frames_per_second: average rate; NaN where unknown.
+        codec: FFmpeg's name of the format.
+        threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
+    """
+
+    id: str
+    fingerprint: str
+    frames: int
+    width_px: int
+    height_px: int
+    frames_per_second: float
+    codec: str
+    threshold_pos: float | None = None
+    threshold_neg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A file, folder or line of the list that gives no video, and why."""
+
+    id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
+
+    Attributes:
+        root: the folder that ids are relative to, resolved.
+        rows: which rows of the pictures may be used.
+        videos: the videos that can be used, by id.
+        problems: what could not be taken in, by id.
+        notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
+        digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
+    """
+
+    root: Path
+    rows: Rows
+    videos: tuple[VideoEntry, ...]
+    problems: tuple[Problem, ...]
+    notes: tuple[str, ...]
+    digest: str
+    _store: Store = field(repr=False, compare=False)
+    _fingerprints: dict[str, str] = field(repr=False, compare=False)
+
+    def path(self, id: str) -> Path:
+        """Where the video lies.
+
+        Raises:
+            CorpusError: no such id in this catalogue.
+        """
+        self._fingerprint(id)
+        return self.root / id
+
+    def frame_index(self, id: str) -> FrameIndex:
+        """The frames of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue, or the index can no longer be read.
+            VideoChanged: another process has catalogued a changed file under this id since.
+        """
+        fingerprint = self._fingerprint(id)
+        try:
+            data = self._store.frame_index(id, fingerprint)
+        except sqlite3.Error as error:
+            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return FrameIndex.from_bytes(data)
+
+    def close(self) -> None:
+        """Close the index; ``frame_index`` works no more."""
+        self._store.close()
+
+    def _fingerprint(self, id: str) -> str:
+        if id not in self._fingerprints:
+            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
+        return self._fingerprints[id]
+
+
+def open_catalogue(
+    source: str | os.PathLike[str],
+    *,
+    list_file: str | os.PathLike[str] | None = None,
+    rows: Rows | None = None,
+    cache_dir: str | os.PathLike[str] | None = None,
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> Catalogue:
+    """Take in a corpus: probe what is new or changed, forget what is gone.
+
+    Args:
+        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder.
+        list_file: a list that restricts the folder ``source`` to the videos it names.
+        rows: which rows may be used; all when None.
+        cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
+            ``~/.cache/v2v``.
+        processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
+        progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
+
+    Raises:
+        CorpusError: there is no such folder or list, it makes no sense, or not one video of it can be used.
+    """
+    root, listed = _wanted(Path(source), list_file)
+    refused: dict[str, str] = {}
+    ids = tuple(video_files(root, refused)) if listed is None else tuple(entry.id for entry in listed)
+    if not ids:
+        raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
+    store, records, notes = _up_to_date(root, ids, _index_path(root, cache_dir), processes, progress)
+    try:
+        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store)
+    except BaseException:
+        store.close()
+        raise
+
+
+def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Path, tuple[ListEntry, ...] | None]:
+    """The root folder, and the entries to take from it; None takes every video below it."""
+    if source.is_dir():
+        return source.resolve(), None if list_file is None else read_list(list_file)
+    if list_file is not None:
+        raise CorpusError(f"{source}: not a folder; a list file names videos of a folder")
+    if not source.is_file():
+        raise CorpusError(f"{source}: there is no such folder, video or list file")
+    folder = source.parent.resolve()
+    if source.suffix.lower() in LIST_SUFFIXES:
+        return folder, read_list(source)
+    if printable(source.name) != source.name:
+        raise CorpusError(f"{printable(source.name)}: its name is not UTF-8 text; rename it")
+    return folder, (ListEntry(source.name),)
+
+
+def _index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+    if cache_dir is not None:
+        folder = Path(cache_dir)
+    elif chosen := os.environ.get("V2V_CACHE_DIR"):
+        folder = Path(chosen)
+    else:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
+    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    return folder / f"catalogue-{name}.sqlite3"
+
+
+def _up_to_date(
+    root: Path, ids: Sequence[str], path: Path, processes: int, progress: Progress | None
+) -> tuple[Store, dict[str, Record], list[str]]:
+    """An open index that knows every id, and its records; in memory, with a note, where the file cannot serve."""
+    try:
+        return *_refreshed(path, root, ids, processes, progress), []
+    except (sqlite3.Error, OSError) as error:
+        note = (
+            f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
+            "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
+            "another place with V2V_CACHE_DIR"
+        )
+        return *_refreshed(None, root, ids, processes, progress), [note]
+
+
+def _refreshed(
+    path: Path | None, root: Path, ids: Sequence[str], processes: int, progress: Progress | None
+) -> tuple[Store, dict[str, Record]]:
+    store = Store(path)
+    try:
+        known = store.records()
+        stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
+        wanted = set(ids)
+        store.forget([id for id in known if id not in wanted and not (root / id).is_file()])
+        for batch in _batches(survey(root, stale, processes), len(stale), progress):
+            store.put(batch)
+            known.update((record.id, record) for record in batch)
+        return store, {id: known[id] for id in ids}
+    except BaseException:
+        store.close()
+        raise
+
+
+def _unchanged(root: Path, record: Record) -> bool:
+    try:
+        status = (root / record.id).stat()
+    except OSError:
+        return False
+    return (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns)
+
+
+def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:
+    batch: list[Record] = []
+    for done, record in enumerate(records, 1):
+        batch.append(record)
+        if progress is not None:
+            progress(done, total)
+        if len(batch) == _WRITE_EVERY:
+            yield batch
+            batch = []
+    yield batch
+
+
+def _snapshot(
+    root: Path,
+    rows: Rows,
+    records: dict[str, Record],
+    listed: Sequence[ListEntry],
+    refused: dict[str, str],
+    notes: list[str],
+    store: Store,
+) -> Catalogue:
+    by_id = {entry.id: entry for entry in listed}
+    problems = dict(refused)
+    videos = []
+    shorter = []
+    for id in sorted(records):
+        record, entry = records[id], by_id.get(id, ListEntry(id))
+        if record.problem is not None:
+            problems[id] = record.problem
+            continue
+        videos.append(_entry(record, entry))
+        if entry.frames is not None and entry.frames > record.frames:
+            shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
+    if not videos:
+        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{_told(problems)}")
+    if shorter:
+        notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
+    return Catalogue(
+        root=root,
+        rows=rows,
+        videos=tuple(videos),
+        problems=tuple(Problem(id, problems[id]) for id in sorted(problems)),
+        notes=tuple(notes),
+        digest=_digest(rows, videos),
+        _store=store,
+        _fingerprints={video.id: video.fingerprint for video in videos},
+    )
+
+
+def _entry(record: Record, entry: ListEntry) -> VideoEntry:
+    return VideoEntry(
+        id=record.id,
+        fingerprint=record.fingerprint,
+        frames=record.frames,
+        width_px=record.width_px,
+        height_px=record.height_px,
+        frames_per_second=float("nan") if record.frames_per_second is None else record.frames_per_second,
+        codec=record.codec,
+        threshold_pos=entry.threshold_pos,
+        threshold_neg=entry.threshold_neg,
+    )
+
+
+def _digest(rows: Rows, videos: Sequence[VideoEntry]) -> str:
+    digest = hashlib.sha256(f"v2v catalogue 1\n{rows}\n".encode())
+    for video in videos:
+        fields = (
+            video.id, video.fingerprint, video.frames, video.width_px, video.height_px, video.threshold_pos,
+            video.threshold_neg,
+        )  # fmt: skip
+        digest.update("\0".join(map(str, fields)).encode() + b"\n")
+    return digest.hexdigest()[:32]
+
+
+def _told(problems: dict[str, str]) -> str:
+    """The first few reasons, for an error message."""
+    if not problems:
+        return ""
+    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    return f" ({shown}{more})"

@@ -1,0 +1,105 @@
+"""Which grey is meant: the luma Y that the file stores, stretched to the full range 0 .. 255.
+
+No colour conversion takes place; where a picture has a luma plane, that plane is the picture.
+
+* limited ("tv", "mpeg") range, 8 bit:  grey = clip(round((Y - 16) 255 / 219), 0, 255), Y = 16 .. 235 (ITU-R BT.601);
+* limited range, b bit:                 grey = clip(round((Y - 16 s) 255 / (219 s)), 0, 255), s = 2**(b - 8);
+* full ("pc", "jpeg") range:            grey = Y at 8 bit, round(Y 255 / (2**b - 1)) at b bit.
+
+A file that does not state its range has full range if its pixel format is ``yuvj*`` or ``gray*``, else limited range.
+For 8-bit formats this equals swscale's conversion to ``gray`` level for level. It is not the grey of OpenCV, which goes
+through BGR and rounds and clips on the way: the two differ by 0 to 2 levels mostly.
+
+Formats without a luma plane (RGB, palettes, packed YUV) go through swscale's ``gray``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+from av.video.frame import VideoFrame
+from av.video.reformatter import ColorRange
+
+from v2v_server.video.orientation import Window
+
+_LUMA_PLANE = re.compile(r"(yuvj?\d{3}p|yuva\d{3}p|gray|nv(12|16|21|24)$)((9|10|12|14|16)(le|be))?$")
+
+
+@dataclass(frozen=True, slots=True)
+class LumaFormat:
+    """How the luma of a frame is stored.
+
+    Attributes:
+        pixel_format: FFmpeg's name.
+        color_range: as stated by the file, AVCOL_RANGE_*.
+        bits: significant bits of a sample; 8 where the frame must first go through ``gray``.
+        full_range: whether 0 and 2**bits - 1 are black and white.
+        has_plane: whether plane 0 is the luma; otherwise the frame goes through ``gray``.
+    """
+
+    pixel_format: str
+    color_range: int
+    bits: int
+    full_range: bool
+    has_plane: bool
+
+    @classmethod
+    def of(cls, frame: VideoFrame) -> LumaFormat:
+        """The luma format of a decoded frame."""
+        name = frame.format.name
+        if not _LUMA_PLANE.fullmatch(name) or frame.planes[0].line_size <= 0:  # negative: stored bottom-up
+            return cls(name, int(frame.color_range), 8, full_range=True, has_plane=False)
+        full_range = _is_full_range(name, frame.color_range)
+        return cls(name, int(frame.color_range), frame.format.components[0].bits, full_range, has_plane=True)
+
+    def describes(self, frame: VideoFrame) -> bool:
+        """Whether that frame, too, is stored like this."""
+        return frame.format.name == self.pixel_format and frame.color_range == self.color_range
+
+    @property
+    def sample(self) -> np.dtype[np.unsignedinteger]:
+        """dtype of one sample in the plane."""
+        if self.bits == 8:
+            return np.dtype(np.uint8)
+        return np.dtype(">u2" if self.pixel_format.endswith("be") else "<u2")
+
+
+def _is_full_range(pixel_format: str, color_range: int) -> bool:
+    """Whether samples span 0 .. 2**b - 1: as stated, or by the rule above where nothing is stated."""
+    if color_range == ColorRange.UNSPECIFIED:
+        return pixel_format.startswith(("yuvj", "gray"))
+    return color_range == ColorRange.JPEG
+
+
+@cache
+def range_table(bits: int, full_range: bool) -> npt.NDArray[np.uint8]:
+    """[2**bits] uint8: the full-range 8-bit grey of every luma value."""
+    values = np.arange(2**bits, dtype=np.int64)
+    scale = 2 ** (bits - 8)
+    black, span = (0, 2**bits - 1) if full_range else (16 * scale, 219 * scale)
+    # Rounding half up in whole numbers: floor((2 * 255 (Y - black) + span) / (2 span)).
+    table: npt.NDArray[np.uint8] = np.clip((510 * (values - black) + span) // (2 * span), 0, 255).astype(np.uint8)
+    table.flags.writeable = False
+    return table
+
+
+def copy_luma(frame: VideoFrame, luma: LumaFormat, window: Window, out: npt.NDArray[np.uint8]) -> None:
+    """Copy a window of a frame's luma to ``out`` [h, w] uint8, straight from the decoder's memory.
+
+    8-bit samples are copied as they are (the caller maps the whole stack once); deeper ones are mapped to grey.
+    """
+    top, left, height, width = window
+    if not luma.has_plane:
+        frame = frame.reformat(format="gray")
+    plane = frame.planes[0]
+    stride = plane.line_size // luma.sample.itemsize
+    samples = np.frombuffer(memoryview(plane), luma.sample, count=stride * frame.height).reshape(frame.height, stride)
+    view = samples[top : top + height, left : left + width]
+    if luma.bits == 8:
+        out[...] = view
+    else:
+        np.take(range_table(luma.bits, luma.full_range), view, out=out)

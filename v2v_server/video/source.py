@@ -1,0 +1,76 @@
+"""Opening a video file for sequential, single-threaded reading of its picture track."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+
+import av
+from av.container import InputContainer
+from av.packet import Packet
+from av.stream import Disposition
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
+
+from v2v_protocol.errors import VideoError
+
+_STILL = Disposition.attached_pic | Disposition.timed_thumbnails
+
+
+@contextmanager
+def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The container and its video track, closed at the end whatever happens.
+
+    The track is the first whose pictures are no cover art; its decoder runs in the calling thread only.
+
+    Raises:
+        VideoError: the file cannot be opened, or has no video track.
+    """
+    name = os.fspath(path)
+    try:
+        container = av.open(name, "r")
+    except (av.FFmpegError, OSError) as error:
+        raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
+    except UnicodeError as error:
+        raise VideoError(name, None, f"cannot be opened: its name is not valid text ({error})") from error
+    try:
+        tracks = [stream for stream in container.streams.video if not stream.disposition & _STILL]
+        if not tracks:
+            raise VideoError(name, None, "has no video track")
+        stream = tracks[0]
+        if stream.codec_context is None:
+            raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
+        stream.thread_type = "NONE"
+        stream.codec_context.thread_count = 1
+        yield container, stream
+    finally:
+        container.close()
+
+
+def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
+    """The track's packets in stored order. Empty ones (AVI's dropped frames) are left out: a decoder would take them
+    for the end of the stream."""
+    for packet in container.demux(stream):
+        if packet.size:
+            yield packet
+
+
+def pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """All frames from the current position, in the decoder's order of output."""
+    for packet in packets(container, stream):
+        yield from stream.decode(packet)
+    yield from stream.decode(None)
+
+
+def time_base(stream: VideoStream) -> tuple[int, int]:
+    """(numerator, denominator) of the track's clock; 1/1 where the container states none."""
+    base = stream.time_base or Fraction(1)
+    return (base.numerator, base.denominator) if base > 0 else (1, 1)
+
+
+def reason(error: BaseException) -> str:
+    """One line that says what FFmpeg or the system complained about."""
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(text).split())
