@@ -141,8 +141,9 @@ class Sessions:
         session.unanswered.remove((task.epoch, task.index))
         session.balance_seconds -= worker_seconds
         if not session.unanswered:
-            # Nothing waits: a debt or a gain from an idle past must not weigh on the future.
-            session.balance_seconds = 0.0
+            # Nothing is saved up while idle. A debt stays, or asking for one sample at a time would be free of charge;
+            # it is never more than the cost of what was in work at once.
+            session.balance_seconds = min(session.balance_seconds, 0.0)
         session.served += 1
         return True
 

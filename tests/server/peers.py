@@ -34,9 +34,9 @@ CREDIT = 2
 """Leases a fake worker holds at a time, as the real one does."""
 
 
-def sample_frames(epoch: int, index: int, worker: bytes = b"w") -> list[Buffer]:
-    """A whole SampleHeader message of one small array."""
-    header = SampleHeader(epoch, index, ("voxels",), ("int8",), (1, 3), {}, worker.decode(), 0.1)
+def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
+    """A whole SampleHeader message of one small array; its provenance says for which seed it was made."""
+    header = SampleHeader(epoch, index, ("voxels",), ("int8",), (1, 3), {"seed": seed}, "w", 0.1)
     return [*encode(header), memoryview(b"abc")]
 
 
@@ -115,7 +115,7 @@ class Peers:
     def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1) -> Lease:
         """Answers the oldest lease."""
         lease = self.leases[identity].popleft()
-        payload = sample_frames(lease.epoch, lease.indices[0], identity)
+        payload = sample_frames(lease.epoch, lease.indices[0], lease.seed)
         self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *payload)
         return lease
 

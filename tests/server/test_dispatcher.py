@@ -579,6 +579,22 @@ def test_a_reconnected_consumer_is_answered_once() -> None:
     assert at.dispatcher.counters.late_results == 2
 
 
+def test_a_sample_of_the_session_before_is_no_answer_to_the_next() -> None:
+    """The same consumer, epoch and index, but another seed: the old sample would be the wrong one."""
+    at = peers()
+    at.join()
+    at.hello(seed=1)
+    at.want(0, 1)
+    at.begin()
+    at.hello(seed=2)
+    at.want(0, 1)
+    at.finish()
+    assert at.samples() == []
+    at.work_off()
+    samples = [message for message in at.heard[b"c"] if isinstance(message, SampleHeader)]
+    assert [(sample.index, sample.provenance) for sample in samples] == [(0, {"seed": 2}), (1, {"seed": 2})]
+
+
 def test_specs_asked_for_once_do_not_stay_for_ever() -> None:
     at = peers()
     alive = []
@@ -784,6 +800,7 @@ class Interleaving(RuleBasedStateMachine):
         self.owed: dict[bytes, set[tuple[int, int]]] = {}
         self.credit: dict[bytes, int] = {}
         self.read: dict[bytes, int] = {}
+        self.seed: dict[bytes, int] = {}
         self.dead: list[tuple[bytes, Lease]] = []
 
     def _listen(self) -> None:
@@ -793,6 +810,8 @@ class Interleaving(RuleBasedStateMachine):
                 if isinstance(message, SampleHeader | Unavailable):
                     # The heart of the promise: nothing comes that is not waited for.
                     self.owed[identity].remove((message.epoch, message.index))
+                    if isinstance(message, SampleHeader):
+                        assert message.provenance == {"seed": self.seed[identity]}
             self.read[identity] = len(heard)
         while self.at.given_up:
             # Half of them could be killed, as local ones are; the others are out of reach, and say something later.
@@ -809,7 +828,8 @@ class Interleaving(RuleBasedStateMachine):
     @rule(identity=consumers, batch_size=st.integers(1, 4))
     def connect(self, identity: bytes, batch_size: int) -> None:
         """Connects, or connects again and asks again for what it still lacks, as far as its new credit goes."""
-        welcome = self.at.hello(identity, batch_size=batch_size)
+        self.seed[identity] = self.seed.get(identity, 0) + 1
+        welcome = self.at.hello(identity, batch_size=batch_size, seed=self.seed[identity])
         self.credit[identity] = welcome.credit
         self._listen()
         lacking = sorted(self.owed.get(identity, ()))[: welcome.credit]

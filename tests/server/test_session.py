@@ -157,13 +157,15 @@ def test_the_silent_are_idle() -> None:
 # --- sharing ----------------------------------------------------------------------------------------------------------
 
 
-def serve(costs: Mapping[bytes, float], samples: int, workers: int = 1) -> Counter[bytes]:
+def serve(
+    costs: Mapping[bytes, float], samples: int, workers: int = 1, credits: Mapping[bytes, int] | None = None
+) -> Counter[bytes]:
     """Serves consumers that always ask for as much as they may, ``workers`` samples being in work at a time.
 
     Returns:
         samples that each consumer got.
     """
-    sessions = opened(*(session(identity, credit=16) for identity in costs))
+    sessions = opened(*(session(identity, (credits or {}).get(identity, 16)) for identity in costs))
     asked = dict.fromkeys(costs, 0)
     in_work: list[Task] = []
     got: Counter[bytes] = Counter()
@@ -207,6 +209,15 @@ def test_nobody_starves_and_time_is_shared_evenly(costs: dict[bytes, float]) -> 
     assert max(spent.values()) - min(spent.values()) <= 2 * max(costs.values()) + 0.1
 
 
+def test_turns_alternate_before_any_cost_is_known() -> None:
+    """All workers are free and nothing is finished yet: the first to ask must not get them all."""
+    sessions = opened(*(session(identity) for identity in (b"a", b"b", b"c")))
+    for each in sessions:
+        sessions.want(each, 0, range(4))
+    taken = [take(sessions).session for _ in range(12)]
+    assert [Counter(taken[first : first + 3]) for first in (0, 3, 6, 9)] == [Counter((b"a", b"b", b"c"))] * 4
+
+
 def test_a_consumer_in_debt_that_waits_alone_is_served_at_once() -> None:
     a, b = session(b"a"), session(b"b")
     sessions = opened(a, b)
@@ -227,11 +238,19 @@ def test_the_largest_debt_that_is_accepted_does_not_stall() -> None:
     assert take(sessions).index == 3
 
 
-def test_debts_end_when_nothing_is_waited_for() -> None:
+@pytest.mark.parametrize("credit", [1, 2])
+def test_asking_for_one_sample_at_a_time_is_not_free_of_charge(credit: int) -> None:
+    """Whose queue runs empty with every answer still pays for it, and starves nobody."""
+    got = serve({b"cheap": 0.1, b"dear": 1.0}, 2200, credits={b"dear": credit})
+    assert got[b"cheap"] / got[b"dear"] == pytest.approx(10.0, rel=0.1)
+
+
+def test_nothing_is_saved_up_while_idle() -> None:
     a, b = session(b"a"), session(b"b")
     sessions = opened(a, b)
+    a.balance_seconds = 1000.0
     sessions.want(a, 0, [0])
-    assert sessions.answered(take(sessions), 1000.0)
+    assert sessions.answered(take(sessions), 0.1)
     assert a.balance_seconds == 0.0
 
 
