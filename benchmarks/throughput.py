@@ -135,8 +135,8 @@ def _decode_jobs(setting: Setting, number: int, count: Any, stop: Event) -> None
                 return
             epoch, index = divmod(turn, schedule.count)
             lease = describe(
-                Task(b"", epoch, index), number=1, catalogue=catalogue, schedule=schedule, spec=spec, seed=0,
-                arrays=("voxels",), deadline_seconds=60.0,
+                Task(b"", epoch, index), number=1, sequence=schedule.candidate(0, epoch, index, 0), quarantine=0,
+                catalogue=catalogue, spec=spec, seed=0, arrays=("voxels",), deadline_seconds=60.0,
             )  # fmt: skip
             decode_for(lease, index, catalogue.root)
             count.value += 1

@@ -59,8 +59,9 @@ def main() -> None:
 def _rows(batch: Batch) -> list[Row]:
     """For the picture: of each sample the voxel grid with most events that still shows the scene."""
     rows = []
+    arrays = {name: tensor.numpy() for name, tensor in batch.arrays.items()}
     for number in range(len(batch)):
-        voxels, frames = batch.voxels[number].numpy(), batch.frames[number].numpy()
+        voxels, frames = arrays["voxels"][number], arrays["frames"][number]
         pick = int(abs(voxels.astype("int32")).sum(axis=(1, 2, 3)).argmax())
         rows.append(Row(frames[pick, 0], voxels[pick], batch.provenance[number], f"voxel {pick}"))
     return rows

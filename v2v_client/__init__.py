@@ -6,6 +6,7 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
     batch.voxels  # int8 [B, T, bins, H, W]
 """
 
+from v2v_client.allocator import keep_freed_memory
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_protocol.errors import (
@@ -32,4 +33,5 @@ __all__ = [
     "V2VError",
     "V2VStreamDataset",
     "VersionMismatch",
+    "keep_freed_memory",
 ]

@@ -1,11 +1,13 @@
-"""The consumer's end of the wire: one DEALER socket, and what to do when nothing comes.
+"""The consumer's end of the wire: a session with a server, and what to do when nothing comes.
 
 Rules
     Hello is answered by Welcome. It is sent again, ever more rarely, until it is: either may have been lost.
     A server that does not know us (it was restarted, or forgot us while we were silent) refuses what we send; then we
     say Hello with the resolved spec, and it must offer the same stream as before.
-    After every Welcome, and whenever nothing was answered for ``rewant_seconds`` although pongs come,
-    everything unanswered is asked for again. That can make a sample twice; the reorder window drops the second.
+    After every Welcome, whenever the network was cut and came back, and whenever nothing was answered for
+    ``rewant_seconds`` although pongs come, everything unanswered is asked for again. That can make a sample twice; the
+    reorder window drops the second.
+    Nothing at all heard for ``rewant_seconds``: the connection itself is suspect, and another one is made.
     Nothing heard for ``timeout_seconds`` of listening: ServerLost.
 
 Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
@@ -21,15 +23,17 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy.typing as npt
 import zmq
 
+from v2v_client.link import Link
 from v2v_client.liveness import Due, Liveness, Patience
 from v2v_client.state import Stream
-from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost, UsageError
+from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.messages import (
     ErrorCode,
     Goodbye,
@@ -107,20 +111,22 @@ class Connection:
     ) -> None:
         self._address = address
         self._hello = hello
+        self._quarantine = hello.quarantine  # a server that was restarted is asked to go on under what we have seen
         self._epoch = epoch
         self._pinned = pinned
         self._pinned_by = pinned_by
         self._patience = patience or Patience()
         self._clock = clock
         self._process = os.getpid()
-        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
-        self._socket: zmq.Socket[bytes] | None = None
+        self._link: Link | None = None
+        self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._liveness = Liveness(self._patience, clock())
         self._asked: dict[int, None] = {}  # sent and not answered, in that order
         self._queued: deque[int] = deque()  # to be sent when the credit allows
         self._welcome_due: float | None = None  # when to say Hello again; None once welcomed
         self._hello_wait = 0.0
         self._asked_again = False
+        self._owed = False  # a request was refused for credit since everything was asked again
         self._credit_refusals = 0
         self._last: int | None = None  # last sample received
         self.credit = 0
@@ -140,17 +146,18 @@ class Connection:
             StateMismatch: it offers another stream than the pinned one.
             UsageError: the address, or the arrays, are not understood.
         """
-        self._context = zmq.Context()
+        self._link = Link(self._address)
         try:
             if self._pinned is None:
-                self._connect(LARGEST_HEADER_BYTES)
+                self._link.connect(LARGEST_HEADER_BYTES)
                 self._await_welcome()
                 self._pinned = self.stream
-                self._disconnect()
+                self._leave(self._link)
             self._hello = replace(self._hello, spec=self._pinned.spec)
             self.layout = self._layout(self._pinned)
             largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
-            self._connect(max(LARGEST_HEADER_BYTES, largest))
+            self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, largest)
+            self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
         except BaseException:
             self.close()
@@ -160,23 +167,6 @@ class Connection:
         spec = stream.resolved
         return array_layout(spec.recipe, spec.voxel_dtype, self._hello.arrays)
 
-    def _connect(self, largest_frame_bytes: int) -> None:
-        if self._context is None:
-            raise ServerLost(f"{self._address}: this connection is closed")
-        socket = self._context.socket(zmq.DEALER)
-        self._socket = socket
-        socket.setsockopt(zmq.ROUTING_ID, b"\x01" + os.urandom(15))  # a first byte of 0 is ZeroMQ's own
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.RCVHWM, 0)
-        socket.setsockopt(zmq.SNDHWM, 0)
-        socket.setsockopt(zmq.IPV6, 1)
-        socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
-        try:
-            socket.connect(self._address)
-        except zmq.ZMQError as error:
-            raise UsageError(f"address {self._address!r}: {error}; give tcp://host:port") from error
-
     def _await_welcome(self) -> None:
         self._begin_hello()
         while self._welcome_due is not None:
@@ -185,32 +175,29 @@ class Connection:
     def _begin_hello(self) -> None:
         self._hello_wait = self._patience.ping_seconds
         self._welcome_due = self._clock() + self._hello_wait
-        self._send(self._hello)
+        self._say_hello()
 
-    def _disconnect(self) -> None:
-        """Leaves the server, telling it where that does not take long."""
-        socket, self._socket = self._socket, None
-        if socket is None:
-            return
-        try:
-            socket.send_multipart(encode(Goodbye()), flags=zmq.NOBLOCK)
-            linger = _GOODBYE_LINGER_MS
-        except zmq.ZMQError:  # nobody to tell
-            linger = 0
+    def _say_hello(self) -> None:
+        self._send(replace(self._hello, quarantine=self._quarantine))
+
+    def _leave(self, link: Link) -> None:
+        """Tells the server, where that does not take long."""
         quiet = self._liveness.silence(self._clock()) >= self._patience.ping_seconds
-        socket.close(linger=0 if quiet else linger)
+        with suppress(ServerLost):  # nobody to tell
+            link.send(encode(Goodbye()))
+        link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
 
     def close(self) -> None:
         """Leaves the server and frees socket, context and thread. May be called again, and in a forked child, where
         it does nothing."""
         if os.getpid() != self._process:
             return
-        context, self._context = self._context, None
-        try:
-            self._disconnect()
-        finally:
-            if context is not None:
-                context.term()
+        link, self._link = self._link, None
+        if link is not None:
+            try:
+                self._leave(link)
+            finally:
+                link.close()
 
     # --- asking and receiving -----------------------------------------------------------------------------------------
 
@@ -234,6 +221,7 @@ class Connection:
         self._asked_again = self._asked_again or bool(self._asked)
         self._queued.extendleft(reversed(self._asked))
         self._asked.clear()
+        self._owed = False
         self.want(())
 
     def receive(self, *, wait: bool = True) -> Arrival | None:
@@ -265,8 +253,11 @@ class Connection:
         seconds = self._liveness.next_due(now) if wait else 0.0
         if self._welcome_due is not None and wait:
             seconds = min(seconds, max(0.0, self._welcome_due - now))
-        frames = self._receive(seconds)
+        link = self._open_link()
+        frames = link.receive(seconds)
         if frames is None:
+            if link.remade():
+                self._resume()
             return None, True
         message = decode(frames[0].buffer)
         answer = not isinstance(message, Pong)
@@ -279,22 +270,32 @@ class Connection:
         return None, False
 
     def _attend(self, now: float) -> None:
-        """Pings, asks again or gives up, as the silence demands."""
+        """Pings, asks again, connects anew or gives up, as the silence demands."""
         due = self._liveness.due(now)
         if due is Due.GIVE_UP:
             raise self._lost(now)
-        if self._welcome_due is not None:
+        if due is Due.CONNECT_ANEW:
+            self._open_link().connect(self._largest_frame_bytes, keep_name=True)
+            self._begin_hello()
+        elif self._welcome_due is not None:
             if now >= self._welcome_due:
                 self._hello_wait *= 2
                 self._welcome_due = now + self._hello_wait
-                self._send(self._hello)
+                self._say_hello()
+        elif due is Due.WANT_AGAIN or (due is Due.PING and self._owed):
+            self._want_again()
+            self._send(Ping())
         elif due is Due.PING:
             # A server answers anybody's Ping; that it forgot us shows only when something is asked, be it nothing.
             self._send(Want(self._epoch, ()))
             self._send(Ping())
-        elif due is Due.WANT_AGAIN:
+
+    def _resume(self) -> None:
+        """The network was cut and is back: what was under way in either direction may be lost."""
+        if self._welcome_due is not None:
+            self._begin_hello()
+        else:
             self._want_again()
-            self._send(Ping())
 
     def _handle(self, message: Message) -> None:
         match message:
@@ -310,6 +311,7 @@ class Connection:
                 # It still makes what it had sent before we asked again. What it refused stays asked for, in our
                 # account, and goes out again with the rest at the next quiet moment.
                 self._credit_refusals += 1
+                self._owed = True
             case Refused():
                 raise RemoteError(message.code, f"{self._address} refused: {message.text}")
             case Unavailable():
@@ -332,6 +334,7 @@ class Connection:
         if self._pinned is not None:
             self._pinned.require_same(stream, ours=self._pinned_by, theirs=self._address)
         self.stream, self.credit = stream, welcome.credit
+        self._quarantine = welcome.quarantine
         self._welcome_due = None
         self._want_again()
 
@@ -356,33 +359,22 @@ class Connection:
         )
         if provenance.id != identity:
             raise ProtocolError(f"{self._address} sent {provenance.id} in answer to {identity}")
+        self._quarantine = max(self._quarantine or 0, provenance.quarantine)
         self._asked.pop(header.index, None)
         self._credit_refusals = 0
         self._last = header.index
         self.want(())
         return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds)
 
-    # --- the socket ---------------------------------------------------------------------------------------------------
+    # --- the link -----------------------------------------------------------------------------------------------------
+
+    def _open_link(self) -> Link:
+        if self._link is None:
+            raise ServerLost(f"{self._address}: this connection is closed")
+        return self._link
 
     def _send(self, message: Message) -> None:
-        if self._socket is None:
-            raise ServerLost(f"{self._address}: this connection is closed")
-        try:
-            self._socket.send_multipart(encode(message), flags=zmq.NOBLOCK)
-        except zmq.ZMQError as error:
-            raise ServerLost(f"{self._address}: cannot send: {error}") from error
-
-    def _receive(self, seconds: float) -> list[zmq.Frame] | None:
-        if self._socket is None:
-            raise ServerLost(f"{self._address}: this connection is closed")
-        try:
-            if not self._socket.poll(math.ceil(seconds * 1000), zmq.POLLIN):
-                return None
-            return self._socket.recv_multipart(flags=zmq.NOBLOCK, copy=False)
-        except zmq.Again:  # readiness is a hint
-            return None
-        except zmq.ZMQError as error:
-            raise ServerLost(f"{self._address}: cannot receive: {error}") from error
+        self._open_link().send(encode(message))
 
     def _lost(self, now: float) -> ServerLost:
         last = (

@@ -67,6 +67,17 @@ class V2VStreamDataset(IterableDataset[Batch]):
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
 
+    A sample is made once for the position it is asked for; what a crash or a cut swallows is asked for again. So each
+    sample comes once relative to the state that was saved, whichever process died in between.
+
+    Memory of an iterating process (each loader worker is one), however slow its trainer, with S bytes in a sample, k
+    batches that the trainer itself still holds, and a credit of C samples (the server grants twice ``batch_size``, or
+    twice its number of workers if that is more, or less where ``--max-credit-bytes`` says so):
+
+        received, waiting in ZeroMQ    C S           (2 C S while everything is asked for again)
+        batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
+        at the server, not yet sent    C S
+
     Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses),
     SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream than the one begun),
     ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a loader worker,
@@ -300,7 +311,13 @@ class V2VStreamDataset(IterableDataset[Batch]):
         pinned = self.stream
         connection = Connection(
             self._address,
-            Hello(self._resolved(pinned, "this dataset's stream"), self._arrays, self._batch_size, self._seed),
+            Hello(
+                self._resolved(pinned, "this dataset's stream"),
+                self._arrays,
+                self._batch_size,
+                self._seed,
+                quarantine=None if state is None else state.quarantine,
+            ),
             epoch,
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
@@ -320,16 +337,17 @@ class V2VStreamDataset(IterableDataset[Batch]):
             workers = loader or _Loader(0, 1, "", 0)
             batches = plan.batches_of_worker(workers.worker, workers.workers)[done:]
 
-            def after(batch: int) -> dict[str, Any]:
-                return self._after(stream, epoch, plan, batch).to_dict()
+            def after(batch: int, quarantine: int) -> dict[str, Any]:
+                return self._after(stream, epoch, plan, batch, quarantine).to_dict()
 
             for batch, number in zip(deliver(connection, plan, batches, epoch, after), batches, strict=True):
                 done += 1
                 if mine == self._iterations:  # an older iterator that is still read says nothing about where we are
+                    seen = batch.resume_state["quarantine"]
                     self._here = (
-                        self._after(stream, epoch, plan, number)
+                        self._after(stream, epoch, plan, number, seen)
                         if loader is None
-                        else self._worker_state(stream, epoch, state, loader, done)
+                        else self._worker_state(stream, epoch, state, loader, done, seen)
                     )
                 yield batch
         finally:
@@ -349,18 +367,25 @@ class V2VStreamDataset(IterableDataset[Batch]):
         origin, position = (0, 0) if state is None else (state.origin, state.position)
         return EpochPlan(stream.sequences, self.world_size, self.rank, self._batch_size, origin, position)
 
-    def _after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int) -> ResumeState:
+    def _after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
         """The rank's state after a batch; after the last one, that is the beginning of the next epoch."""
         if batch + 1 == plan.batches:
             return ResumeState(stream, self._seed, epoch + 1, 0, 0, plan.world_size)
-        return ResumeState(stream, self._seed, epoch, plan.origin, plan.position_after(batch), plan.world_size)
+        position = plan.position_after(batch)
+        return ResumeState(stream, self._seed, epoch, plan.origin, position, plan.world_size, quarantine=quarantine)
 
     def _worker_state(
-        self, stream: Stream | None, epoch: int, state: ResumeState | None, loader: _Loader, done: int
+        self,
+        stream: Stream | None,
+        epoch: int,
+        state: ResumeState | None,
+        loader: _Loader,
+        done: int,
+        quarantine: int | None = None,
     ) -> ResumeState:
         origin, position = (0, 0) if state is None else (state.origin, state.position)
         share = LoaderShare(loader.worker, loader.workers, self._batch_size, done)
-        return ResumeState(stream, self._seed, epoch, origin, position, self.world_size, share)
+        return ResumeState(stream, self._seed, epoch, origin, position, self.world_size, share, quarantine)
 
     def _resolved(self, pinned: Stream | None, side: str) -> dict[str, Any]:
         """What to ask the server for: the pinned stream's spec, which must be what the options say."""

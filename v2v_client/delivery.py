@@ -38,7 +38,7 @@ def deliver(
     plan: EpochPlan,
     batches: Sequence[int],
     epoch: int,
-    resume_state: Callable[[int], Mapping[str, Any]],
+    resume_state: Callable[[int, int], Mapping[str, Any]],
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Batch]:
     """The batches of an open connection, in order.
@@ -47,7 +47,7 @@ def deliver(
         plan: which samples make up a batch.
         batches: numbers of the batches to deliver.
         epoch: of the samples.
-        resume_state: the state after a batch, by its number.
+        resume_state: the state after a batch, by its number and the newest quarantine snapshot seen up to it.
         clock: seconds, for ``Batch.wait_seconds``.
 
     Raises:
@@ -60,6 +60,7 @@ def deliver(
         for name, (dtype, shape) in connection.layout.items()
     }
     drafts: dict[int, _Draft] = {}
+    quarantine = 0
 
     def accept(sample: Arrival) -> None:
         slot = window.receive(sample.index)
@@ -82,7 +83,9 @@ def deliver(
                 connection.want(window.ask())
         connection.want(window.ask())
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
-        yield _finished(drafts.pop(number), plan.indices(number), epoch, resume_state(number), clock() - began)
+        draft = drafts.pop(number)
+        quarantine = max([quarantine, *(item.quarantine for item in draft.provenance if item is not None)])
+        yield _finished(draft, plan.indices(number), epoch, resume_state(number, quarantine), clock() - began)
 
 
 def _finished(

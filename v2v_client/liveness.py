@@ -16,6 +16,7 @@ class Due(Enum):
 
     PING = "ping"
     WANT_AGAIN = "want again"
+    CONNECT_ANEW = "connect anew"
     GIVE_UP = "give up"
 
 
@@ -25,7 +26,9 @@ class Patience:
     Attributes:
         ping_seconds: silence after which the server is asked whether it lives, and again as often.
         rewant_seconds: time without an answer to any request after which all of them are sent again, although the
-            server lives: a cut of the network can swallow messages in either direction.
+            server lives: a cut of the network can swallow messages in either direction. If nothing at all was heard
+            in that time, another connection is made. The wait doubles each time, up to ``timeout_seconds``, so that a
+            network which is only slow is not flooded, nor left before it could answer.
         timeout_seconds: silence after which the server is given up.
 
     Raises:
@@ -47,6 +50,7 @@ class Liveness:
 
     def __init__(self, patience: Patience, now: float) -> None:
         self._patience = patience
+        self._rewant_seconds = min(patience.rewant_seconds, patience.timeout_seconds)
         self._heard = now
         self._answered = now
         self._pinged = now
@@ -77,9 +81,11 @@ class Liveness:
         """What to do now; asking for it counts as doing it."""
         if now - self._heard >= self._patience.timeout_seconds:
             return Due.GIVE_UP
-        if now - self._answered >= self._patience.rewant_seconds:
+        if now - self._answered >= self._rewant_seconds:
+            silent = now - self._heard >= self._rewant_seconds
             self._answered = self._pinged = now
-            return Due.WANT_AGAIN
+            self._rewant_seconds = min(2 * self._rewant_seconds, self._patience.timeout_seconds)
+            return Due.CONNECT_ANEW if silent else Due.WANT_AGAIN
         if now - self._pinged >= self._patience.ping_seconds:
             self._pinged = now
             return Due.PING
@@ -91,7 +97,7 @@ class Liveness:
             0.0,
             min(
                 self._heard + self._patience.timeout_seconds,
-                self._answered + self._patience.rewant_seconds,
+                self._answered + self._rewant_seconds,
                 self._pinged + self._patience.ping_seconds,
             )
             - now,

@@ -4,7 +4,8 @@
 original nothing. But an epoch must begin when the last loader worker has finished the one before, a late worker must
 begin the epoch that its siblings began, and the original must know that its own state is stale. So all copies share a
 log: a small temporary file (not shared memory: that may be missing or tiny in a container) to which each appends
-whole lines, which the kernel keeps apart, and from which each computes the same answers:
+whole lines, which the kernel keeps apart, and from which each computes the same answers. It has no name, so that it is
+gone with the last process that has it open, however that one ends:
 
     set     an epoch to be in, and the state to start it from: from the user, or a state that was loaded
     main    the original itself iterates
@@ -17,6 +18,7 @@ The order of the lines is the order of the events; no lock, no clock.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import tempfile
@@ -25,9 +27,12 @@ import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.context import get_spawning_popen
+from multiprocessing.reduction import DupFd
 from typing import Any
 
 from v2v_client.state import ResumeState, Stream
+
+_READ_BYTES = 1 << 16
 
 
 @dataclass(slots=True)
@@ -92,18 +97,23 @@ class Progress:
         self.set(epoch, None)
 
     def _create(self) -> None:
-        descriptor, self._path = tempfile.mkstemp(prefix="v2v-progress-")
-        os.close(descriptor)
-        weakref.finalize(self, _remove, self._path, os.getpid())
+        descriptor, path = tempfile.mkstemp(prefix="v2v-progress-")
+        os.unlink(path)
+        fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | os.O_APPEND)
+        self._adopt(descriptor)
+
+    def _adopt(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        weakref.finalize(self, os.close, descriptor)
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:
-            return {"path": self._path}
+            return {"descriptor": DupFd(self._descriptor)}
         return {"lines": list(self._lines())}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        if "path" in state:
-            self._path = state["path"]
+        if "descriptor" in state:
+            self._adopt(state["descriptor"].detach())
             return
         self._create()
         for line in state["lines"]:
@@ -147,19 +157,12 @@ class Progress:
         self._append(kind="stream", stream=plain | {"spec": dict(stream.spec)})
 
     def _append(self, **line: Any) -> None:
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
-        try:
-            os.write(descriptor, json.dumps(line).encode() + b"\n")
-        finally:
-            os.close(descriptor)
+        os.write(self._descriptor, json.dumps(line).encode() + b"\n")
 
     def _lines(self) -> Iterator[dict[str, Any]]:
-        with open(self._path, encoding="utf-8") as file:
-            for line in file:
-                yield json.loads(line)
-
-
-def _remove(path: str, owner: int) -> None:
-    # A forked loader worker inherits the finalizer with everything else.
-    if os.getpid() == owner:
-        os.unlink(path)
+        # The offset of the descriptor is everybody's, so it is not used.
+        content = b""
+        while piece := os.pread(self._descriptor, _READ_BYTES, len(content)):
+            content += piece
+        for line in content.split(b"\n")[:-1]:  # what has no end yet is still being written
+            yield json.loads(line)

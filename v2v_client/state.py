@@ -127,6 +127,7 @@ class ResumeState:
         seed, epoch: of the samples to come.
         origin, position, world_size: see :mod:`v2v_client.world`.
         share: None for the state of a rank, which any number of loader workers can take up.
+        quarantine: number of the quarantine snapshot to go on under; None for the server's newest.
     """
 
     stream: Stream | None
@@ -136,6 +137,7 @@ class ResumeState:
     position: int
     world_size: int
     share: LoaderShare | None = None
+    quarantine: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -148,6 +150,7 @@ class ResumeState:
             "origin": self.origin,
             "position": self.position,
             "world_size": self.world_size,
+            "quarantine": self.quarantine,
             "loader_worker": None if self.share is None else dataclasses.asdict(self.share),
         }
 
@@ -160,11 +163,11 @@ class ResumeState:
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
             version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
             raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
-        known = {"version", "seed", "epoch", "origin", "position", "world_size", "loader_worker"}
+        known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(Stream)}
         if values.keys() != known:
             raise UsageError(f"not a state of V2VStreamDataset: keys {sorted(values)}, expected {sorted(known)}")
-        share = values["loader_worker"]
+        share, quarantine = values["loader_worker"], values["quarantine"]
         return cls(
             stream=_stream(values),
             seed=_whole(values, "seed", 0, LARGEST_SEED),
@@ -173,6 +176,7 @@ class ResumeState:
             position=_whole(values, "position", 0, LARGEST_INDEX),
             world_size=_whole(values, "world_size", 1, LARGEST_INDEX),
             share=None if share is None else _share(share),
+            quarantine=None if quarantine is None else _whole(values, "quarantine", 0, LARGEST_INDEX),
         )
 
 

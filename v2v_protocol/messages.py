@@ -27,6 +27,7 @@ class ErrorCode(StrEnum):
     UNKNOWN_SESSION = "unknown-session"
     CREDIT = "credit"
     RANGE = "range"
+    BUSY = "busy"
 
 
 # --- consumer -> server -----------------------------------------------------------------------------------------------
@@ -41,12 +42,14 @@ class Hello:
         arrays: names of the arrays wanted.
         batch_size: samples of a batch; it only sizes the suggested credit.
         seed: seed of the stream.
+        quarantine: number of the quarantine snapshot to go on under; None: the newest.
     """
 
     spec: Mapping[str, Any]
     arrays: tuple[str, ...]
     batch_size: int
     seed: int
+    quarantine: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,7 @@ class Welcome:
         spec_digest, catalogue_digest, numerics_version: the server's half of every sample's identity.
         sequences: N, samples of one epoch before ranks drop a remainder.
         credit: samples the consumer may have asked for and not yet received, at most.
+        quarantine: number of the quarantine snapshot its samples are made under, until a new verdict falls.
     """
 
     spec: Mapping[str, Any]
@@ -90,6 +94,7 @@ class Welcome:
     numerics_version: int
     sequences: int
     credit: int
+    quarantine: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +206,7 @@ class Lease:
         candidate: which candidate of the index this is.
         refusals: candidates passed over before, as ``Refusal`` fields: {"refusals": [...]}.
         deadline_seconds: a worker silent for longer than this is taken for hung.
+        quarantine: number of the quarantine snapshot that let the candidate pass.
     """
 
     lease: int
@@ -224,6 +230,7 @@ class Lease:
     candidate: int
     refusals: Mapping[str, Any]
     deadline_seconds: float
+    quarantine: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,6 +127,7 @@ class Provenance:
         irregular_timestamps: steps whose time stamps were missing or not increasing (noise per second used the
             average rate there).
         decoder: codec name, and whether its decoding is bit-exact on every host.
+        quarantine: number of the quarantine snapshot it was made under.
     """
 
     id: SampleId
@@ -139,6 +140,7 @@ class Provenance:
     saturated_bins: int
     irregular_timestamps: int
     decoder: str
+    quarantine: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in the sample's header."""

@@ -2,14 +2,15 @@
 
 Samples pass through as the very frames that arrived; only the small header before them is read. One thread, one loop.
 
-Memory: a session's unanswered samples are bounded by its credit, and a worker has at most two samples on the way, so
-the queues need no high-water mark of their own: broker bytes <= sum over sessions of credit x sample bytes (in
-ZeroMQ's out-queue of a consumer that does not read) + workers x 2 x sample bytes.
+Memory: a consumer asks for more only as it takes what it was sent, so broker bytes <= sum over sessions of credit x
+sample bytes (in ZeroMQ's out-queue of a consumer that is slow) + workers x 2 x sample bytes. A peer that asks and never
+reads is cut off at MOST_QUEUED messages.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,8 +18,12 @@ import zmq
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_HEADER_BYTES
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, ToConsumer, ToWorker
+from v2v_server.blame import Loss
+from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.quarantine import Verdict
 
+MOST_QUEUED = 512
+"""Messages that wait for one peer before it is taken for deaf; above any credit (``reception.MOST_CREDIT``)."""
 _BATCH = 64
 _TICK_SECONDS = 0.1
 
@@ -42,16 +47,16 @@ class Broker:
         except BaseException:
             self._context.destroy(linger=0)
             raise
-        self.address = self._consumers.last_endpoint.decode()
-        self.worker_address = self._workers.last_endpoint.decode()
+        self.address = self._consumers.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.worker_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def _router(self, address: str, flag: str, largest_bytes: int) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
         # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
         router.setsockopt(zmq.IPV6, int("[" in address))
-        router.setsockopt(zmq.SNDHWM, 0)
-        router.setsockopt(zmq.RCVHWM, 0)
+        router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
+        router.setsockopt(zmq.RCVHWM, MOST_QUEUED)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
@@ -66,7 +71,9 @@ class Broker:
         self,
         dispatcher: Dispatcher,
         *,
-        give_up: Callable[[bytes], None],
+        give_up: Callable[[GiveUp], Loss],
+        record: Callable[[Record], list[Verdict]],
+        watched: Callable[[bytes], bool],
         every_tick: Callable[[float], list[Instruction]],
         stopping: Callable[[], bool],
     ) -> None:
@@ -74,7 +81,9 @@ class Broker:
 
         Args:
             dispatcher: decides.
-            give_up: ends the process of a worker that hangs.
+            give_up: ends the process of a worker that hangs, and says what its loss means.
+            record: writes a verdict down; returns what the quarantine has more now.
+            watched: whether somebody else reports how that worker's process ends, once it has.
             every_tick: called about ten times a second with the time; may return instructions.
             stopping: asked at every turn.
         """
@@ -82,23 +91,42 @@ class Broker:
         poller.register(self._consumers, zmq.POLLIN)
         poller.register(self._workers, zmq.POLLIN)
         next_tick = time.monotonic()
+
+        def carry_out(instructions: list[Instruction]) -> None:
+            todo = deque(instructions)
+            while todo:
+                match todo.popleft():
+                    case ToConsumer(identity, frames):
+                        if not _send(self._consumers, identity, frames):
+                            dispatcher.consumer_lost(identity)
+                    case ToWorker(identity, frames):
+                        if not _send(self._workers, identity, frames) and not watched(identity):
+                            todo.extend(dispatcher.worker_unreachable(identity, time.monotonic()))
+                    case GiveUp() as hopeless:
+                        loss = give_up(hopeless)
+                        todo.extend(dispatcher.worker_lost(hopeless.identity, loss, time.monotonic()))
+                    case Record() as verdict:
+                        todo.extendleft(reversed(dispatcher.recorded(verdict, record(verdict), time.monotonic())))
+
         while not stopping():
-            ready = dict(poller.poll(_TICK_SECONDS * 1000))
+            ready = dict(poller.poll(int(_TICK_SECONDS * 1000)))
             now = time.monotonic()
             if self._workers in ready:
                 for identity, frames in self._drain(self._workers):
-                    self._carry_out(dispatcher, dispatcher.from_worker(identity, frames, now), give_up)
+                    carry_out(dispatcher.from_worker(identity, frames, now))
             if self._consumers in ready:
                 for identity, frames in self._drain(self._consumers):
-                    self._carry_out(dispatcher, dispatcher.from_consumer(identity, frames, now), give_up)
+                    carry_out(dispatcher.from_consumer(identity, frames, now))
             if now >= next_tick:
                 next_tick = now + _TICK_SECONDS
-                self._carry_out(dispatcher, dispatcher.tick(now), give_up)
-                self._carry_out(dispatcher, every_tick(now), give_up)
+                carry_out(dispatcher.tick(now))
+                carry_out(every_tick(now))
 
-    def carry_out(self, dispatcher: Dispatcher, instructions: list[Instruction]) -> None:
-        """Sends what a stopping server still has to say."""
-        self._carry_out(dispatcher, instructions, lambda identity: None)
+    def say_farewell(self, instructions: list[Instruction]) -> None:
+        """Sends workers what a stopping server still has to say."""
+        for instruction in instructions:
+            if isinstance(instruction, ToWorker):
+                _send(self._workers, instruction.identity, instruction.frames)
 
     def close(self) -> None:
         """Closes both sockets; what was not sent is dropped."""
@@ -118,26 +146,13 @@ class Broker:
             messages.append((identity.bytes, [*(frame.bytes for frame in frames[:1]), *frames[1:]]))
         return messages
 
-    def _carry_out(
-        self, dispatcher: Dispatcher, instructions: list[Instruction], give_up: Callable[[bytes], None]
-    ) -> None:
-        for instruction in instructions:
-            match instruction:
-                case ToConsumer(identity, frames):
-                    if not _send(self._consumers, identity, frames):
-                        dispatcher.consumer_lost(identity)
-                case ToWorker(identity, frames):
-                    if not _send(self._workers, identity, frames):
-                        now = time.monotonic()
-                        self._carry_out(dispatcher, dispatcher.worker_lost(identity, None, now), give_up)
-                case GiveUp(identity, _):
-                    give_up(identity)
-
 
 def _send(router: zmq.Socket[bytes], identity: bytes, frames: Sequence[Any]) -> bool:
-    """False when the peer is not connected any more."""
+    """False when the peer is not connected any more, or does not read what it is sent."""
     try:
-        router.send_multipart([identity, *frames], copy=False)
+        router.send_multipart([identity, *frames], zmq.NOBLOCK, copy=False)
+    except zmq.Again:
+        return False
     except zmq.ZMQError as error:
         if error.errno == zmq.EHOSTUNREACH:
             return False

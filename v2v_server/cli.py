@@ -20,7 +20,7 @@ from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
 
 def serve(argv: Sequence[str] | None = None) -> None:
     """`v2v-serve`."""
-    parser = _parser("v2v-serve", "Decode videos, simulate event voxels, stream samples to trainers.")
+    parser = new_parser("v2v-serve", "Decode videos, simulate event voxels, stream samples to trainers.")
     parser.add_argument(
         "--videos", metavar="DIR", help="folder of videos (searched recursively), a video, or a list file"
     )
@@ -60,28 +60,31 @@ def serve(argv: Sequence[str] | None = None) -> None:
         flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
         run_server(ServeConfig.load(arguments.config, flags))
 
-    _main(parser, run, argv)
+    run_command(parser, run, argv)
 
 
 def worker(argv: Sequence[str] | None = None) -> None:
     """`v2v-worker`."""
-    parser = _parser("v2v-worker", "Work for a server: take leases, make samples.")
+    parser = new_parser("v2v-worker", "Work for a server: take leases, make samples.")
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
     parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus folder on this host")
     parser.add_argument("--name", help="unique name (default: host and process id)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
 
     def run(arguments: argparse.Namespace) -> None:
         from v2v_server.worker import run_worker
 
-        run_worker(arguments.connect, Path(arguments.videos), arguments.name, arguments.parent_pid)
+        run_worker(
+            arguments.connect, Path(arguments.videos), arguments.name, arguments.parent_pid, arguments.logbook_fd
+        )
 
-    _main(parser, run, argv)
+    run_command(parser, run, argv)
 
 
 def simulate(argv: Sequence[str] | None = None) -> None:
     """`v2v-simulate`."""
-    parser = _parser("v2v-simulate", "Make one sample in this process: the same bytes a server would stream.")
+    parser = new_parser("v2v-simulate", "Make one sample in this process: the same bytes a server would stream.")
     parser.add_argument("video", metavar="VIDEO", help="a video; or a folder or list file, to remake a streamed sample")
     parser.add_argument(
         "--out", required=True, metavar="FILE.npz", help="receives voxels, frames and provenance (JSON)"
@@ -113,10 +116,11 @@ def simulate(argv: Sequence[str] | None = None) -> None:
             index=arguments.index,
         )
 
-    _main(parser, run, argv)
+    run_command(parser, run, argv)
 
 
-def _parser(name: str, description: str) -> argparse.ArgumentParser:
+def new_parser(name: str, description: str) -> argparse.ArgumentParser:
+    """A parser with what all commands have."""
     parser = argparse.ArgumentParser(prog=name, description=description)
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     return parser
@@ -133,9 +137,10 @@ def _add_recipe(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _main(
+def run_command(
     parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], None], argv: Sequence[str] | None
 ) -> None:
+    """Runs a command; an error of ours becomes one line on stderr and an exit status."""
     arguments = parser.parse_args(argv)
     try:
         run(arguments)

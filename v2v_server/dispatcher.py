@@ -6,12 +6,13 @@ sends, the answer is an instruction or a counted fault, never an exception: one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
+from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -26,30 +27,28 @@ from v2v_protocol.messages import (
     Stop,
     Unavailable,
     Want,
-    Welcome,
     WorkerHello,
 )
-from v2v_protocol.sample import Refusal, SampleId, array_layout, layout_bytes
+from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, Buffer, Frames, decode, encode
+from v2v_protocol.wire import Buffer, Frames, decode, encode
+from v2v_server.blame import Cause, Loss, judged, runs_alone
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.metrics import Counters
-from v2v_server.schedule import MOST_CANDIDATES, Schedule
-from v2v_server.sequences import SequenceTable
+from v2v_server.quarantine import Quarantine, Verdict
+from v2v_server.reception import Reception
+from v2v_server.schedule import MOST_CANDIDATES
+from v2v_server.sequences import Sequence as VideoSequence
 from v2v_server.session import Session, Sessions
 from v2v_server.video.catalogue import Catalogue
+from v2v_server.workers import SILENCE_SECONDS, Workers
 
-MOST_BLAMED_DEATHS = 2
-"""A candidate that was in work while this many workers died by their own doing is passed over."""
-MOST_BATCH_SIZE = 65_536
-MOST_SCHEDULES = 16
-"""Schedules kept for consumers to come. Each is a table over all videos; those in use live in their sessions."""
+MOST_SESSIONS = 4096
 _LONGEST_TEXT = 2000
-"""Characters of a text that quotes what a peer sent: unlimited, it might not fit into any message."""
+"""Characters of a refusal: it quotes what the peer sent, which may be long, and must itself fit a header."""
 _LONGEST_REASON = 500
 _MOST_CPU_SECONDS = 86_400.0
-"""Of one sample, whatever its worker claims: an absurd number must not unbalance the sharing for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,7 @@ class ToConsumer:
     """Send these frames to a consumer."""
 
     identity: bytes
-    frames: Sequence[Buffer]
+    frames: Sequence[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,20 +69,26 @@ class ToWorker:
 
 @dataclass(frozen=True, slots=True)
 class GiveUp:
-    """This worker hangs: end its process where that is in our power."""
+    """This worker hangs: end its process where that is in our power, and report its loss."""
 
     identity: bytes
     reason: str
 
 
-Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Write this verdict down before anything that follows is sent, and report what came of it.
+
+    Attributes:
+        verdict: not numbered yet.
+        task: whose candidate it refuses.
+    """
+
+    verdict: Verdict
+    task: Task
 
 
-@dataclass(slots=True)
-class _Worker:
-    name: str
-    credit: int
-    last_heard: float
+Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record
 
 
 class Dispatcher:
@@ -95,6 +100,8 @@ class Dispatcher:
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
         max_credit_bytes: bound on the bytes in flight to one consumer.
+        quarantine: the snapshots; verdicts that were written down are added to it.
+        wall_clock: gives the time for a verdict, ISO 8601.
 
     Attributes:
         counters: what happened so far.
@@ -109,15 +116,18 @@ class Dispatcher:
         lease_deadline_seconds: float,
         session_idle_seconds: float,
         max_credit_bytes: int,
+        quarantine: Quarantine,
+        wall_clock: Callable[[], str],
     ) -> None:
         self.counters = Counters()
         self.sessions = Sessions(session_idle_seconds)
         self._catalogue = catalogue
-        self._default_spec = default_spec
-        self._max_credit_bytes = max_credit_bytes
+        self._quarantine = quarantine
+        self._wall_clock = wall_clock
+        self._reception = Reception(catalogue, default_spec, max_credit_bytes, quarantine)
         self._leases = LeaseBook(lease_deadline_seconds)
-        self._workers: dict[bytes, _Worker] = {}
-        self._schedules: dict[str, Schedule] = {}
+        self._workers = Workers(self._leases)
+        self._lone: deque[Task] = deque()
         self._refusals: list[Refusal] = []
 
     @property
@@ -128,10 +138,10 @@ class Dispatcher:
     @property
     def waiting(self) -> int:
         """Asked samples that nobody works on yet."""
-        return sum(len(session.waiting) for session in self.sessions)
+        return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
 
     def take_refusals(self) -> list[Refusal]:
-        """The candidates passed over since the last call, for the log."""
+        """The candidates that failed since the last call, for the log."""
         taken, self._refusals = self._refusals, []
         return taken
 
@@ -166,48 +176,18 @@ class Dispatcher:
         """The consumer left, or cannot be reached any more."""
         self.sessions.forget(identity)
         self._leases.forget_session(identity)
+        self._lone = deque(task for task in self._lone if task.session != identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float) -> Instruction:
+        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+            return _refuse(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
-            spec = StreamSpec.from_dict(hello.spec, self._default_spec)
-            layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
-            if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
-                raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
-            _check_sizes(layout)
-            schedule = self._schedule(spec)
-        except UsageError as error:
+            session, welcome = self._reception.receive(identity, hello, len(self._workers), now)
+        except (UsageError, CorpusError) as error:
             return _refuse(identity, ErrorCode.SPEC, str(error))
-        suggested = max(2 * hello.batch_size, 2 * max(1, len(self._workers)))
-        credit = max(1, min(suggested, self._max_credit_bytes // layout_bytes(layout)))
         self.consumer_lost(identity)
-        self.sessions.open(
-            Session(identity, spec, hello.seed, hello.arrays, hello.batch_size, schedule, credit, last_heard=now)
-        )
-        welcome = Welcome(
-            spec=spec.to_dict(),
-            spec_digest=spec.digest,
-            catalogue_digest=self._catalogue.digest,
-            numerics_version=NUMERICS_VERSION,
-            sequences=schedule.count,
-            credit=credit,
-        )
+        self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
-
-    def _schedule(self, spec: StreamSpec) -> Schedule:
-        schedule = self._schedules.get(spec.digest)
-        if schedule is None:
-            table = SequenceTable(self._catalogue.videos, self._catalogue.rows, spec)
-            if not table.count:
-                first = table.rejections[0]
-                raise UsageError(
-                    f"none of the {len(table.rejections)} videos gives a sequence; {first.video}: {first.reason} "
-                    f"(would admit it: {first.remedy})"
-                )
-            schedule = Schedule(table, shuffle=spec.shuffle)
-            while len(self._schedules) >= MOST_SCHEDULES:
-                del self._schedules[next(iter(self._schedules))]
-            self._schedules[spec.digest] = schedule
-        return schedule
 
     def _want(self, session: Session, want: Want) -> list[Instruction]:
         try:
@@ -227,7 +207,7 @@ class Dispatcher:
 
     # --- workers ------------------------------------------------------------------------------------------------------
 
-    def from_worker(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Instruction]:
+    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Instruction]:
         """A message from the workers' side. The frames behind a Result are passed on as they are."""
         try:
             message = decode(frames[0]) if frames else _only(frames)
@@ -235,111 +215,150 @@ class Dispatcher:
             return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now)
-        worker = self._workers.get(identity)
-        if worker is None:
+        if not self._workers.heard(identity, now):
             return [ToWorker(identity, encode(Refused(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
-        worker.last_heard = now
         match message:
             case Begun(lease):
                 self._leases.begun(lease, identity, now)
                 return []
             case Result():
-                return [*self._result(identity, message, frames[1:]), *self._assign(now)]
-            case JobFailed():
-                return [*self._job_failed(identity, message), *self._assign(now)]
+                return self._result(identity, message, frames[1:], now)
+            case JobFailed(lease, frame, reason):
+                task = self._leases.finished(lease, identity, now)
+                failed = [] if task is None else self._refuse_candidate(task, frame, reason)
+                return [*failed, *self._assign(now)]
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
             case Goodbye():
-                return self._take_back(identity, blame=None, now=now)
+                return self._take_back(identity, Loss(Cause.KILLED, "left"), now)
             case _:
                 self.counters.malformed += 1
                 return []
 
-    def worker_lost(self, identity: bytes, blame: str | None, now: float) -> list[Instruction]:
-        """A worker died or was given up.
+    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+        """A worker died, was given up, or cannot be reached any more."""
+        self.counters.workers_lost += 1
+        return self._take_back(identity, loss, now)
+
+    def worker_unreachable(self, identity: bytes, now: float) -> list[Instruction]:
+        """Something sent to a worker did not go out, and nobody will say what became of its process."""
+        if identity not in self._workers:
+            return []
+        return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
+
+    def recorded(self, record: Record, written: Sequence[Verdict], now: float) -> list[Instruction]:
+        """What came of a :class:`Record`.
 
         Args:
-            identity: which worker.
-            blame: why the sample it had begun is suspect (a crash, a hang), or None when it is not (killed from
-                outside, disconnected).
+            record: the instruction.
+            written: the lines that the quarantine has more now, others' among them; none when it cannot be written.
             now: the time.
         """
-        self.counters.workers_lost += 1
-        return self._take_back(identity, blame, now)
+        before = self._quarantine.latest
+        self._quarantine.extend(written)
+        # Consumers that went on under the newest snapshot go on under the newest. One that resumed an older one keeps
+        # it: what was cleared since must not come back, nor what it had refused be admitted.
+        for each in self.sessions:
+            if each.quarantine == before:
+                each.quarantine = self._quarantine.latest
+        return [*self._refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
 
     def tick(self, now: float) -> list[Instruction]:
-        """To be called a few times a second: deadlines and forgotten consumers."""
+        """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         instructions: list[Instruction] = []
-        for overdue in self._leases.overdue(now):
-            if overdue.worker in self._workers:
-                reason = f"no answer over one sample for {self._leases.deadline_seconds:g} s"
-                instructions.append(GiveUp(overdue.worker, reason))
-                instructions += self.worker_lost(overdue.worker, reason, now)
-        return instructions
+        for identity in self._workers.hanging(now):
+            instructions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
+        for identity in self._workers.vanished(now):
+            instructions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
+        for task, worker in self._leases.slow(now):
+            second = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone), other_than=worker)
+            if second is not None and not runs_alone(task):
+                self.counters.second_leases += 1
+                instructions += self._grant(task, second, now)
+        # A consumer that left may have freed a worker that was kept for it, or for its tasks.
+        return instructions + self._assign(now)
 
     def stop_workers(self) -> list[Instruction]:
         """Tells every worker to finish and leave."""
-        return [ToWorker(identity, encode(Stop())) for identity in self._workers]
+        return [ToWorker(identity, encode(Stop())) for identity in self._workers.identities()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Instruction]:
+        again = Loss(Cause.KILLED, "started again")
+        instructions = self._take_back(identity, again, now) if identity in self._workers else []
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
-            return [ToWorker(identity, encode(Refused(ErrorCode.VERSION, text)))]
-        instructions = self._take_back(identity, blame=None, now=now) if identity in self._workers else []
-        self._workers[identity] = _Worker(hello.name, max(1, min(hello.credit, 64)), now)
+            return [ToWorker(identity, encode(Refused(ErrorCode.VERSION, text))), *instructions]
+        self._workers.add(identity, hello.credit, now)
         return instructions + self._assign(now)
 
-    def _result(self, identity: bytes, result: Result, payload: Sequence[Buffer]) -> list[Instruction]:
-        task = self._leases.finished(result.lease, identity)
-        if task is not None and (result.index != task.index or not payload):
-            self.counters.malformed += 1
-            self.sessions.put_back(task)
-            return []
+    def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
+        asked = self._leases.task(result.lease, identity)
+        if asked is not None and (result.index != asked.index or not payload):
+            # No worker of ours does this, and one that did it once would do it again.
+            refused = ToWorker(identity, self._malformed(ProtocolError("a result that answers another lease")))
+            return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+        task = self._leases.finished(result.lease, identity, now)
         cpu_seconds = min(max(result.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
         if task is None or not self.sessions.answered(task, cpu_seconds):
             self.counters.late_results += 1
-            return []
-        size = sum(len(frame) for frame in payload)
+            return self._assign(now)
         self.counters.samples += 1
-        self.counters.bytes += size
+        self.counters.bytes += sum(len(frame) for frame in payload)
         self.counters.worker_cpu_seconds += cpu_seconds
         session = self.sessions.get(task.session)
         if session is not None:
             self.counters.batches += 1 / session.batch_size
-        return [ToConsumer(task.session, payload)]
+        return [ToConsumer(task.session, payload), *self._assign(now)]
 
-    def _job_failed(self, identity: bytes, failed: JobFailed) -> list[Instruction]:
-        task = self._leases.finished(failed.lease, identity)
-        return [] if task is None else self._refuse_candidate(task, failed.frame, failed.reason)
-
-    def _take_back(self, identity: bytes, blame: str | None, now: float) -> list[Instruction]:
-        self._workers.pop(identity, None)
+    def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+        self._workers.remove(identity)
         instructions: list[Instruction] = []
-        returned = self._leases.lost(identity)
+        returned = self._leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for task, begun in reversed(returned):
-            if begun and blame is not None:
-                blamed = replace(task, deaths=task.deaths + 1)
-                if blamed.deaths >= MOST_BLAMED_DEATHS:
-                    instructions += self._refuse_candidate(blamed, None, blame)
-                    continue
-                task = blamed
-            self.sessions.put_back(task)
+            verdict = judged(task, loss) if begun else task
+            if isinstance(verdict, Task):
+                self.sessions.put_back(verdict)
+            else:
+                instructions += self._condemn(task, verdict)
         return instructions + self._assign(now)
 
     # --- tasks --------------------------------------------------------------------------------------------------------
 
-    def _refuse_candidate(self, task: Task, frame: int | None, reason: str) -> list[Instruction]:
+    def _condemn(self, task: Task, reason: str) -> list[Instruction]:
+        """The task's candidate brought its worker down: a verdict, unless there is one already."""
+        session = self.sessions.get(task.session)
+        if session is None:
+            return []
+        if self._quarantined(session, task, self._quarantine.latest) is not None:
+            return self._refuse_condemned(task, reason)
+        sequence = self._sequence(session, task)
+        video, text = sequence.video, reason[:_LONGEST_REASON]
+        return [Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), task)]
+
+    def _refuse_condemned(self, task: Task, reason: str) -> list[Instruction]:
+        """On to the next candidate: by the quarantine if the task's snapshot has the verdict, which says the same to
+        whoever makes the sample again; else by what happened."""
+        session = self.sessions.get(task.session)
+        if session is None:
+            return []
+        if self._quarantined(session, task, session.quarantine) is None:
+            return self._refuse_candidate(task, None, reason)
+        self.sessions.put_back(replace(task, deaths=0))
+        return []
+
+    def _refuse_candidate(self, task: Task, frame: int | None, reason: str, *, log: bool = True) -> list[Instruction]:
         """The task's candidate cannot be used: on to the next, or to the consumer with the whole story."""
         session = self.sessions.get(task.session)
         if session is None:
             return []
         self.counters.refused_candidates += 1
-        sequence = session.schedule.candidate(session.seed, task.epoch, task.index, task.candidate)
-        refusal = Refusal(task.candidate, sequence.video.id, frame, reason[:_LONGEST_REASON])
-        self._refusals.append(refusal)
+        video = self._sequence(session, task).video.id
+        refusal = Refusal(task.candidate, video, frame, reason[:_LONGEST_REASON])
+        if log:
+            self._refusals.append(refusal)
         refusals = (*task.refusals, refusal)
         candidate = task.candidate + 1
         if candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
@@ -352,54 +371,74 @@ class Dispatcher:
         return [ToConsumer(task.session, encode(Unavailable(task.epoch, task.index, text)))]
 
     def _assign(self, now: float) -> list[Instruction]:
-        """Gives waiting tasks to the workers with the most room."""
+        """Gives waiting tasks to workers, until there is no task or no room."""
         instructions: list[Instruction] = []
         while True:
-            free = [
-                (self._leases.held_by(identity), identity)
-                for identity, worker in self._workers.items()
-                if self._leases.held_by(identity) < worker.credit
-            ]
-            task = self.sessions.next_task() if free else None
-            if task is None:
+            if self._lone:
+                empty = self._workers.for_lone_task()
+                if empty is not None:
+                    instructions += self._try(self._lone.popleft(), empty, now)
+                    continue
+            worker = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone))
+            task = self.sessions.next_task() if worker is not None else None
+            if worker is None or task is None:
                 return instructions
-            session = self.sessions.get(task.session)
-            if session is None:
-                continue
-            _, identity = min(free)
-            number = self._leases.grant(task, identity, now)
-            try:
-                lease = describe(
-                    task,
-                    number=number,
-                    catalogue=self._catalogue,
-                    schedule=session.schedule,
-                    spec=session.spec,
-                    seed=session.seed,
-                    arrays=session.arrays,
-                    deadline_seconds=self._leases.deadline_seconds,
-                )
-                instructions.append(ToWorker(identity, encode(lease)))
-            except V2VError as error:
-                # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
-                self._leases.finished(number, identity)
-                instructions += self._refuse_candidate(task, None, str(error))
+            if runs_alone(task):
+                self._lone.append(task)
+            else:
+                instructions += self._try(task, worker, now)
+
+    def _try(self, task: Task, worker: bytes, now: float) -> list[Instruction]:
+        """Grants the task, unless its candidate is in quarantine."""
+        session = self.sessions.get(task.session)
+        if session is None:
+            return []
+        if task.snapshot != session.quarantine:
+            # Under another snapshot others may be passed over: from the first candidate, as whoever makes it again.
+            deaths = 0 if task.candidate else task.deaths
+            task = replace(task, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
+        refusal = self._quarantined(session, task, session.quarantine)
+        if refusal is not None:
+            return self._refuse_candidate(task, None, refusal, log=False)
+        return self._grant(task, worker, now)
+
+    def _grant(self, task: Task, worker: bytes, now: float) -> list[Instruction]:
+        session = self.sessions.get(task.session)
+        if session is None:
+            return []
+        number = self._leases.grant(task, worker, now)
+        try:
+            lease = describe(
+                task,
+                number=number,
+                sequence=self._sequence(session, task),
+                quarantine=task.snapshot,
+                catalogue=self._catalogue,
+                spec=session.spec,
+                seed=session.seed,
+                arrays=session.arrays,
+                deadline_seconds=self._leases.deadline_seconds,
+            )
+            return [ToWorker(worker, encode(lease))]
+        except V2VError as error:
+            # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
+            returned = self._leases.finished(number, worker, now)
+            return [] if returned is None else self._refuse_candidate(returned, None, str(error))
+
+    def _quarantined(self, session: Session, task: Task, snapshot: int) -> str | None:
+        """Why the task's candidate is refused under a snapshot; None when it is not."""
+        sequence = self._sequence(session, task)
+        video = sequence.video
+        return self._quarantine.refusal(snapshot, video.id, video.fingerprint, sequence.start_frame)
+
+    def _sequence(self, session: Session, task: Task) -> VideoSequence:
+        return session.schedule.candidate(session.seed, task.epoch, task.index, task.candidate)
 
 
 def _only(frames: Sequence[Buffer]) -> Message:
     if len(frames) != 1:
         raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
     return decode(frames[0])
-
-
-def _check_sizes(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
-    for name, (dtype, shape) in layout.items():
-        size = layout_bytes({name: (dtype, shape)})
-        if size > LARGEST_ARRAY_BYTES:
-            raise UsageError(
-                f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is {LARGEST_ARRAY_BYTES}: "
-                f"ask for fewer voxels_per_clip or a smaller crop"
-            )
 
 
 def _refused(code: ErrorCode, text: str) -> Frames:

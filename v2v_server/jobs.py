@@ -8,7 +8,7 @@ import math
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.leases import Task
-from v2v_server.schedule import Schedule
+from v2v_server.sequences import Sequence
 from v2v_server.video.catalogue import Catalogue
 
 
@@ -16,8 +16,9 @@ def describe(
     task: Task,
     *,
     number: int,
+    sequence: Sequence,
+    quarantine: int,
     catalogue: Catalogue,
-    schedule: Schedule,
     spec: StreamSpec,
     seed: int,
     arrays: tuple[str, ...],
@@ -25,10 +26,18 @@ def describe(
 ) -> Lease:
     """The lease for one task.
 
+    Args:
+        task: which sample, and what was tried before.
+        number: of the lease.
+        sequence: what the task's candidate is made from.
+        quarantine: number of the quarantine snapshot that let it pass.
+        catalogue, spec, seed: of the sample's identity.
+        arrays: to be sent.
+        deadline_seconds: see :class:`v2v_protocol.messages.Lease`.
+
     Raises:
         CorpusError: the catalogue's index can no longer be read.
     """
-    sequence = schedule.candidate(seed, task.epoch, task.index, task.candidate)
     video = sequence.video
     thresholds: tuple[str, ...] = ()
     if video.threshold_pos is not None and video.threshold_neg is not None:
@@ -54,6 +63,7 @@ def describe(
         start_frame=sequence.start_frame,
         frame_index=index.to_bytes(),
         candidate=task.candidate,
+        quarantine=quarantine,
         refusals={"refusals": [dataclasses.asdict(refusal) for refusal in task.refusals]},
         deadline_seconds=deadline_seconds,
     )

@@ -2,17 +2,27 @@
 
     pending (in its session's queue) --grant--> leased --begun--> working --finished--> gone
                  ^                                 |                 |
-                 `------- returned to its session -+-----------------'   worker lost, deadline passed
+                 `------- returned to its session -+-----------------'   worker lost
 
 A task is one asked sample. Every grant gets a new number, so an answer to a lease that was taken away is recognised by
-its number and dropped. Only the lease a worker announced as begun can be blamed for the worker's death.
+its number and dropped. A task that takes much longer than its consumer's others is given to a second worker as well;
+the first answer retires its twin.
 """
 
 from __future__ import annotations
 
+import statistics
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from v2v_protocol.sample import Refusal
+
+SLOW_FACTOR = 3.0
+"""A lease in work for this many times the median of its session is slow."""
+_LEAST_SLOW_SECONDS = 1.0
+_REMEMBERED = 64
+_LEAST_REMEMBERED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +34,8 @@ class Task:
         epoch, index: which sample.
         candidate: which candidate sequence is being tried.
         refusals: the candidates that failed before it.
-        deaths: workers that died by their own doing (a crash, a hang) while they were at this candidate.
+        deaths: unexplained deaths of workers that were at this candidate.
+        snapshot: number of the quarantine snapshot under which those candidates were passed over.
     """
 
     session: bytes
@@ -33,22 +44,20 @@ class Task:
     candidate: int = 0
     refusals: tuple[Refusal, ...] = ()
     deaths: int = 0
+    snapshot: int = 0
+
+    @property
+    def sample(self) -> tuple[bytes, int, int]:
+        """What is asked, whichever candidate it will be made from."""
+        return self.session, self.epoch, self.index
 
 
 @dataclass(slots=True)
 class _Lease:
-    task: Task | None  # None: its consumer is gone, but the worker still has to get through it
+    task: Task | None  # None: answered, or its consumer is gone; but the worker still has to get through it
     worker: bytes
     deadline: float
-    begun: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Overdue:
-    """A lease whose worker has been silent for longer than the deadline."""
-
-    lease: int
-    worker: bytes
+    begun_at: float | None = None
 
 
 class LeaseBook:
@@ -62,6 +71,8 @@ class LeaseBook:
         self.deadline_seconds = deadline_seconds
         self._leases: dict[int, _Lease] = {}
         self._held: dict[bytes, list[int]] = {}
+        self._out: dict[tuple[bytes, int, int], list[int]] = {}
+        self._durations: dict[bytes, deque[float]] = {}
         self._next = 1
 
     def __len__(self) -> int:
@@ -71,44 +82,99 @@ class LeaseBook:
         """Leases that are out to this worker."""
         return len(self._held.get(worker, ()))
 
+    def tasks_of(self, worker: bytes) -> Iterator[Task]:
+        """The tasks that this worker holds and somebody still waits for."""
+        for number in self._held.get(worker, ()):
+            task = self._leases[number].task
+            if task is not None:
+                yield task
+
+    def task(self, number: int, worker: bytes) -> Task | None:
+        """What this worker's lease asks for; None when nobody waits for its answer."""
+        lease = self._leases.get(number)
+        return None if lease is None or lease.worker != worker else lease.task
+
     def grant(self, task: Task, worker: bytes, now: float) -> int:
         """Gives the task to a worker; returns the number of the lease."""
         number = self._next
         self._next += 1
         self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
         self._held.setdefault(worker, []).append(number)
+        self._out.setdefault(task.sample, []).append(number)
         return number
 
     def begun(self, number: int, worker: bytes, now: float) -> None:
-        """The worker started on it. The clock of those queued behind it starts again: they wait through no fault."""
+        """The worker started on it. The clock of those queued behind it starts again: they wait through no fault.
+
+        A lease begins once: said again it would put off the deadline for ever.
+        """
         lease = self._leases.get(number)
-        if lease is None or lease.worker != worker:
+        if lease is None or lease.worker != worker or lease.begun_at is not None:
             return
-        lease.begun = True
+        lease.begun_at = now
         for other in self._held[worker]:
             self._leases[other].deadline = now + self.deadline_seconds
 
-    def finished(self, number: int, worker: bytes) -> Task | None:
-        """The worker answered; returns the task, or None when the lease had been taken away from it before, or its
-        consumer is gone."""
+    def finished(self, number: int, worker: bytes, now: float) -> Task | None:
+        """The worker answered, well or badly.
+
+        Returns:
+            the task, or None when nobody waits for this answer: the lease had been taken away from the worker, the
+            consumer is gone, or the twin was faster.
+        """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker:
             return None
+        task = lease.task
+        if task is not None:
+            if lease.begun_at is not None:
+                remembered = self._durations.setdefault(task.session, deque(maxlen=_REMEMBERED))
+                remembered.append(now - lease.begun_at)
+            self._retire(task.sample)
         self._drop(number)
-        return lease.task
+        return task
 
-    def lost(self, worker: bytes) -> list[tuple[Task, bool]]:
-        """The worker is gone: its tasks, oldest first, each with whether it had been begun (and so may be blamed)."""
+    def lost(self, worker: bytes, at: int | None = None) -> list[tuple[Task, bool]]:
+        """The worker is gone.
+
+        Args:
+            worker: which one.
+            at: number of the lease it was at by its own record; None goes by what it announced.
+
+        Returns:
+            those of its tasks that nobody else is at, oldest first, each with whether it had been begun.
+        """
         returned = []
-        for number in self._held.pop(worker, []):
-            lease = self._leases.pop(number)
-            if lease.task is not None:
-                returned.append((lease.task, lease.begun))
+        for number in list(self._held.get(worker, ())):
+            lease = self._leases[number]
+            self._drop(number)
+            if lease.task is not None and lease.task.sample not in self._out:
+                returned.append((lease.task, lease.begun_at is not None if at is None else number == at))
         return returned
 
-    def overdue(self, now: float) -> list[Overdue]:
-        """Leases past their deadline, oldest first. They stay out until their worker is given up (:meth:`lost`)."""
-        return [Overdue(number, lease.worker) for number, lease in self._leases.items() if now > lease.deadline]
+    def overdue(self, now: float) -> set[bytes]:
+        """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
+        return {lease.worker for lease in self._leases.values() if now > lease.deadline}
+
+    def slow(self, now: float) -> list[tuple[Task, bytes]]:
+        """For each session its oldest task, with its worker, if it is slow and nobody else is at it.
+
+        Counted from when its worker last began something, so that a task queued behind one that hangs is slow too.
+        """
+        oldest: dict[bytes, _Lease] = {}
+        for lease in self._leases.values():
+            if lease.task is not None:
+                oldest.setdefault(lease.task.session, lease)
+        found = []
+        for session, lease in oldest.items():
+            durations = self._durations.get(session, ())
+            if lease.task is None or len(durations) < _LEAST_REMEMBERED:
+                continue
+            limit = max(_LEAST_SLOW_SECONDS, SLOW_FACTOR * statistics.median(durations))
+            waited = now - (lease.deadline - self.deadline_seconds)
+            if waited > limit and len(self._out[lease.task.sample]) == 1:
+                found.append((lease.task, lease.worker))
+        return found
 
     def forget_session(self, session: bytes) -> None:
         """The consumer is gone: answers to its leases will find nothing.
@@ -116,9 +182,13 @@ class LeaseBook:
         The leases stay with their workers, which do not know and work through them: that is room they do not have for
         others, and time for which those queued behind must not be called overdue.
         """
-        for lease in self._leases.values():
-            if lease.task is not None and lease.task.session == session:
-                lease.task = None
+        self._durations.pop(session, None)
+        for sample in [sample for sample in self._out if sample[0] == session]:
+            self._retire(sample)
+
+    def _retire(self, sample: tuple[bytes, int, int]) -> None:
+        for number in self._out.pop(sample, ()):
+            self._leases[number].task = None
 
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)
@@ -126,3 +196,8 @@ class LeaseBook:
         held.remove(number)
         if not held:
             del self._held[lease.worker]
+        if lease.task is not None:
+            out = self._out[lease.task.sample]
+            out.remove(number)
+            if not out:
+                del self._out[lease.task.sample]

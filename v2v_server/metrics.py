@@ -18,6 +18,7 @@ class Counters:
         refused_candidates: videos passed over because they could not give what they promised.
         unavailable: samples that no candidate could give.
         returned_leases: leases taken back from workers that died, hung or left.
+        second_leases: samples given to a second worker because the first was slow.
         late_results: answers to leases that had been taken back.
         workers_lost: workers that died or were given up.
         malformed: messages that were none.
@@ -30,6 +31,7 @@ class Counters:
     refused_candidates: int = 0
     unavailable: int = 0
     returned_leases: int = 0
+    second_leases: int = 0
     late_results: int = 0
     workers_lost: int = 0
     malformed: int = 0

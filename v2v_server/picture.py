@@ -96,7 +96,8 @@ def write_png(path: Path, image: Image) -> None:
 
 def _draw_row(row: Row) -> Image:
     strongest = float(np.quantile(np.abs(row.bins[row.bins != 0], dtype=np.float32), 0.98)) if np.any(row.bins) else 1.0
-    tiles = [_label(row, strongest), _fit(cv2.cvtColor(row.frame, cv2.COLOR_GRAY2BGR))]
+    frame = np.repeat(row.frame[..., None], 3, axis=2)
+    tiles = [_label(row, strongest), _fit(frame)]
     tiles += [_fit(_red_blue(events, strongest)) for events in row.bins]
     return np.hstack([cv2.copyMakeBorder(tile, 0, _GAP_PX, 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))
                       for tile in tiles])  # fmt: skip
@@ -107,8 +108,10 @@ def _red_blue(events: npt.NDArray[Any], strongest: float) -> Image:
     share = np.clip(np.abs(events, dtype=np.float32) / strongest, 0.0, 1.0)[..., None]
     # The square root lifts single events out of the white.
     share = np.sqrt(share)
-    colour = np.where((events > 0)[..., None], np.float32(_POSITIVE), np.float32(_NEGATIVE))
-    return (255.0 + share * (colour - 255.0)).round().astype(np.uint8)
+    positive, negative = np.array(_POSITIVE, np.float32), np.array(_NEGATIVE, np.float32)
+    colour = np.where((events > 0)[..., None], positive, negative)
+    image: Image = (255.0 + share * (colour - 255.0)).round().astype(np.uint8)
+    return image
 
 
 def _label(row: Row, strongest: float) -> Image:

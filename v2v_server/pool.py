@@ -15,10 +15,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import psutil
+
 from v2v_protocol.errors import WorkerCrashLoop
+from v2v_server.blame import Cause, Loss
+from v2v_server.logbook import Logbook
 
 _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0
@@ -28,22 +32,16 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 @dataclass(frozen=True, slots=True)
 class Death:
-    """A worker process that ended without being asked to.
-
-    Attributes:
-        identity: its routing identity.
-        status: what the operating system said, in words.
-        blame: the same, when the sample it was at may be to blame; None when it was killed from outside.
-    """
+    """A worker process that ended without being asked to."""
 
     identity: bytes
-    status: str
-    blame: str | None
+    loss: Loss
 
 
 @dataclass(slots=True)
 class _Slot:
     process: subprocess.Popen[bytes] | None = None
+    logbook: Logbook | None = None
     identity: bytes = b""
     generation: int = 0
     given_up: bool = False
@@ -67,6 +65,7 @@ class Pool:
         self._label = label
         self._deaths_in_a_row = 0
         self._samples_seen = 0
+        self._memory_kills = _out_of_memory_kills()
 
     @property
     def crash_budget(self) -> int:
@@ -81,6 +80,10 @@ class Pool:
     def pids(self) -> list[int]:
         """Process ids of the workers that are alive."""
         return [slot.process.pid for slot in self._slots if slot.process is not None and slot.process.poll() is None]
+
+    def watches(self, identity: bytes) -> bool:
+        """Whether :meth:`check` will report how that worker ends: one of this pool's that was not given up."""
+        return any(slot.identity == identity and slot.process is not None and not slot.given_up for slot in self._slots)
 
     def check(self, now: float, samples: int) -> list[Death]:
         """Reaps the dead and starts what is due. To be called a few times a second.
@@ -98,12 +101,13 @@ class Pool:
         deaths = []
         for number, slot in enumerate(self._slots):
             if slot.process is not None and slot.process.poll() is not None:
-                death = _post_mortem(slot.identity, slot.process.returncode)
+                at = None if slot.logbook is None else slot.logbook.lease()
+                death = Death(slot.identity, replace(self._post_mortem(slot.process.returncode), lease=at))
                 self._deaths_in_a_row += 1
                 if self._deaths_in_a_row > self.crash_budget:
                     raise WorkerCrashLoop(
                         f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
-                        f"{self.crash_budget}); the last one {death.status}. What they printed is above; "
+                        f"{self.crash_budget}); the last one {death.loss.text}. What they printed is above; "
                         f"`v2v-simulate` on one of the videos shows the same in one process"
                     )
                 # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
@@ -116,12 +120,36 @@ class Pool:
                 self._start(number, slot)
         return deaths
 
-    def give_up(self, identity: bytes) -> None:
-        """Kills a worker that hangs. The caller has taken its leases back, so its death is not reported again."""
+    def give_up(self, identity: bytes, reason: str) -> Loss | None:
+        """Kills a worker that hangs.
+
+        Returns:
+            what its loss means, not to be reported again by :meth:`check`; None when it is none of this pool's.
+        """
         for slot in self._slots:
             if slot.identity == identity and slot.process is not None:
                 slot.given_up = True
+                stopped = _is_stopped(slot.process.pid)
                 slot.process.kill()
+                if stopped:
+                    return Loss(Cause.KILLED, "was stopped from outside and killed")
+                return Loss(Cause.HUNG, reason, None if slot.logbook is None else slot.logbook.lease())
+        return None
+
+    def _post_mortem(self, returncode: int) -> Loss:
+        if returncode >= 0:
+            # An exception nobody foresaw, a broken installation: the trace is on stderr, whose fault it is is not.
+            return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
+        number = -returncode
+        name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+        if number in _CRASH_SIGNALS:
+            return Loss(Cause.CRASHED, f"was ended by {name}")
+        kills, self._memory_kills = self._memory_kills, _out_of_memory_kills()
+        if number == signal.SIGKILL and self._memory_kills > kills:
+            return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
+        if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            return Loss(Cause.KILLED, f"was ended by {name} from outside")
+        return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
 
     def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
         """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
@@ -137,15 +165,21 @@ class Pool:
             process.wait()
         for slot in self._slots:
             slot.process = None
+            if slot.logbook is not None:
+                slot.logbook.close()
 
     def _start(self, number: int, slot: _Slot) -> None:
         slot.generation += 1
         slot.given_up = False
         name = f"{self._label}-{number}.{slot.generation}"
         slot.identity = name.encode()
+        if slot.logbook is not None:
+            slot.logbook.close()
+        slot.logbook = Logbook()
         slot.process = subprocess.Popen(
-            _command(self._address, self._root, name),
+            [*_command(self._address, self._root, name), "--logbook-fd", str(slot.logbook.descriptor)],
             stdin=subprocess.DEVNULL,
+            pass_fds=(slot.logbook.descriptor,),
             env=os.environ | _ONE_THREAD,
             process_group=0,
         )
@@ -160,17 +194,23 @@ def _command(address: str, root: Path, name: str) -> list[str]:
     ]
 
 
-def _post_mortem(identity: bytes, returncode: int) -> Death:
-    if returncode >= 0:
-        # An exception nobody foresaw, a broken installation, no memory: whose fault it is cannot be told from here, and
-        # to pass over videos for it would silently change the stream.
-        return Death(identity, f"exited with status {returncode}", None)
+def _is_stopped(pid: int) -> bool:
+    """Whether somebody sent it SIGSTOP, or a debugger holds it."""
     try:
-        name = signal.Signals(-returncode).name
-    except ValueError:
-        name = f"signal {-returncode}"
-    status = f"was ended by {name}"
-    return Death(identity, status, f"a worker {status} over it" if -returncode in _CRASH_SIGNALS else None)
+        return psutil.Process(pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _out_of_memory_kills() -> int:
+    """How many processes the kernel of this host has killed for want of memory; 0 where it does not say."""
+    try:
+        for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    except OSError:
+        pass
+    return 0
 
 
 def _wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:

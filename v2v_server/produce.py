@@ -120,6 +120,7 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
             saturated_bins=saturated,
             irregular_timestamps=irregular,
             decoder=codec if decoded.clip.bit_exact else f"{codec} (host-dependent)",
+            quarantine=lease.quarantine,
         ),
     )
 

@@ -18,6 +18,7 @@ from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.picture import draw_sample, write_png
 from v2v_server.produce import make_sample
+from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule
 from v2v_server.sequences import SequenceTable
 from v2v_server.video.catalogue import Catalogue, open_catalogue
@@ -32,6 +33,8 @@ def remake(
     epoch: int,
     index: int,
     arrays: tuple[str, ...] = ("voxels", "frames"),
+    quarantine: Quarantine | None = None,
+    snapshot: int = 0,
 ) -> Sample:
     """The sample of an identity: the same bytes a server streams, candidates and refusals included.
 
@@ -40,6 +43,7 @@ def remake(
         spec: the stream's spec.
         seed, epoch, index: the rest of the identity.
         arrays: which arrays to make.
+        quarantine, snapshot: the quarantine and the number of the snapshot to make it under; the empty one by default.
 
     Raises:
         UsageError: an index outside the epoch, or arrays nobody makes.
@@ -57,14 +61,21 @@ def remake(
     if index >= table.count:
         raise UsageError(f"index {index}: the epoch has {table.count} sequences, 0 .. {table.count - 1}")
     schedule = Schedule(table, shuffle=spec.shuffle)
+    held = quarantine or Quarantine()
     task = Task(b"", epoch, index)
     most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
     while task.candidate < most:
+        sequence = schedule.candidate(seed, epoch, index, task.candidate)
+        quarantined = held.refusal(snapshot, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
+        if quarantined is not None:
+            task = _passed_over(task, Refusal(task.candidate, sequence.video.id, None, quarantined))
+            continue
         lease = describe(
             task,
             number=1,
+            sequence=sequence,
+            quarantine=snapshot,
             catalogue=catalogue,
-            schedule=schedule,
             spec=spec,
             seed=seed,
             arrays=arrays,
@@ -73,9 +84,12 @@ def remake(
         try:
             return make_sample(lease, index, catalogue.root)
         except VideoError as error:
-            refusal = Refusal(task.candidate, lease.video, error.frame, error.reason)
-            task = replace(task, candidate=task.candidate + 1, refusals=(*task.refusals, refusal))
+            task = _passed_over(task, Refusal(task.candidate, lease.video, error.frame, error.reason))
     raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
+
+
+def _passed_over(task: Task, refusal: Refusal) -> Task:
+    return replace(task, candidate=task.candidate + 1, refusals=(*task.refusals, refusal))
 
 
 def simulate_to_file(

@@ -22,11 +22,19 @@ from v2v_server.video.rows import Rows
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A video that gives this spec no sequence: why, and which setting would admit it."""
+    """A video that gives this spec no sequence.
+
+    Attributes:
+        video: its id.
+        reason: why not.
+        remedy: which setting would admit it, in words.
+        voxels_per_clip: the longest clip it would be long enough for; 0 where that is not the matter.
+    """
 
     video: str
     reason: str
     remedy: str
+    voxels_per_clip: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +101,7 @@ def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | Non
         remedy = f"voxels_per_clip at most {most}" if most >= 1 else "fewer bins or frames_per_bin, no lead_voxels"
         if video.frames < 2:
             remedy = "none: a voxel grid needs two frames"
-        return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy)
+        return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy, max(most, 0))
     try:
         top, bottom = rows.bounds(video.height_px)
     except UsageError as error:

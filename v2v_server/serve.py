@@ -9,15 +9,19 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError
+from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
 from v2v_server.config import ServeConfig
-from v2v_server.dispatcher import Dispatcher, Instruction
+from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record
 from v2v_server.pool import Pool
 from v2v_server.process import keep_freed_memory
 from v2v_server.progress import catalogue_progress
+from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.sequences import SequenceTable
 from v2v_server.status import StatusLine, summary
 from v2v_server.video.catalogue import Catalogue, open_catalogue
@@ -58,9 +62,15 @@ def serve(config: ServeConfig) -> None:
         _say(line)
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
+    quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
+    quarantine = read_quarantine(quarantine_file)
+    for verdict in quarantine.verdicts(quarantine.latest):
+        _say(f"in quarantine: {verdict}")
     dispatcher = Dispatcher(
         catalogue,
         config.spec,
+        quarantine=quarantine,
+        wall_clock=_utc_now,
         lease_deadline_seconds=config.lease_deadline_seconds,
         session_idle_seconds=config.session_idle_seconds,
         max_credit_bytes=config.max_credit_bytes,
@@ -70,10 +80,23 @@ def serve(config: ServeConfig) -> None:
     with _stop_on_signals(stop):
         broker = Broker(config.bind, config.worker_bind or _private_address(label))
         pool = Pool(config.workers, catalogue.root, broker.worker_address, label)
+        running = _Running(config, dispatcher, broker, pool, quarantine, quarantine_file)
+
+        def stopping() -> bool:
+            return stop.is_set() or (config.parent_pid != 0 and os.getppid() != config.parent_pid)
+
         try:
-            _loop(config, dispatcher, broker, pool, stop)
+            broker.run(
+                dispatcher,
+                give_up=running.give_up,
+                record=running.record,
+                watched=pool.watches,
+                every_tick=running.every_tick,
+                stopping=stopping,
+            )
         finally:
-            broker.carry_out(dispatcher, dispatcher.stop_workers())
+            running.status.close()
+            broker.say_farewell(dispatcher.stop_workers())
             pool.stop()
             broker.close()
             catalogue.close()
@@ -81,34 +104,62 @@ def serve(config: ServeConfig) -> None:
                 Path(config.port_file).unlink(missing_ok=True)
 
 
-def _loop(config: ServeConfig, dispatcher: Dispatcher, broker: Broker, pool: Pool, stop: threading.Event) -> None:
-    status = StatusLine()
-    announced = False
+@dataclass(slots=True)
+class _Running:
+    """What a running server does to the world: reap and kill workers, write verdicts, talk to its operator."""
 
-    def every_tick(now: float) -> list[Instruction]:
-        nonlocal announced
+    config: ServeConfig
+    dispatcher: Dispatcher
+    broker: Broker
+    pool: Pool
+    quarantine: Quarantine
+    quarantine_file: Path
+    status: StatusLine = field(default_factory=StatusLine)
+    announced: bool = False
+
+    def every_tick(self, now: float) -> list[Instruction]:
+        """Reaps the dead, starts what is due, announces, and shows the status."""
         instructions: list[Instruction] = []
-        for death in pool.check(now, dispatcher.counters.samples):
-            _say(f"worker {death.identity.decode()} {death.status}; its work is given to others")
-            instructions += dispatcher.worker_lost(death.identity, death.blame, now)
-        for refusal in dispatcher.take_refusals():
-            _say(f"passed over {refusal}")
-        if not announced and (dispatcher.workers or not config.workers):
-            announced = True
-            _say(f"ready: consumers connect to {broker.address}, workers to {broker.worker_address}")
-            if config.port_file:
-                _write_port_file(config.port_file, broker.address)
-        if announced:
-            status.update(now, dispatcher, pool.running)
+        for death in self.pool.check(now, self.dispatcher.counters.samples):
+            self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
+            instructions += self.dispatcher.worker_lost(death.identity, death.loss, now)
+        for refusal in self.dispatcher.take_refusals():
+            self._say(f"passed over {refusal}")
+        if not self.announced and (self.dispatcher.workers or not self.config.workers):
+            self.announced = True
+            self._say(f"ready: consumers connect to {self.broker.address}, workers to {self.broker.worker_address}")
+            if self.config.port_file:
+                _write_port_file(self.config.port_file, self.broker.address)
+        if self.announced:
+            self.status.update(now, self.dispatcher, self.pool.running)
         return instructions
 
-    def stopping() -> bool:
-        return stop.is_set() or (config.parent_pid != 0 and os.getppid() != config.parent_pid)
+    def give_up(self, hopeless: GiveUp) -> Loss:
+        """Ends the process of a worker that hangs, if it is one of ours."""
+        elsewhere = Loss(Cause.UNEXPLAINED, hopeless.reason)
+        loss = self.pool.give_up(hopeless.identity, hopeless.reason) or elsewhere
+        name = hopeless.identity.decode(errors="replace")
+        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others")
+        return loss
 
-    try:
-        broker.run(dispatcher, give_up=pool.give_up, every_tick=every_tick, stopping=stopping)
-    finally:
-        status.close()
+    def record(self, instruction: Record) -> list[Verdict]:
+        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs."""
+        try:
+            written = write_verdict(self.quarantine_file, instruction.verdict, self.quarantine)
+        except (OSError, CorpusError) as error:
+            verdict = instruction.verdict
+            self._say(
+                f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
+                f"again, because the quarantine cannot be written: {error}"
+            )
+            return []
+        for verdict in written:
+            self._say(f"quarantine: {verdict}")
+        return written
+
+    def _say(self, text: str) -> None:
+        self.status.interrupt()
+        _say(text)
 
 
 def _private_address(label: str) -> str:
@@ -144,6 +195,10 @@ def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _utc_now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _say(text: str) -> None:

@@ -39,6 +39,7 @@ class Session:
         unanswered: every (epoch, index) asked for and not yet answered.
         balance_seconds: worker time it has earned and not used.
         served: samples sent.
+        quarantine: number of the quarantine snapshot its samples are made under.
     """
 
     identity: bytes
@@ -53,6 +54,7 @@ class Session:
     unanswered: set[tuple[int, int]] = field(default_factory=set)
     balance_seconds: float = 0.0
     served: int = 0
+    quarantine: int = 0
 
 
 class Sessions:

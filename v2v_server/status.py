@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from typing import TextIO
 
 from v2v_protocol.spec import StreamSpec
@@ -26,18 +25,28 @@ def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> lis
     ]
     if table.rejections:
         lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
-        by_remedy = Counter(rejection.remedy for rejection in table.rejections)
         for rejection in table.rejections[:_SHOWN]:
             lines.append(f"  {rejection.video}: {rejection.reason}; would admit it: {rejection.remedy}")
         if len(table.rejections) > _SHOWN:
-            common = "; ".join(f"{remedy} ({count})" for remedy, count in by_remedy.most_common(3))
-            lines.append(f"  ... and {len(table.rejections) - _SHOWN} more; most frequent remedies: {common}")
+            lines.append(f"  ... and {len(table.rejections) - _SHOWN} more")
+        lines += _shorter_clips(table)
     if catalogue.problems:
         lines.append(f"{len(catalogue.problems)} files cannot be used at all:")
         lines += [f"  {problem.id}: {problem.reason}" for problem in catalogue.problems[:_SHOWN]]
         if len(catalogue.problems) > _SHOWN:
             lines.append(f"  ... and {len(catalogue.problems) - _SHOWN} more")
     return lines
+
+
+def _shorter_clips(table: SequenceTable) -> list[str]:
+    """How many of the videos that are too short a shorter clip would admit: half of them, and all."""
+    longest = sorted((rejection.voxels_per_clip for rejection in table.rejections), reverse=True)
+    longest = [voxels for voxels in longest if voxels]
+    if not longest:
+        return []
+    choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
+    shown = ", ".join(f"{choice} admits {sum(voxels >= choice for voxels in longest)}" for choice in choices)
+    return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]
 
 
 class StatusLine:
@@ -62,6 +71,12 @@ class StatusLine:
             return
         self._next = now + self._period
         self._show(self._text(now, dispatcher, running))
+
+    def interrupt(self) -> None:
+        """Clears the live line, because something else is about to be printed."""
+        if self._live and self._width:
+            self._stream.write("\r" + " " * self._width + "\r")
+            self._width = 0
 
     def close(self) -> None:
         """Leaves the last line standing."""

@@ -8,6 +8,7 @@ that would have to be undone.
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import sys
 import time
@@ -33,6 +34,7 @@ from v2v_protocol.messages import (
     WorkerHello,
 )
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, encode_sample
+from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
 from v2v_server.simulation.clip import warm_up
@@ -52,10 +54,12 @@ class Worker:
         name: unique name, also its routing identity.
         root: the corpus folder on this host.
         address: where the server listens for workers.
+        logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.logbook`.
     """
 
-    def __init__(self, name: str, root: Path, address: str) -> None:
+    def __init__(self, name: str, root: Path, address: str, logbook: int | None = None) -> None:
         self._name = name
+        self._logbook = logbook
         self._root = root
         self._leases: deque[Lease] = deque()
         self._stopping = False
@@ -73,6 +77,10 @@ class Worker:
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
             raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+
+    def stop(self) -> None:
+        """Finishes the lease in work, gives the others back and leaves. May be called from a signal handler."""
+        self._stopping = True
 
     def run(self) -> None:
         """Works until told to stop.
@@ -124,7 +132,12 @@ class Worker:
                 pass
 
     def _work(self, lease: Lease) -> None:
+        note(self._logbook, lease.lease)
         self._send(encode(Begun(lease.lease)))
+        self._make(lease)
+        note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
+
+    def _make(self, lease: Lease) -> None:
         for index in lease.indices:
             started = time.process_time()
             try:
@@ -147,7 +160,7 @@ class Worker:
         self._socket.send_multipart(frames, copy=False)
 
 
-def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None) -> None:
+def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:
     """Runs one worker in this process until the server stops it.
 
     Args:
@@ -155,6 +168,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
         root: the corpus folder on this host.
         name: unique name; by default host and process id.
         parent_pid: the server, when this is one of its own processes: we die with it.
+        logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.logbook`.
 
     Raises:
         CorpusError: the folder is missing.
@@ -169,4 +183,6 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     cv2.setNumThreads(1)
     # Compile or load the kernels first: a worker that has said hello can work at full speed.
     warm_up()
-    Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address).run()
+    worker = Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address, logbook)
+    signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
+    worker.run()

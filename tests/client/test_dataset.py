@@ -1,7 +1,7 @@
 import copy
 import gc
-import os
 import pickle
+import tempfile
 import threading
 
 import numpy as np
@@ -550,14 +550,18 @@ def test_a_copy_is_a_dataset_of_its_own(server):
     stream = dataset(server)
     list(stream)
     other = copy.deepcopy(stream)
-    path = stream._progress._path
     assert other.epoch == 1
     other.set_epoch(4)
     assert stream.epoch == 1
     del stream
-    gc.collect()
-    assert not os.path.exists(path)
     assert places(other) == epoch_places(4)
+
+
+def test_a_dataset_leaves_no_file_however_its_process_ends(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    stream = dataset(server)
+    list(loader(stream, 1))
+    assert list(tmp_path.iterdir()) == []
 
 
 # --- buffers ----------------------------------------------------------------------------------------------------------

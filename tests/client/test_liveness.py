@@ -23,16 +23,17 @@ def timeline(until: float, *, pong: bool) -> list[tuple[float, Due]]:
     return done
 
 
-def test_a_dead_server_is_pinged_then_asked_again_then_given_up():
+def test_a_dead_server_is_pinged_then_connected_anew_ever_more_rarely_then_given_up():
     done = timeline(100, pong=False)
-    assert done[:5] == [(2, Due.PING), (4, Due.PING), (6, Due.PING), (8, Due.PING), (10, Due.WANT_AGAIN)]
+    assert done[:5] == [(2, Due.PING), (4, Due.PING), (6, Due.PING), (8, Due.PING), (10, Due.CONNECT_ANEW)]
+    assert [now for now, due in done if due is Due.CONNECT_ANEW] == [10, 30]
     assert done[-1] == (60, Due.GIVE_UP)
 
 
-def test_a_server_that_only_answers_pings_is_asked_again_and_never_given_up():
+def test_a_server_that_only_answers_pings_is_asked_again_ever_more_rarely_and_never_given_up():
     done = timeline(200, pong=True)
     assert Due.GIVE_UP not in [due for _, due in done]
-    assert [now for now, due in done if due is Due.WANT_AGAIN] == [10 * n for n in range(1, 21)]
+    assert [now for now, due in done if due is Due.WANT_AGAIN] == [10, 30, 70, 130, 190]
 
 
 @given(st.floats(0, 1e6), st.floats(0, 50))

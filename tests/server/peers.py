@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tests.server.corpus import SMALL_SPEC, corpus, video
@@ -25,7 +25,9 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, ToConsumer, ToWorker
+from v2v_server.blame import Cause, Loss
+from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.quarantine import Quarantine, Verdict
 from v2v_server.video.catalogue import Catalogue
 
 DEADLINE = 60.0
@@ -52,32 +54,62 @@ class Peers:
         leases: what each worker holds, oldest first; a worker works in this order.
         told: what else each worker was told.
         given_up: workers that were to be killed.
+        remote: workers that cannot be killed, as on another host; what they hold stays with them.
+        quarantine: the snapshots.
+        writable: whether verdicts can be written down.
+        recorded: verdicts that were to be written down.
+        others: lines that somebody else writes before the next verdict, numbered.
+        sent: kinds of all instructions in the order they were carried out, with what they were about.
     """
 
     dispatcher: Dispatcher
+    quarantine: Quarantine
     now: float = 0.0
     frames: dict[bytes, list[Sequence[Buffer]]] = field(default_factory=dict)
     heard: dict[bytes, list[Message]] = field(default_factory=dict)
     leases: dict[bytes, deque[Lease]] = field(default_factory=dict)
     told: dict[bytes, list[Message]] = field(default_factory=dict)
     given_up: list[bytes] = field(default_factory=list)
+    remote: set[bytes] = field(default_factory=set)
+    writable: bool = True
+    recorded: list[Verdict] = field(default_factory=list)
+    others: list[Verdict] = field(default_factory=list)
+    sent: list[tuple[str, Any]] = field(default_factory=list)
 
     # --- carrying -----------------------------------------------------------------------------------------------------
 
     def carry_out(self, instructions: list[Instruction]) -> None:
-        for instruction in instructions:
-            match instruction:
+        """As the broker does it, in its order."""
+        todo = deque(instructions)
+        while todo:
+            match todo.popleft():
                 case ToConsumer(identity, frames):
+                    message = decode(frames[0])
+                    self.sent.append(("to consumer", message))
                     self.frames.setdefault(identity, []).append(frames)
-                    self.heard.setdefault(identity, []).append(decode(frames[0]))
+                    self.heard.setdefault(identity, []).append(message)
                 case ToWorker(identity, frames):
                     message = decode(frames[0])
+                    self.sent.append(("to worker", message))
                     if isinstance(message, Lease):
                         self.leases.setdefault(identity, deque()).append(message)
                     else:
                         self.told.setdefault(identity, []).append(message)
-                case GiveUp(identity, _):
+                case GiveUp(identity, reason):
                     self.given_up.append(identity)
+                    cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
+                    todo.extend(self.dispatcher.worker_lost(identity, Loss(cause, reason), self.now))
+                case Record() as record:
+                    self.sent.append(("record", record.verdict))
+                    todo.extendleft(reversed(self.dispatcher.recorded(record, self._write(record.verdict), self.now)))
+
+    def _write(self, verdict: Verdict) -> list[Verdict]:
+        if not self.writable:
+            return []
+        others, self.others = self.others, []
+        numbered = replace(verdict, snapshot=self.quarantine.latest + len(others) + 1)
+        self.recorded.append(numbered)
+        return [*others, numbered]
 
     def consumer_says(self, identity: bytes, message: Message) -> list[Message]:
         """Sends a consumer's message; returns what that consumer heard in reply."""
@@ -94,8 +126,16 @@ class Peers:
 
     # --- what peers do ------------------------------------------------------------------------------------------------
 
-    def hello(self, identity: bytes = b"c", *, batch_size: int = 4, seed: int = 0, **spec: Any) -> Welcome:
-        (welcome,) = self.consumer_says(identity, Hello(spec, ("voxels",), batch_size, seed))
+    def hello(
+        self,
+        identity: bytes = b"c",
+        *,
+        batch_size: int = 4,
+        seed: int = 0,
+        quarantine: int | None = None,
+        **spec: Any,
+    ) -> Welcome:
+        (welcome,) = self.consumer_says(identity, Hello(spec, ("voxels",), batch_size, seed, quarantine))
         if not isinstance(welcome, Welcome):
             raise AssertionError(welcome)
         return welcome
@@ -124,10 +164,10 @@ class Peers:
         self.worker_says(identity, JobFailed(lease.lease, frame, reason))
         return lease
 
-    def die(self, identity: bytes = b"w", blame: str | None = None) -> list[Lease]:
+    def die(self, identity: bytes = b"w", cause: Cause = Cause.KILLED, text: str = "died") -> list[Lease]:
         """The worker's process ends; returns the leases it held."""
         held = list(self.leases.pop(identity, ()))
-        self.carry_out(self.dispatcher.worker_lost(identity, blame, self.now))
+        self.carry_out(self.dispatcher.worker_lost(identity, Loss(cause, text), self.now))
         return held
 
     def work_off(self, identity: bytes = b"w") -> None:
@@ -149,15 +189,22 @@ class Peers:
         return [message for message in self.heard.get(identity, []) if isinstance(message, Refused)]
 
 
-def peers(catalogue: Catalogue | None = None, spec: StreamSpec = SMALL_SPEC, max_credit_bytes: int = 2 << 30) -> Peers:
+def peers(
+    catalogue: Catalogue | None = None,
+    spec: StreamSpec = SMALL_SPEC,
+    max_credit_bytes: int = 2 << 30,
+    quarantine: Quarantine | None = None,
+) -> Peers:
     """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
     videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    return Peers(
-        Dispatcher(
-            videos if catalogue is None else catalogue,
-            spec,
-            lease_deadline_seconds=DEADLINE,
-            session_idle_seconds=IDLE,
-            max_credit_bytes=max_credit_bytes,
-        )
+    held = Quarantine() if quarantine is None else quarantine
+    dispatcher = Dispatcher(
+        videos if catalogue is None else catalogue,
+        spec,
+        lease_deadline_seconds=DEADLINE,
+        session_idle_seconds=IDLE,
+        max_credit_bytes=max_credit_bytes,
+        quarantine=held,
+        wall_clock=lambda: "2024-02-29T12:00:00+00:00",
     )
+    return Peers(dispatcher, held)

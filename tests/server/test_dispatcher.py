@@ -13,7 +13,6 @@ import hypothesis.strategies as st
 import msgpack
 import pytest
 from hypothesis import given, settings
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from tests.protocol.wire_messages import messages
 from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
@@ -33,18 +32,20 @@ from v2v_protocol.messages import (
     Result,
     SampleHeader,
     Stop,
-    Unavailable,
     Want,
     Welcome,
     WorkerHello,
 )
 from v2v_protocol.recipe import preset
-from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
-from v2v_server.dispatcher import MOST_BATCH_SIZE, MOST_BLAMED_DEATHS, MOST_SCHEDULES, ToConsumer
+from v2v_server import dispatcher as dispatcher_module
+from v2v_server.blame import Cause
+from v2v_server.dispatcher import GiveUp, Record, ToConsumer
+from v2v_server.reception import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.schedule import MOST_CANDIDATES
 from v2v_server.video.index import FrameIndex
+from v2v_server.workers import SILENCE_SECONDS
 
 
 def refused(replies: list[Message], code: ErrorCode) -> str:
@@ -62,7 +63,7 @@ def test_hello_is_answered_with_the_resolved_spec() -> None:
     at = peers()
     welcome = at.hello(shuffle=False)
     spec = replace(SMALL_SPEC, shuffle=False)
-    assert welcome == Welcome(spec.to_dict(), spec.digest, "c" * 32, NUMERICS_VERSION, 50, 8)
+    assert welcome == Welcome(spec.to_dict(), spec.digest, "c" * 32, NUMERICS_VERSION, 50, 8, 0)
     assert StreamSpec.from_dict(welcome.spec).digest == welcome.spec_digest
 
 
@@ -231,7 +232,29 @@ def test_credit_follows_batch_size_workers_and_bytes() -> None:
     assert at.hello(batch_size=12).credit == 40
     sample_bytes = 2 * 2 * 8 * 8
     assert peers(max_credit_bytes=10 * sample_bytes - 1).hello(batch_size=12).credit == 9
-    assert peers(max_credit_bytes=1).hello(batch_size=12).credit == 1
+    assert peers(max_credit_bytes=sample_bytes).hello(batch_size=12).credit == 1
+
+
+def test_a_sample_that_the_credit_cannot_hold_is_refused_with_both_numbers() -> None:
+    at = peers(max_credit_bytes=255)
+    text = refused(at.consumer_says(b"c", Hello({}, ("voxels",), 1, 0)), ErrorCode.SPEC)
+    assert "one sample is 256 bytes; the server's --max-credit-bytes is 255" in text
+    assert len(at.dispatcher.sessions) == 0
+
+
+def test_a_full_server_is_busy_to_newcomers_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatcher_module, "MOST_SESSIONS", 3)
+    at = peers()
+    for identity in (b"c1", b"c2", b"c3"):
+        at.hello(identity)
+    hello = Hello({}, ("voxels",), 4, 0)
+    assert "3 consumers" in refused(at.consumer_says(b"c4", hello), ErrorCode.BUSY)
+    refused(at.want(0, identity=b"c4"), ErrorCode.UNKNOWN_SESSION)
+    # Those that are in may connect again, and whoever leaves makes room.
+    at.hello(b"c2", seed=1)
+    at.consumer_says(b"c3", Goodbye())
+    at.hello(b"c4")
+    assert len(at.dispatcher.sessions) == 3
 
 
 def test_consumers_do_not_hear_each_other() -> None:
@@ -248,15 +271,15 @@ def test_consumers_do_not_hear_each_other() -> None:
 # --- workers that die, hang or fail -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("blame", [None, "a worker was ended by SIGSEGV over it"])
-def test_work_of_a_dead_worker_is_done_by_another_once(blame: str | None) -> None:
+@pytest.mark.parametrize("cause", list(Cause))
+def test_work_of_a_dead_worker_is_done_by_another_once(cause: Cause) -> None:
     at = peers()
     at.join(b"w1")
     at.hello()
     at.want(0, 1, 2)
     at.begin(b"w1")
     at.join(b"w2")
-    held = at.die(b"w1", blame)
+    held = at.die(b"w1", cause)
     assert [lease.indices for lease in held] == [(0,), (1,)]
     at.worker_says(b"w1", Result(held[0].lease, 0, 0.1), *sample_frames(0, 0))
     at.work_off(b"w2")
@@ -305,54 +328,6 @@ def test_returned_work_keeps_its_order() -> None:
     at.die(b"w1")
     at.join(b"w2", credit=4)
     assert [lease.indices[0] for lease in at.leases[b"w2"]] == [0, 1, 2, 3]
-
-
-def test_a_crash_blames_only_the_begun_sample_and_two_move_it_on() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
-    candidates = []
-    for death in range(MOST_BLAMED_DEATHS):
-        worker = b"w%d" % death
-        at.join(worker)
-        candidates.append(at.begin(worker).candidate)
-        at.die(worker, "a worker was ended by SIGSEGV over it")
-    assert candidates == [0] * MOST_BLAMED_DEATHS
-    at.join()
-    first, second = at.leases[b"w"]
-    assert (first.indices, first.candidate, second.indices, second.candidate) == ((0,), 1, (1,), 0)
-    (refusal,) = first.refusals["refusals"]
-    assert refusal["reason"] == "a worker was ended by SIGSEGV over it"
-    assert at.dispatcher.take_refusals() == [Refusal(**refusal)]
-    assert at.dispatcher.take_refusals() == []
-    at.work_off()
-    assert at.samples() == [(0, 0), (0, 1)]
-
-
-def test_deaths_count_for_each_candidate_anew() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
-    for death in range(2 * MOST_BLAMED_DEATHS):
-        worker = b"w%d" % death
-        at.join(worker)
-        assert at.begin(worker).candidate == death // MOST_BLAMED_DEATHS
-        at.die(worker, "crash")
-
-
-@pytest.mark.parametrize("begun", [True, False])
-def test_a_kill_from_outside_never_moves_a_sample_on(begun: bool) -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
-    for death in range(5 * MOST_BLAMED_DEATHS):
-        worker = b"w%d" % death
-        at.join(worker)
-        assert at.leases[worker][0].candidate == 0
-        if begun:
-            at.begin(worker)
-        at.die(worker, None if begun else "a crash before it was begun")
-    assert at.dispatcher.take_refusals() == []
 
 
 def test_goodbye_gives_the_work_to_others_without_blame() -> None:
@@ -471,19 +446,66 @@ def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:
     assert at.samples() == [(0, 0), (0, 1)]
 
 
-def test_a_hang_is_blamed_on_the_begun_sample() -> None:
+def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
     at = peers()
+    at.join(b"w1")
+    at.join(b"w2")
     at.hello()
     at.want(0)
-    for hang in range(MOST_BLAMED_DEATHS):
-        worker = b"w%d" % hang
-        at.join(worker)
-        at.begin(worker)
-        at.tick(DEADLINE + 1)
+    at.begin(b"w1")
+    at.tick(SILENCE_SECONDS)
+    assert at.given_up == []
+    at.tick(0.5)
+    assert at.given_up == [b"w2"]
+    at.tick(0.5)
+    assert (at.given_up, at.dispatcher.workers) == ([b"w2"], 1)
+    assert (at.recorded, at.dispatcher.counters.workers_lost) == ([], 1)
+    # Whoever holds a lease may be silent for as long as that lasts; a word counts, whatever it is.
+    at.finish(b"w1")
+    at.worker_says(b"w1", Ping())
+    at.tick(SILENCE_SECONDS)
+    assert at.given_up == [b"w2"]
+
+
+def test_a_hopeless_worker_is_reported_once_however_long_it_takes_to_end_it() -> None:
+    at = peers()
     at.join()
-    (lease,) = at.leases[b"w"]
-    assert lease.candidate == 1
-    assert f"no answer over one sample for {DEADLINE:g} s" in lease.refusals["refusals"][0]["reason"]
+    at.hello()
+    at.want(0)
+    assert [type(each) for each in at.dispatcher.tick(DEADLINE + 1)] == [GiveUp]
+    assert at.dispatcher.tick(DEADLINE + 2) == []
+    # Meanwhile it gets nothing more to do.
+    at.want(1)
+    assert len(at.leases[b"w"]) == 1
+
+
+def test_a_worker_that_cannot_be_reached_is_counted_once_and_its_work_given_to_others() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0)
+    at.begin(b"w1")
+    at.join(b"w2")
+    for _ in range(3):
+        at.carry_out(at.dispatcher.worker_unreachable(b"w1", 0.0))
+        at.carry_out(at.dispatcher.worker_unreachable(b"never there", 0.0))
+    assert (at.dispatcher.counters.workers_lost, at.dispatcher.workers) == (1, 1)
+    assert at.leases[b"w2"][0].candidate == 0
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0)]
+
+
+def test_a_known_worker_that_comes_back_with_other_numerics_gives_its_work_back() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    at.leases[b"w"].clear()
+    at.worker_says(b"w", WorkerHello("w", "host", 1, NUMERICS_VERSION + 1, 2))
+    assert (at.dispatcher.workers, at.dispatcher.waiting) == (0, 1)
+    at.join(b"w2")
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0)]
 
 
 def test_a_worker_of_other_numerics_is_refused_with_both_numbers() -> None:
@@ -595,21 +617,21 @@ def test_a_sample_of_the_session_before_is_no_answer_to_the_next() -> None:
     assert [(sample.index, sample.provenance) for sample in samples] == [(0, {"seed": 2}), (1, {"seed": 2})]
 
 
-def test_specs_asked_for_once_do_not_stay_for_ever() -> None:
+def test_geometries_asked_for_once_do_not_stay_for_ever() -> None:
     at = peers()
     alive = []
-    for number in range(3 * MOST_SCHEDULES):
-        at.hello(recipe={"gamma": 1.0 + number / 100})
+    for number in range(3 * MOST_TABLES):
+        at.hello(max_sequences_per_video=number + 1)
         session = at.dispatcher.sessions.get(b"c")
         assert session is not None
-        alive.append(weakref.ref(session.schedule))
+        alive.append(weakref.ref(session.schedule._table))
     del session
     gc.collect()
-    assert sum(each() is not None for each in alive) <= MOST_SCHEDULES + 1
+    assert sum(each() is not None for each in alive) == MOST_TABLES
     # The session's own is not lost, whatever others ask for.
-    at.hello(b"other", recipe={"gamma": 1.5})
-    for number in range(2 * MOST_SCHEDULES):
-        at.hello(recipe={"gamma": 2.5 + number / 100})
+    at.hello(b"other", max_sequences_per_video=100)
+    for number in range(2 * MOST_TABLES):
+        at.hello(max_sequences_per_video=200 + number)
     at.join()
     at.want(0, identity=b"other")
     at.work_off()
@@ -715,19 +737,31 @@ def test_absurd_costs_neither_stop_nor_unbalance(cpu_seconds: float) -> None:
     assert 0.0 <= at.dispatcher.counters.worker_cpu_seconds < 1e6
 
 
-def test_a_result_of_another_index_or_without_a_sample_is_not_passed_on() -> None:
+@pytest.mark.parametrize("wrong", ["index", "payload"])
+def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_its_order(wrong: str) -> None:
     at = peers()
     at.join()
     at.hello()
-    at.want(0)
-    lease = at.leases[b"w"].popleft()
-    at.worker_says(b"w", Result(lease.lease, 1, 0.1), *sample_frames(0, 1))
-    lease = at.leases[b"w"].popleft()
-    at.worker_says(b"w", Result(lease.lease, 0, 0.1))
+    at.want(0, 1, 2)
+    lease = at.begin()
+    if wrong == "index":
+        at.worker_says(b"w", Result(lease.lease, 1, 0.1), *sample_frames(0, 1))
+    else:
+        at.worker_says(b"w", Result(lease.lease, 0, 0.1))
     assert at.samples() == []
-    assert at.dispatcher.counters.malformed == 2
-    at.work_off()
-    assert at.samples() == [(0, 0)]
+    counters = at.dispatcher.counters
+    assert (counters.malformed, counters.workers_lost, at.dispatcher.workers) == (1, 1, 0)
+    (reply,) = at.told[b"w"]
+    assert isinstance(reply, Refused)
+    assert reply.code == ErrorCode.MALFORMED
+    # Whatever else it says, nobody knows it any more.
+    at.worker_says(b"w", Result(lease.lease + 1, 1, 0.1), *sample_frames(0, 1))
+    assert at.samples() == []
+    at.join(b"w2", credit=3)
+    assert [(lease.indices[0], lease.candidate) for lease in at.leases[b"w2"]] == [(0, 0), (1, 0), (2, 0)]
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0), (0, 1), (0, 2)]
+    assert at.recorded == []
 
 
 _frames = st.lists(st.binary(max_size=30), max_size=3) | messages.map(encode)
@@ -776,155 +810,13 @@ def test_any_conversation_leaves_it_serving(said: list[tuple[bool, bytes, list[A
     for by_worker, identity, frames, seconds in said:
         speak = at.dispatcher.from_worker if by_worker else at.dispatcher.from_consumer
         for instruction in speak(identity, [*frames, b"payload"] if by_worker else frames, at.now):
+            assert not isinstance(instruction, Record)
             assert instruction.identity in (b"c", b"d", b"w", b"")
         at.tick(seconds)
     for identity in (b"c", b"d", b"w", b""):
         at.consumer_says(identity, Goodbye())
         at.die(identity)
     still_serves(at)
-
-
-# --- any interleaving -------------------------------------------------------------------------------------------------
-
-
-class Interleaving(RuleBasedStateMachine):
-    """Whatever happens in whatever order, once healthy workers are left to finish, every index that a consumer waits
-    for has been answered exactly once."""
-
-    consumers = st.sampled_from((b"c", b"d"))
-    names = st.sampled_from((b"w1", b"w2", b"w3"))
-
-    @initialize()
-    def start(self) -> None:
-        self.at = peers()
-        self.owed: dict[bytes, set[tuple[int, int]]] = {}
-        self.credit: dict[bytes, int] = {}
-        self.read: dict[bytes, int] = {}
-        self.seed: dict[bytes, int] = {}
-        self.dead: list[tuple[bytes, Lease]] = []
-
-    def _listen(self) -> None:
-        """Each consumer takes what it was sent; workers that nobody knows clear their table and say hello again."""
-        for identity, heard in self.at.heard.items():
-            for message in heard[self.read.get(identity, 0) :]:
-                if isinstance(message, SampleHeader | Unavailable):
-                    # The heart of the promise: nothing comes that is not waited for.
-                    self.owed[identity].remove((message.epoch, message.index))
-                    if isinstance(message, SampleHeader):
-                        assert message.provenance == {"seed": self.seed[identity]}
-            self.read[identity] = len(heard)
-        while self.at.given_up:
-            # Half of them could be killed, as local ones are; the others are out of reach, and say something later.
-            identity = self.at.given_up.pop()
-            if identity != b"w3":
-                self.at.leases.pop(identity, None)
-        for identity, told in self.at.told.items():
-            for message in told:
-                if isinstance(message, Refused) and identity in self.at.leases:
-                    assert message.code == ErrorCode.UNKNOWN_SESSION
-                    self.at.join(identity)
-            told.clear()
-
-    @rule(identity=consumers, batch_size=st.integers(1, 4))
-    def connect(self, identity: bytes, batch_size: int) -> None:
-        """Connects, or connects again and asks again for what it still lacks, as far as its new credit goes."""
-        self.seed[identity] = self.seed.get(identity, 0) + 1
-        welcome = self.at.hello(identity, batch_size=batch_size, seed=self.seed[identity])
-        self.credit[identity] = welcome.credit
-        self._listen()
-        lacking = sorted(self.owed.get(identity, ()))[: welcome.credit]
-        self.owed[identity] = set(lacking)
-        for epoch, index in lacking:
-            assert self.at.want(index, identity=identity, epoch=epoch) in ([], self.at.heard[identity][-1:])
-        self._listen()
-
-    @rule(identity=consumers, epoch=st.integers(0, 1), indices=st.lists(st.integers(0, 49), max_size=6))
-    def ask(self, identity: bytes, epoch: int, indices: list[int]) -> None:
-        if identity not in self.owed:
-            return
-        wanted = self.owed[identity] | {(epoch, index) for index in indices}
-        within = len(wanted) <= self.credit[identity]
-        if within:
-            self.owed[identity] = wanted
-        refusals = len(self.at.refusals(identity))
-        self.at.want(*indices, identity=identity, epoch=epoch)
-        assert len(self.at.refusals(identity)) == refusals + (not within)
-        self._listen()
-
-    @rule(identity=names)
-    def join(self, identity: bytes) -> None:
-        self.at.join(identity)
-        self._listen()
-
-    def _busy(self) -> list[bytes]:
-        return sorted(identity for identity, held in self.at.leases.items() if held)
-
-    @precondition(lambda self: self._busy())
-    @rule(which=st.integers(0, 2), what=st.sampled_from(("begin", "finish", "finish", "fail")))
-    def work(self, which: int, what: str) -> None:
-        identity = self._busy()[which % len(self._busy())]
-        if what == "begin":
-            self.at.begin(identity)
-        elif what == "finish":
-            self.at.finish(identity)
-        else:
-            self.at.fail(identity)
-        self._listen()
-
-    @rule(identity=names, blame=st.sampled_from((None, "crash")), began=st.booleans())
-    def die(self, identity: bytes, blame: str | None, began: bool) -> None:
-        if began and self.at.leases.get(identity):
-            self.at.begin(identity)
-        self.dead += [(identity, lease) for lease in self.at.die(identity, blame)]
-        self._listen()
-
-    @precondition(lambda self: self.dead)
-    @rule(failed=st.booleans())
-    def late_answer(self, failed: bool) -> None:
-        identity, lease = self.dead.pop()
-        if failed:
-            self.at.worker_says(identity, JobFailed(lease.lease, None, "late"))
-        else:
-            self.at.worker_says(
-                identity, Result(lease.lease, lease.indices[0], 0.1), *sample_frames(0, lease.indices[0])
-            )
-        self._listen()
-
-    @rule(seconds=st.sampled_from((1.0, DEADLINE / 2, DEADLINE + 1)))
-    def time_passes(self, seconds: float) -> None:
-        for identity in self.owed:
-            self.at.consumer_says(identity, Ping())
-        self.at.tick(seconds)
-        self._listen()
-
-    @invariant()
-    def bounded(self) -> None:
-        at = getattr(self, "at", None)
-        if at is None:
-            return
-        for held in at.leases.values():
-            assert len(held) <= CREDIT
-        for session in at.dispatcher.sessions:
-            assert session.unanswered == self.owed[session.identity]
-            assert len(session.unanswered) <= session.credit
-
-    def teardown(self) -> None:
-        if not hasattr(self, "at"):
-            return
-        for identity in list(self.at.leases):
-            self.at.die(identity)
-            self._listen()
-        self.at.join(b"healthy")
-        while self.at.leases[b"healthy"]:
-            self.at.begin(b"healthy")
-            self.at.finish(b"healthy")
-            self._listen()
-        assert not any(self.owed.values())
-        assert self.at.dispatcher.waiting == 0
-
-
-TestInterleaving = Interleaving.TestCase
-TestInterleaving.settings = settings(max_examples=80, stateful_step_count=40, deadline=None)
 
 
 def test_the_paper_preset_is_served_where_videos_are_long_enough() -> None:

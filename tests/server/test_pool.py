@@ -11,10 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server import pool as pool_module
+from v2v_server.blame import Cause, Loss
 from v2v_server.pool import Death, Pool
 
 SLEEPS = "import time\ntime.sleep(600)"
@@ -52,6 +54,11 @@ def all_dead(pool: Pool) -> None:
     until(lambda: pool.running == 0)
 
 
+def is_loaded(pid: int) -> bool:
+    """Whether the process runs its program: before that it still has the signal handlers of the one it came from."""
+    return b"label-" in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
 def is_gone(pid: int) -> bool:
     """Neither running nor a zombie."""
     try:
@@ -72,8 +79,8 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     pids = pool.pids()
 
     def names() -> list[bytes]:
-        # The last argument; a process has none to show until its program has been loaded.
-        return [Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").split(b"\0")[-1] for pid in pids]
+        # The argument before the logbook's two; a process has none to show until its program has been loaded.
+        return [(b"\0\0\0" + Path(f"/proc/{pid}/cmdline").read_bytes()).split(b"\0")[-4] for pid in pids]
 
     until(lambda: b"" not in names())
     assert names() == [b"label-0.1", b"label-1.1"]
@@ -95,31 +102,53 @@ def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str],
 
 
 @pytest.mark.parametrize(
-    ("number", "blamed"),
+    ("number", "cause", "text"),
     [
-        (signal.SIGKILL, False),
-        (signal.SIGTERM, False),
-        (signal.SIGHUP, False),
-        (signal.SIGSEGV, True),
-        (signal.SIGBUS, True),
-        (signal.SIGABRT, True),
-        (signal.SIGFPE, True),
-        (signal.SIGILL, True),
+        (signal.SIGKILL, Cause.KILLED, "was ended by SIGKILL from outside"),
+        (signal.SIGTERM, Cause.KILLED, "was ended by SIGTERM from outside"),
+        (signal.SIGINT, Cause.KILLED, "was ended by SIGINT from outside"),
+        (signal.SIGHUP, Cause.KILLED, "was ended by SIGHUP from outside"),
+        (signal.SIGSEGV, Cause.CRASHED, "was ended by SIGSEGV"),
+        (signal.SIGBUS, Cause.CRASHED, "was ended by SIGBUS"),
+        (signal.SIGABRT, Cause.CRASHED, "was ended by SIGABRT"),
+        (signal.SIGFPE, Cause.CRASHED, "was ended by SIGFPE"),
+        (signal.SIGILL, Cause.CRASHED, "was ended by SIGILL"),
+        (signal.SIGALRM, Cause.UNEXPLAINED, "was ended by SIGALRM"),
+        (signal.SIGRTMIN + 3, Cause.UNEXPLAINED, f"was ended by signal {signal.SIGRTMIN + 3}"),
     ],
 )
-def test_a_crash_is_blamed_and_a_kill_is_not(
-    start: Callable[[int, str], Pool], number: signal.Signals, blamed: bool
+def test_a_crash_is_told_from_a_kill(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
 ) -> None:
+    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: 5)
     pool = start(1, SLEEPS)
     pool.check(0.0, 0)
+    until(lambda: is_loaded(pool.pids()[0]))
     os.kill(pool.pids()[0], number)
     all_dead(pool)
-    (death,) = pool.check(1.0, 0)
-    assert death.identity == b"label-0.1"
-    assert death.status == f"was ended by {number.name}"
-    assert (death.blame is not None) == blamed
-    if death.blame is not None:
-        assert number.name in death.blame
+    assert pool.check(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
+
+
+def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kills = [7]
+    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: kills[0])
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    causes = []
+    for now, more in ((10.0, 1), (20.0, 0)):
+        kill_one(pool)
+        kills[0] += more
+        (death,) = pool.check(now, 1)
+        causes.append(death.loss.cause)
+        pool.check(now + 5.0, 2)
+    assert causes == [Cause.UNEXPLAINED, Cause.KILLED]
+
+
+def test_the_kernels_count_of_such_kills_is_read() -> None:
+    said = Path("/proc/vmstat").read_text(encoding="ascii")
+    assert f"\noom_kill {pool_module._out_of_memory_kills()}\n" in said
 
 
 @pytest.mark.parametrize("status", [0, 1, 3])
@@ -127,25 +156,23 @@ def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], 
     pool = start(1, f"import sys\nsys.exit({status})")
     pool.check(0.0, 0)
     all_dead(pool)
-    assert pool.check(0.0, 0) == [Death(b"label-0.1", f"exited with status {status}", None)]
-
-
-def test_a_signal_without_a_name(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
-    os.kill(pool.pids()[0], signal.SIGRTMIN + 3)
-    all_dead(pool)
-    (death,) = pool.check(1.0, 0)
-    assert death.status == f"was ended by signal {signal.SIGRTMIN + 3}"
-    assert death.blame is None
+    expected = Loss(Cause.UNEXPLAINED, f"exited with status {status}")
+    assert pool.check(0.0, 0) == [Death(b"label-0.1", expected)]
 
 
 def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
     pool.check(0.0, 0)
     hung, other = pool.pids()
-    pool.give_up(b"label-9.9")
-    pool.give_up(b"label-0.1")
+    assert pool.watches(b"label-0.1")
+    assert pool.give_up(b"label-9.9", "slept") is None
+    assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept")
+    assert [pool.watches(name) for name in (b"label-0.1", b"label-1.1", b"label-9.9", b"")] == [
+        False,
+        True,
+        False,
+        False,
+    ]
     until(lambda: pool.running == 1)
     assert pool.check(0.0, 0) == []
     assert pool.pids() == [other]
@@ -153,9 +180,23 @@ def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Call
     assert pool.running == 2
     assert is_gone(hung)
     # The next life of the slot is a new worker: its death is reported.
+    assert pool.watches(b"label-0.2")
     os.kill(pool.pids()[0], signal.SIGKILL)
     until(lambda: pool.running == 1)
     assert [death.identity for death in pool.check(200.0, 0)] == [b"label-0.2"]
+    assert not pool.watches(b"label-0.2")
+
+
+def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    (pid,) = pool.pids()
+    os.kill(pid, signal.SIGSTOP)
+    until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    loss = pool.give_up(b"label-0.1", "slept")
+    assert loss is not None
+    assert loss.cause is Cause.KILLED
+    all_dead(pool)
 
 
 # --- restarting -------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC, NamedCorpus, corpus, video
+from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from tests.server.peers import peers
 from v2v_protocol.spec import StreamSpec
 from v2v_server.metrics import Counters, Rate
@@ -44,18 +44,20 @@ def test_rejections_name_reason_and_remedy() -> None:
         "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1",
         "  small.mp4: picture 16x5 after rows full, the crop is 8x8; "
         "would admit it: resize_scale up to 1.6, or a smaller crop",
+        "  with --set voxels_per_clip=N (now the longest that fits is 1): 1 admits 1 of them",
     ]
 
 
-def test_many_rejections_are_counted_by_remedy() -> None:
-    shorts: list[VideoEntry] = [video(f"s{number}.mp4", frames=4) for number in range(8)]
-    said = lines(corpus(*shorts, video("tiny.mp4", frames=2), video("good.mp4")))
-    assert said[1] == "9 videos give none under the server's own recipe:"
-    assert len(said) == 2 + 5 + 1
-    assert said[-1] == (
-        "  ... and 4 more; most frequent remedies: voxels_per_clip at most 1 (8); "
-        "fewer bins or frames_per_bin, no lead_voxels (1)"
-    )
+def test_many_rejections_are_counted_and_a_length_of_clip_named_that_admits_them() -> None:
+    lengths = (15, 11, 11, 8, 8, 8, 6)  # SMALL spends two bins of one frame on a voxel grid
+    shorts: list[VideoEntry] = [video(f"s{number}.mp4", frames) for number, frames in enumerate(lengths)]
+    spec = replace(SMALL_SPEC, recipe=replace(SMALL, voxels_per_clip=10))
+    said = lines(corpus(*shorts, video("still.mp4", frames=1), video("good.mp4")), spec)
+    assert said[1] == "8 videos give none under the server's own recipe:"
+    assert said[-2] == "  ... and 3 more"
+    assert len(said) == 2 + 5 + 2
+    # The middle one of those seven has room for three voxel grids, and all of them for two.
+    assert said[-1] == "  with --set voxels_per_clip=N (now the longest that fits is 7): 3 admits 6, 2 admits 7 of them"
 
 
 def test_files_that_cannot_be_used_are_named() -> None:

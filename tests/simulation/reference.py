@@ -42,10 +42,10 @@ def simulate(
     drift = normal.astype(real) * real(hot_sigma)
     counts = np.zeros((steps // frames_per_bin, pixels), real)
     for step in range(steps):
+        residual[position] += drift * real(hot_scale[step])
         change = level[step + 1] - level[step]
         if normals is not None and noise_scale is not None:
             change += normals[step].astype(real) * real(noise_scale[step])
-        change[position] += drift * real(hot_scale[step])
         potential = residual + change
         threshold = np.where(potential >= 0, positive, negative)
         events = np.floor((np.abs(potential) + tolerance) / threshold)

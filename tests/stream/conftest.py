@@ -11,6 +11,7 @@ import pytest
 
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_client import Batch, V2VStreamDataset
+from v2v_client.local_server import LocalServer
 from v2v_protocol.recipe import Recipe
 
 SMALL = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
@@ -38,6 +39,13 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
         luma = panned_luma(frames, 48, 64, step=(1 + number % 2, 1 + number % 3))
         write_clip(folder / name, luma, **options)  # type: ignore[arg-type]
     return folder
+
+
+@pytest.fixture(scope="package")
+def server(clips: Path) -> Iterator[LocalServer]:
+    """A server over these clips for tests that leave it as it is."""
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as running:
+        yield running
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.pixel import simulate_pixels
+from v2v_server.simulation.pixel import pixel_words, simulate_pixels
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
 
 _PRECISIONS: dict[str, type[np.floating[Any]]] = {"float32": np.float32, "float64": np.float64}
@@ -189,7 +189,8 @@ def _simulate_array(
     _check_number("hot_pixel_sigma", hot_pixel_sigma)
     if start_residual is not None and not -threshold_neg <= start_residual <= threshold_pos:
         raise UsageError(
-            f"start_residual = {start_residual!r}: give -threshold_neg .. threshold_pos, {-threshold_neg} .. {threshold_pos}"
+            f"start_residual = {start_residual!r}: give a value from -threshold_neg to threshold_pos, "
+            f"{-threshold_neg} to {threshold_pos}"
         )
     _check_whole("bins", bins, 1, 2**31)
     _check_whole("frames_per_bin", frames_per_bin, 1, 2**31)
@@ -223,7 +224,9 @@ def _run(
     # Noise of independent increments: its variance, not its deviation, grows with time.
     noise_scale = params.noise_sigma * np.sqrt(step_seconds) if params.noise_sigma > 0.0 else np.empty(0)
     hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
-    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels)
+    key = np.array(params.noise_key, np.uint32)
+    place_words = pixel_words(key, np.uint32(noise.HOT_PLACE), pixels) if hot_count else None
+    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels, place_words)
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
     if start_residual is None:
         start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
@@ -233,7 +236,7 @@ def _run(
         np.ascontiguousarray(frames).reshape(len(frames), pixels),
         table,
         source_index,
-        np.array(params.noise_key, np.uint32),
+        key,
         noise_scale.astype(real),
         position,
         normal.astype(real) * real(params.hot_pixel_sigma),

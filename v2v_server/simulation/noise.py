@@ -27,9 +27,9 @@ pair is uniform over 64 bits; x keeps the y of neighbours apart. Then the transf
 
 The smallest u is 2**-31: |normal| reaches 6.56. The logarithm splits u = 2**e (1 + f), 1 + f in [sqrt(1/2), sqrt(2)),
 with ln(1+f) = f P(f), P of degree 5 (relative error 7e-6); sin(pi t) = t S(t^2) and cos(pi t) = C(t^2), both of
-degree 3 (errors 6e-7, 7e-6), give cos(2 pi t) = 1 - 2 sin^2(pi t) and sin(2 pi t) = 2 sin(pi t) cos(pi t). A distribution
-needs no more: the variance is off by less than 1e-5, which 10^10 draws would not show. The coefficients are minimax
-fits by the algorithm of Remez, rounded to binary32.
+degree 3 (errors 6e-7, 7e-6), give cos(2 pi t) = 1 - 2 sin^2(pi t) and sin(2 pi t) = 2 sin(pi t) cos(pi t). The
+coefficients are minimax fits by the algorithm of Remez, rounded to binary32. Noise needs no higher degree: the
+variance is off by less than 2e-5, which 10^9 draws would not show.
 """
 
 from __future__ import annotations
@@ -111,24 +111,27 @@ def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
     bits = value.view(np.int32)
     exponent = (bits - SQRT_HALF_BITS) >> np.int32(23)
     fraction = (bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
-    log = (exponent - np.int32(31)).astype(np.float32) * MINUS_2_LN_2 + fraction * _horner(LOG_COEFFICIENTS, fraction)
-    radius = np.sqrt(log)
+    l0, l1, l2, l3, l4, l5 = LOG_COEFFICIENTS
+    square = fraction * fraction
+    high = (l2 + l3 * fraction) + (l4 + l5 * fraction) * square
+    log = (exponent - np.int32(31)).astype(np.float32) * MINUS_2_LN_2
+    radius = np.sqrt(log + fraction * ((l0 + l1 * fraction) + high * square))
 
     turn = y.view(np.int32).astype(np.float32) * np.float32(2.0**-32)
     square = turn * turn
-    sine = turn * _horner(SIN_COEFFICIENTS, square)
+    sine = turn * _cubic(SIN_COEFFICIENTS, square)
     twice = sine + sine
-    return radius * (np.float32(1) - twice * sine), radius * (twice * _horner(COS_COEFFICIENTS, square))
+    return radius * (np.float32(1) - twice * sine), radius * (twice * _cubic(COS_COEFFICIENTS, square))
 
 
-def standard_normals(key: NoiseKey, steps: int, pixels: int, first_pixel: int = 0) -> Reals:
+def standard_normals(key: NoiseKey, steps: int, pixels: int) -> Reals:
     """The noise of every step, before it is scaled.
 
     Returns:
         [steps, pixels] float32; steps counted from 0 (the step from frame 0 to frame 1), pixels in row order.
     """
     pairs = (steps + 1) // 2
-    place = np.arange(first_pixel, first_pixel + pixels)
+    place = np.arange(pixels)
     radius_words, angle_words = words(key, PIXEL_RADIUS, place), words(key, PIXEL_ANGLE, place)
     pair_radius, pair_angle = words(key, PAIR_RADIUS, np.arange(pairs)), words(key, PAIR_ANGLE, np.arange(pairs))
     normals = np.empty((2 * pairs, pixels), np.float32)
@@ -144,26 +147,29 @@ def start_uniforms(key: NoiseKey, pixels: int) -> Reals:
     return (words(key, START, np.arange(pixels)) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
 
 
-def hot_pixels(key: NoiseKey, count: int, pixels: int) -> tuple[npt.NDArray[np.int64], Reals]:
+def hot_pixels(
+    key: NoiseKey, count: int, pixels: int, place_words: Words | None = None
+) -> tuple[npt.NDArray[np.int64], Reals]:
     """The hot pixels: those of the smallest words, so they are distinct for any count up to all.
 
     Args:
         count: how many, 0 .. pixels.
+        place_words: [pixels], ``words(key, HOT_PLACE, arange(pixels))`` where the caller has a faster way to them.
 
     Returns:
         positions [count] int64, ascending, in row order; their standard normals [count] float32.
     """
     if count == 0:
         return np.empty(0, np.int64), np.empty(0, np.float32)
-    place_words = words(key, HOT_PLACE, np.arange(pixels))
+    if place_words is None:
+        place_words = words(key, HOT_PLACE, np.arange(pixels))
     largest = np.partition(place_words, count - 1)[count - 1]
     position = np.flatnonzero(place_words <= largest).astype(np.int64)
     normal, _ = box_muller(words(key, HOT_RADIUS, position), words(key, HOT_ANGLE, position))
     return position, normal
 
 
-def _horner(coefficients: tuple[np.float32, ...], x: Reals) -> Reals:
-    value = coefficients[-1] * x + coefficients[-2]
-    for coefficient in coefficients[-3::-1]:
-        value = value * x + coefficient
-    return value
+def _cubic(coefficients: tuple[np.float32, ...], x: Reals) -> Reals:
+    # Estrin's scheme, as for the logarithm above: a shorter chain of dependent operations than Horner's.
+    c0, c1, c2, c3 = coefficients
+    return (c0 + c1 * x) + (c2 + c3 * x) * (x * x)

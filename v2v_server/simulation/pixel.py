@@ -1,8 +1,8 @@
 """The fused pixel kernel: frames in, voxels out, one pass.
 
 Pixels are independent, so the loop over time runs inside a loop over blocks of neighbouring pixels whose state stays
-in the first-level cache. Within a step, noise, look-up and threshold are separate short loops over the block, each
-simple enough that the compiler turns it into vector instructions; one loop that did everything would not be.
+in the cache. Within a step, noise, look-up and threshold are separate short loops over the block, each simple enough
+that the compiler turns it into vector instructions; one loop that did everything would not be.
 
 Bit for bit the arithmetic is that of ``noise.py`` and ``voxel.py``: no fast-math, no contraction to fused multiply-add,
 no maths library (square root and floor are exact operations of IEEE 754), explicit 32-bit types throughout. So the
@@ -22,8 +22,8 @@ from numba.extending import intrinsic, overload
 
 from v2v_server.simulation import noise
 
-BLOCK_PX = 512
-"""Pixels of a block. Larger blocks touch each page of frames and voxels less often, and still fit the first-level cache."""
+BLOCK_PX = 1024
+"""Pixels of a block. Fewer would touch each page of frames and voxels more often, more would not stay in the cache."""
 
 _PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
 
@@ -55,6 +55,21 @@ def _bits_of_float(typing_context: Any, value: Any) -> Any:
     return types.int32(types.float32), lambda context, builder, signature, args: builder.bitcast(
         args[0], ir.IntType(32)
     )
+
+
+@intrinsic
+def _use_widest_vectors(typing_context: Any) -> Any:
+    """Lets LLVM use 512-bit vectors in the calling function where the processor has them; ignored elsewhere.
+
+    For some processors LLVM halves them by default, lest a few wide instructions lower the clock of all the others.
+    Here the wide ones are the work. llvmlite knows no attributes with a value, hence ``set.add``.
+    """
+
+    def generate(context, builder, signature, args):
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.none(), generate
 
 
 def _log_intensity(table, value):
@@ -89,54 +104,78 @@ def _word(key, purpose, counter):
     return _scramble(np.uint32(word + key[3]))
 
 
+@numba.njit(nogil=True, cache=True)
+def pixel_words(key, purpose, pixels):
+    """``noise.words(key, purpose, arange(pixels))``: [pixels] uint32."""
+    words = np.empty(pixels, np.uint32)
+    for p in range(pixels):
+        words[p] = _word(key, purpose, p)
+    return words
+
+
 @numba.njit(nogil=True, inline="always")
 def _two_normals(hashed, radius_word, angle_word, normal, scratch):
-    """``noise.mix`` and ``noise.box_muller`` of a block, in loops short enough for the processor to overlap rounds."""
+    """``noise.mix`` and ``noise.box_muller`` of a block.
+
+    Many short loops: a processor overlaps the rounds of a loop only as far as its window of waiting instructions
+    reaches, and a long chain of dependent operations fills that window with a single round.
+    """
     for i in range(BLOCK_PX):
         x = np.uint32(hashed[0, i] ^ radius_word)
         x = np.uint32(x ^ (x >> np.uint32(16)))
         x = np.uint32(x * _M0)
         x = np.uint32(x ^ (x >> np.uint32(15)))
-        x = np.uint32(x * _M1)
+        hashed[2, i] = np.uint32(x * _M1)
+    for i in range(BLOCK_PX):
+        x = hashed[2, i]
         y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(hashed[1, i] ^ angle_word))
         hashed[2, i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
         hashed[3, i] = np.uint32(y * _M2)
     for i in range(BLOCK_PX):
-        bits = _bits_of_float(np.float32(np.int32(hashed[2, i])))
+        bits: Any = _bits_of_float(np.float32(np.int32(hashed[2, i])))  # type: ignore[call-arg]
         exponent = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
         scratch[0, i] = _float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
         scratch[1, i] = np.float32(np.int32(exponent - np.int32(31))) * _MINUS_2_LN_2
     for i in range(BLOCK_PX):
         fraction = scratch[0, i]
-        log = ((((_L5 * fraction + _L4) * fraction + _L3) * fraction + _L2) * fraction + _L1) * fraction + _L0
-        scratch[1, i] = np.sqrt(scratch[1, i] + fraction * log)
+        square = fraction * fraction
+        high = (_L2 + _L3 * fraction) + (_L4 + _L5 * fraction) * square
+        scratch[1, i] = np.sqrt(scratch[1, i] + fraction * ((_L0 + _L1 * fraction) + high * square))
     for i in range(BLOCK_PX):
         turn = np.float32(np.int32(hashed[3, i])) * _TURN
         square = turn * turn
-        sine = turn * (((_A3 * square + _A2) * square + _A1) * square + _A0)
+        fourth = square * square
+        normal[0, i] = turn * ((_A0 + _A1 * square) + (_A2 + _A3 * square) * fourth)
+        normal[1, i] = (_C0 + _C1 * square) + (_C2 + _C3 * square) * fourth
+    for i in range(BLOCK_PX):
+        sine, cosine = normal[0, i], normal[1, i]
         twice = sine + sine
-        cosine = ((_C3 * square + _C2) * square + _C1) * square + _C0
         normal[0, i] = scratch[1, i] * (_ONE - twice * sine)
         normal[1, i] = scratch[1, i] * (twice * cosine)
 
 
-RESIDUAL, LEVEL, REACHED, CHANGE, COUNT = range(5)
-"""Rows of a block's state."""
-
-
-@numba.njit(nogil=True, error_model="numpy", inline="always")
+@numba.njit(nogil=True, inline="always")
 def _look_up(table, row, levels):
     for i in range(len(row)):
         levels[i] = _log_intensity(table, row[i])
 
 
-@numba.njit(nogil=True, error_model="numpy", inline="always")
+@numba.njit(nogil=True, error_model="numpy")
+def _crossed(potential, threshold_pos, threshold_neg, tolerance):
+    """Signed events of a potential, and the residual they leave: the rule of ``voxel.py``."""
+    rising = potential >= tolerance - tolerance
+    threshold = threshold_pos if rising else threshold_neg
+    events = np.floor((abs(potential) + tolerance) / threshold)
+    signed = events if rising else -events
+    return signed, potential - signed * threshold
+
+
+@numba.njit(nogil=True, inline="always")
 def _store(counts, limit, stored):
     saturated = np.int32(0)
     for i in range(len(stored)):
-        clipped = min(max(counts[i], -limit), limit)
-        saturated = np.int32(saturated + np.int32(clipped != counts[i]))
-        stored[i] = clipped
+        saturated = np.int32(saturated + np.int32(abs(counts[i]) > limit))
+        stored[i] = min(max(counts[i], -limit), limit)
     return saturated
 
 
@@ -165,11 +204,12 @@ def simulate_pixels(
     Returns:
         number of bins clipped to the limit.
     """
+    _use_widest_vectors()  # type: ignore[call-arg]
     steps, pixels = len(source_index) - 1, frames.shape[1]
     noisy = len(noise_scale) > 0
     zero = tolerance - tolerance
-    # One array for all state of a block: constant distances between its rows need no check for overlap.
-    state = np.zeros((5, _PITCH), table.dtype)
+    residual, count = np.zeros(BLOCK_PX, table.dtype), np.zeros(BLOCK_PX, table.dtype)
+    levels = np.zeros((2, _PITCH), table.dtype)
     hashed = np.zeros((4, _PITCH), np.uint32)
     scratch = np.zeros((2, _PITCH), np.float32)
     normal = np.zeros((2, _PITCH), np.float32)
@@ -187,45 +227,40 @@ def simulate_pixels(
             next_hot += 1
         for i in range(BLOCK_PX):
             uniform = np.float32(np.int32(_word(key, _START, first + i) >> np.uint32(8))) * _UNIT
-            state[RESIDUAL, i] = uniform * start_span + start_low
+            residual[i] = uniform * start_span + start_low
         if noisy:
             for i in range(BLOCK_PX):
                 hashed[0, i] = _word(key, _PIXEL_RADIUS, first + i)
                 hashed[1, i] = _word(key, _PIXEL_ANGLE, first + i)
-        _look_up(table, frames[source_index[0], first : first + width], state[LEVEL])
+        now = 0
+        _look_up(table, frames[source_index[0], first : first + width], levels[now])
 
         row, due = 0, steps_per_bin
         for step in range(steps):
+            before = now
             if source_index[step + 1] != source_index[step]:
-                _look_up(table, frames[source_index[step + 1], first : first + width], state[REACHED])
-                for i in range(BLOCK_PX):
-                    reached = state[REACHED, i]
-                    state[CHANGE, i] = reached - state[LEVEL, i]
-                    state[LEVEL, i] = reached
-            else:
-                for i in range(BLOCK_PX):
-                    state[CHANGE, i] = zero
+                now = 1 - now
+                _look_up(table, frames[source_index[step + 1], first : first + width], levels[now])
+            for each in range(hot, next_hot):
+                residual[hot_position[each] - first] += hot_drift[each] * hot_scale[step]
             if noisy:
                 pair, odd = step >> 1, step & 1
                 if not odd:
                     _two_normals(hashed, pairs[0, pair], pairs[1, pair], normal, scratch)
                 scale = noise_scale[step]
                 for i in range(BLOCK_PX):
-                    state[CHANGE, i] += normal[odd, i] * scale
-            for each in range(hot, next_hot):
-                state[CHANGE, hot_position[each] - first] += hot_drift[each] * hot_scale[step]
-            for i in range(BLOCK_PX):
-                potential = state[RESIDUAL, i] + state[CHANGE, i]
-                rising = potential >= zero
-                threshold = threshold_pos if rising else threshold_neg
-                events = np.floor((abs(potential) + tolerance) / threshold)
-                signed = events if rising else -events
-                state[RESIDUAL, i] = potential - signed * threshold
-                state[COUNT, i] += signed
+                    change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+                    signed, residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+                    count[i] += signed
+            else:
+                for i in range(BLOCK_PX):
+                    change = levels[now, i] - levels[before, i]
+                    signed, residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+                    count[i] += signed
             due -= 1
             if due == 0:
-                saturated += _store(state[COUNT], limit, voxels[row, first : first + width])
+                saturated += _store(count, limit, voxels[row, first : first + width])
                 for i in range(BLOCK_PX):
-                    state[COUNT, i] = zero
+                    count[i] = zero
                 row, due = row + 1, steps_per_bin
     return saturated

@@ -4,15 +4,19 @@ Steps. Step s (0 .. steps-1) is the change from frame s to frame s+1 of the clip
 counts of the ``frames_per_bin`` consecutive steps that start at ``(t * bins + b) * frames_per_bin``; so voxel t spans
 frames ``t * bins * frames_per_bin`` to ``(t + 1) * bins * frames_per_bin``, its ends included.
 
-Counting. One threshold crossing is decided per step, with d = residual + change of log intensity + noise:
+Counting. One threshold crossing is decided per step, with d = (residual + hot drift) + (change of log intensity +
+noise), in this order:
 
     count    = floor((|d| + tolerance) / c)        c = threshold_pos where d >= 0, else threshold_neg
     residual = d - sign(d) * c * count
     V(bin)  += sign(d) * count
 
-``tolerance`` is the paper's rule made well defined: log intensities are known to float32 (2**-22 log units where
-|L| > 4) and the threshold itself is a float32, so whether an exact multiple of c has been "reached" would otherwise
-be decided by rounding. See :func:`rounding_tolerance`.
+``tolerance`` makes the paper's plain floor well defined in float32. Log intensities are known to half a unit in the
+last place (2**-22 where |L| > 4), and every step rounds a residual of the size of c; without a tolerance, whether an
+exact multiple of c has been reached is decided by these roundings. :func:`rounding_tolerance` has a part for each.
+With it every exact ramp tried counts exactly: 1 to 100 thresholds of 0.05 to 2, over 5 to 200 steps, anywhere between
+black and white; half of it misses 2 % of them. It moves an event by a step where a change misses its threshold by
+less: against the plain floor in float64 up to 60 bins in a million at c = 0.05 on natural clips, up to 3 at c >= 1.
 
 Dtypes. A sum is made in floating point (exact up to 2**24) and stored in int8 clipped to -127 .. 127, in int16 clipped
 to -32767 .. 32767, or in float32 as it is. Clipped bins are counted, never wrapped.
@@ -35,9 +39,10 @@ LARGEST_COUNT = {"int8": 127.0, "int16": 32767.0, "float32": np.inf}
 def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
     """The change, log units, by which a threshold may be missed and still counts as reached.
 
-    2**-20, or a sixteenth of the smaller threshold where that is less.
+    With c the smaller threshold: 2**-21, or c * 2**-19 where that is more; never more than c / 16.
     """
-    return min(2.0**-20, min(threshold_pos, threshold_neg) * 2.0**-4)
+    smaller = min(threshold_pos, threshold_neg)
+    return min(max(2.0**-21, smaller * 2.0**-19), smaller * 2.0**-4)
 
 
 def voxel_array(voxels: int, bins: int, height: int, width: int, dtype: str) -> npt.NDArray[Any]:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, VideoChanged
-from v2v_server.video.index import FrameIndex
+from v2v_server.video.index import FrameIndex, unseekable
 from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.video.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.rows import Rows
 from v2v_server.video.store import Record, Store
 from v2v_server.video.survey import survey
@@ -67,6 +68,9 @@ class Catalogue:
         problems: what could not be taken in, by id.
         notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
+        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.video.prepare`). Its videos
+            are those of its source in number, order, id and frames, so that every position means the same frames;
+            one without a sound prepared file is refused when it is opened, like a damaged one.
     """
 
     root: Path
@@ -75,8 +79,10 @@ class Catalogue:
     problems: tuple[Problem, ...]
     notes: tuple[str, ...]
     digest: str
+    prepared: Header | None
     _store: Store = field(repr=False, compare=False)
     _fingerprints: dict[str, str] = field(repr=False, compare=False)
+    _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
 
     def path(self, id: str) -> Path:
         """Where the video lies.
@@ -95,6 +101,9 @@ class Catalogue:
             VideoChanged: another process has catalogued a changed file under this id since.
         """
         fingerprint = self._fingerprint(id)
+        if id in self._absent:
+            video = self._absent[id]
+            return unseekable(video.frames, (1, 1), video.height_px, video.width_px)
         try:
             data = self._store.frame_index(id, fingerprint)
         except sqlite3.Error as error:
@@ -137,13 +146,20 @@ def open_catalogue(
         CorpusError: there is no such folder or list, it makes no sense, or not one video of it can be used.
     """
     root, listed = _wanted(Path(source), list_file)
+    manifest = find_manifest(root)
     refused: dict[str, str] = {}
-    ids = tuple(video_files(root, refused)) if listed is None else tuple(entry.id for entry in listed)
+    if manifest is not None:
+        manifest.check_served(rows)
+        rows = None
+        ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
+    else:
+        ids = tuple(video_files(root, refused)) if listed is None else tuple(entry.id for entry in listed)
+        refuse_prepared_below(root, ids)
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
-    store, records, notes = _up_to_date(root, ids, _index_path(root, cache_dir), processes, progress)
+    store, records, notes = _up_to_date(root, ids, index_path(root, cache_dir), processes, progress)
     try:
-        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store)
+        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest)
     except BaseException:
         store.close()
         raise
@@ -165,7 +181,8 @@ def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Pat
     return folder, (ListEntry(source.name),)
 
 
-def _index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+    """The index file of a corpus; ``cache_dir`` as in :func:`open_catalogue`."""
     if cache_dir is not None:
         folder = Path(cache_dir)
     elif chosen := os.environ.get("V2V_CACHE_DIR"):
@@ -237,13 +254,19 @@ def _snapshot(
     refused: dict[str, str],
     notes: list[str],
     store: Store,
+    manifest: Manifest | None,
 ) -> Catalogue:
     by_id = {entry.id: entry for entry in listed}
     problems = dict(refused)
     videos = []
     shorter = []
+    absent: dict[str, PreparedVideo] = {}
     for id in sorted(records):
         record, entry = records[id], by_id.get(id, ListEntry(id))
+        if manifest is not None:
+            if not manifest.describes(record):
+                absent[id] = manifest.videos[id]
+            record = manifest.as_source(record)
         if record.problem is not None:
             problems[id] = record.problem
             continue
@@ -252,6 +275,11 @@ def _snapshot(
             shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
     if not videos:
         raise CorpusError(f"{root}: none of {len(problems)} videos can be used{_told(problems)}")
+    if absent:
+        if len(absent) == len(videos):
+            raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
+        reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
+        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{_told(reasons)}"]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     return Catalogue(
@@ -261,8 +289,10 @@ def _snapshot(
         problems=tuple(Problem(id, problems[id]) for id in sorted(problems)),
         notes=tuple(notes),
         digest=_digest(rows, videos),
+        prepared=None if manifest is None else manifest.header,
         _store=store,
         _fingerprints={video.id: video.fingerprint for video in videos},
+        _absent=absent,
     )
 
 

@@ -1,0 +1,65 @@
+"""Puts a fault into real server workers: on the PYTHONPATH of a server, this is run by every Python it starts.
+
+``V2V_FAULT`` is JSON: {"stage": decode | simulate | send, "action": a signal's name, "exit", "memory" or "hang",
+"video": only at this video (any when missing), "once": a file that is created by the one worker that does it}.
+Nothing in the product knows of this.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+
+def _is_worker() -> bool:
+    arguments = Path("/proc/self/cmdline").read_bytes().split(b"\0")
+    return b"v2v_server.cli" in arguments and b"worker" in arguments
+
+
+def _act(fault: dict, video: str) -> None:
+    if fault.get("video", video) != video:
+        return
+    if "once" in fault:
+        try:
+            os.close(os.open(fault["once"], os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            return
+    action = fault["action"]
+    if action == "exit":
+        os._exit(3)
+    if action == "memory":
+        raise MemoryError("injected")
+    if action == "hang":
+        threading.Event().wait()
+    os.kill(os.getpid(), getattr(signal, action))
+
+
+def _install(fault: dict) -> None:
+    from v2v_server import produce, worker
+
+    at = {"video": ""}
+    make_sample, decode_luma, simulate_clip = worker.make_sample, produce.decode_luma, produce.simulate_clip
+    encode_sample = worker.encode_sample
+
+    def making(lease, *rest):
+        at["video"] = lease.video
+        return make_sample(lease, *rest)
+
+    def before(stage, function):
+        def call(*arguments, **named):
+            if fault["stage"] == stage:
+                _act(fault, at["video"])
+            return function(*arguments, **named)
+
+        return call
+
+    worker.make_sample = making
+    produce.decode_luma = before("decode", decode_luma)
+    produce.simulate_clip = before("simulate", simulate_clip)
+    worker.encode_sample = before("send", encode_sample)
+
+
+if "V2V_FAULT" in os.environ and sys.platform.startswith("linux") and _is_worker():
+    _install(json.loads(os.environ["V2V_FAULT"]))

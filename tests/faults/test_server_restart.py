@@ -1,0 +1,109 @@
+"""The server is killed under a client that iterates; another one may come up at the same address."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from v2v_client import ServerLost, StateMismatch, V2VStreamDataset
+from v2v_client.liveness import Patience
+from v2v_client.local_server import LocalServer
+
+pytestmark = pytest.mark.timeout(120)
+
+BATCHES_BEFORE = 2
+QUICK = Patience(ping_seconds=0.2, rewant_seconds=1.0)
+
+
+@contextmanager
+def iterating(address: str, timeout_seconds: float = 60.0) -> Iterator[tuple[Future[list[str]], threading.Event]]:
+    """A client that has taken two of eight batches of an epoch and goes on when told; its digests, when it is done."""
+    taken, go_on = threading.Event(), threading.Event()
+
+    def consume() -> list[str]:
+        found = []
+        stream = V2VStreamDataset(
+            address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=timeout_seconds, patience=QUICK
+        )
+        try:
+            for batch in stream:
+                found.append(digest(batch))
+                if len(found) == BATCHES_BEFORE:
+                    taken.set()
+                    go_on.wait()
+        finally:
+            taken.set()
+        return found
+
+    with ThreadPoolExecutor(1) as thread:
+        running = thread.submit(consume)
+        try:
+            taken.wait()
+            yield running, go_on
+        finally:
+            go_on.set()
+
+
+def kill(server: LocalServer) -> None:
+    os.kill(server.pid, signal.SIGKILL)
+
+
+def same_address(address: str) -> tuple[str, ...]:
+    return (*SMALL_FLAGS, "--bind", address)
+
+
+def test_the_client_goes_on_with_a_restarted_server(clips: Path) -> None:
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as first:
+        address = first.address
+        expected = [digest(batch) for batch in epoch_of(address)]
+        with iterating(address) as (client, go_on):
+            kill(first)
+            go_on.set()  # it waits for samples while nobody is there
+            with LocalServer(clips, workers=2, flags=same_address(address)):
+                assert client.result() == expected
+    assert len(expected) > 2 * BATCHES_BEFORE
+
+
+def test_a_server_restarted_over_other_videos_is_refused_naming_both(clips: Path, tmp_path: Path) -> None:
+    videos = tmp_path / "videos"
+    shutil.copytree(clips, videos)
+    with LocalServer(videos, workers=1, flags=SMALL_FLAGS) as first:
+        address = first.address
+        before = _catalogue(address)
+        with iterating(address) as (client, go_on):
+            kill(first)
+            go_on.set()
+            write_clip(videos / "one_more.mp4", panned_luma(64, 48, 64))
+            with LocalServer(videos, workers=1, flags=same_address(address)):
+                after = _catalogue(address)
+                assert before != after
+                expected = rf"catalogue_digest: this dataset has {before}, {address} has {after}; serve the folder"
+                with pytest.raises(StateMismatch, match=expected):
+                    client.result()
+
+
+def test_a_server_that_is_gone_for_good_is_given_up_naming_the_last_sample(clips: Path) -> None:
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        address = server.address
+        with iterating(address, timeout_seconds=1.5) as (client, go_on):
+            kill(server)
+            go_on.set()
+            expected = rf"{address}: nothing heard for \d+ s; last sample: epoch 0, index \d+; start v2v-serve there"
+            with pytest.raises(ServerLost, match=expected):
+                client.result()
+
+
+def _catalogue(address: str) -> str:
+    stream = V2VStreamDataset(address, recipe=SMALL, batch_size=1)
+    next(iter(stream))
+    return str(stream.describe()["catalogue_digest"])

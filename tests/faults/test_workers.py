@@ -1,0 +1,175 @@
+"""Workers that die, hang or run out of memory at every stage of their work, for real."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from v2v_client import Batch, V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import ServerLost
+from v2v_protocol.spec import StreamSpec
+from v2v_server.quarantine import read_quarantine
+from v2v_server.remake import remake
+from v2v_server.video.catalogue import open_catalogue
+
+INJECT = Path(__file__).parent / "inject"
+STAGES = ("decode", "simulate", "send")
+
+
+@contextmanager
+def _faulty(monkeypatch: pytest.MonkeyPatch, videos: Path, *flags: str, **fault: Any) -> Iterator[LocalServer]:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(INJECT), os.environ.get("PYTHONPATH")))))
+    monkeypatch.setenv("V2V_FAULT", json.dumps(fault))
+    with LocalServer(videos, workers=2, flags=[*SMALL_FLAGS, *flags]) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def reference(clips: Path) -> list[str]:
+    """Digests of an undisturbed epoch."""
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        return [digest(batch) for batch in epoch_of(server.address)]
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """A quarantine of the test's own."""
+    return tmp_path / "cache"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("action", ["SIGKILL", "exit", "memory"])
+def test_a_death_without_blame_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, reference: list[str], stage: str, action: str
+) -> None:
+    once = tmp_path / "done"
+    with _faulty(monkeypatch, clips, stage=stage, action=action, once=str(once)) as server:
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+    assert once.exists()
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stopped_worker_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, reference: list[str], stage: str
+) -> None:
+    fault = {"stage": stage, "action": "SIGSTOP", "once": str(tmp_path / "done")}
+    with _faulty(monkeypatch, clips, "--lease-deadline-seconds", "2", **fault) as server:
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+    assert (tmp_path / "done").exists()
+
+
+@pytest.mark.parametrize(
+    ("stage", "action"), [("decode", "SIGSEGV"), ("simulate", "SIGABRT"), ("send", "SIGBUS"), ("decode", "hang")]
+)
+def test_a_crash_moves_its_own_index_only_and_is_written_down(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, cache: Path, stage: str, action: str
+) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        undisturbed = {index: row for batch in epoch_of(server.address) for index, row in _rows(batch)}
+    fault = {"stage": stage, "action": action, "once": str(tmp_path / "done")}
+    flags = ("--cache-dir", str(cache), "--lease-deadline-seconds", "3")
+    with _faulty(monkeypatch, clips, *flags, **fault) as server:
+        batches = epoch_of(server.address)
+    disturbed = {index: row for batch in batches for index, row in _rows(batch)}
+    moved = [item for batch in batches for item in batch.provenance if item.refusals]
+    assert len(moved) == 1
+    assert moved[0].candidate == 1
+    assert moved[0].quarantine == 1
+    assert {index for index in undisturbed if undisturbed[index] != disturbed[index]} == {moved[0].id.index}
+    (line,) = (json.loads(text) for text in next(cache.glob("quarantine-*.jsonl")).read_text().splitlines())
+    assert (line["snapshot"], line["path"]) == (1, moved[0].refusals[0].video)
+    assert line["reason"] in moved[0].refusals[0].reason
+
+    catalogue = open_catalogue(clips, cache_dir=cache)
+    try:
+        held = read_quarantine(next(cache.glob("quarantine-*.jsonl")))
+        again = remake(
+            catalogue, StreamSpec(recipe=SMALL), seed=3, epoch=0, index=moved[0].id.index, quarantine=held, snapshot=1
+        )
+        assert again.arrays["voxels"].tobytes() == disturbed[moved[0].id.index][0]
+        assert again.provenance.candidate == 1
+    finally:
+        catalogue.close()
+
+
+def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path) -> None:
+    poison = "deep/c.mp4"
+    fault = {"stage": "decode", "action": "SIGSEGV", "video": poison}
+    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:
+        first = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+        said = server.last_lines()
+    assert "quarantine" in said
+    videos = {item.video for batch in first for item in batch.provenance}
+    assert poison not in videos
+    verdicts = [json.loads(text) for text in next(cache.glob("quarantine-*.jsonl")).read_text().splitlines()]
+    assert {line["path"] for line in verdicts} == {poison}
+    # Both workers may have been at it when the second verdict fell; after that nobody touches it.
+    assert 2 <= len(verdicts) <= 4
+
+    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:
+        pids = {worker.pid for worker in server_workers(server.pid)}
+        again = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+        assert {worker.pid for worker in server_workers(server.pid)} == pids
+    assert {item.quarantine for batch in again for item in batch.provenance} == {len(verdicts)}
+
+
+def test_killing_workers_from_outside_never_refuses_a_video(clips: Path, reference: list[str]) -> None:
+    got = []
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        for batch in V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3):
+            got.append(digest(batch))
+            for worker in server_workers(server.pid):
+                os.kill(worker.pid, signal.SIGKILL)
+    assert got == reference
+
+
+def test_workers_that_always_die_end_in_one_clear_error(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path
+) -> None:
+    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), stage="decode", action="exit") as server:
+        process = psutil.Process(server.pid)
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=30)
+        with pytest.raises(ServerLost):
+            list(dataset)
+        assert not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+        assert "died in a row without finishing a sample" in server.last_lines()
+
+
+@pytest.mark.parametrize("change", ["gone", "shrunk", "garbage"])
+def test_a_video_that_changes_after_it_was_catalogued_is_passed_over(tmp_path: Path, change: str) -> None:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    for number in range(4):
+        write_clip(folder / f"clip{number}.mp4", panned_luma(64, step=(1, 1 + number)), gop=16)
+    victim = folder / "clip2.mp4"
+    with LocalServer(folder, workers=2, flags=SMALL_FLAGS) as server:
+        if change == "gone":
+            victim.unlink()
+        elif change == "shrunk":
+            os.truncate(victim, victim.stat().st_size // 2)
+        else:
+            victim.write_bytes(os.urandom(victim.stat().st_size))
+        batches = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, batch_size=2)]
+    refused = {refusal.video for batch in batches for item in batch.provenance for refusal in item.refusals}
+    assert refused == {"clip2.mp4"}
+    assert {item.video for batch in batches for item in batch.provenance} == {"clip0.mp4", "clip1.mp4", "clip3.mp4"}
+    assert len(batches) == 12
+
+
+def _rows(batch: Batch) -> list[tuple[int, tuple[bytes, bytes]]]:
+    arrays = batch.arrays
+    return [
+        (index, (arrays["voxels"][row].numpy().tobytes(), arrays["frames"][row].numpy().tobytes()))
+        for row, index in enumerate(batch.indices)
+    ]

@@ -1,0 +1,83 @@
+"""A short run of the fuzzer of `benchmarks/fuzz.py`, and the proof that it would notice."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import fuzz
+from benchmarks.fuzz_frames import MESSAGE_TYPES, FrameFuzzer
+from tests.clips import panned_luma, write_clip
+from v2v_protocol.errors import ProtocolError
+from v2v_protocol.wire import decode, decode_sample
+
+
+def test_twenty_thousand_frames() -> None:
+    record = fuzz.fuzz_decoder(20_000, seed=1)
+    assert record["failures"] == []
+    assert fuzz.gave_way(record) == []
+    assert min(record["messages"], record["samples"], record["refused"]) > 200
+
+
+def test_the_frames_follow_from_the_seed() -> None:
+    one, same, other = (FrameFuzzer(random.Random(seed)) for seed in (5, 5, 6))
+    frames = [one.header() for _ in range(100)]
+    assert frames == [same.header() for _ in range(100)]
+    assert frames != [other.header() for _ in range(100)]
+
+
+def test_every_type_of_message_is_reached_whole_and_damaged() -> None:
+    fuzzer = FrameFuzzer(random.Random(3))
+    assert {type(decode(fuzzer.true())) for _ in range(500)} == set(MESSAGE_TYPES)
+    for form in (fuzzer.noise, fuzzer.bomb, fuzzer.damaged, fuzzer.replaced):
+        refused = 0
+        for _ in range(300):
+            try:
+                decode(form())
+            except ProtocolError:
+                refused += 1
+        assert refused > 100
+
+
+def test_samples_fit_sometimes_and_miss_in_many_ways() -> None:
+    fuzzer = FrameFuzzer(random.Random(4))
+    said: Counter[str] = Counter()
+    for _ in range(3000):
+        try:
+            decode_sample(*fuzzer.sample())
+            said["fits"] += 1
+        except ProtocolError as error:
+            said[" ".join(word for word in str(error).split() if word.isalpha())] += 1
+    assert said["fits"] > 100
+    assert len(said) >= 8
+
+
+@pytest.mark.parametrize("wrong", [ValueError("boom"), RecursionError(), "not a message"])
+def test_a_decoder_that_gives_way_is_noticed(monkeypatch: pytest.MonkeyPatch, wrong: object) -> None:
+    def broken(header: bytes) -> Any:
+        if header[:1] == b"\xdf":
+            if isinstance(wrong, Exception):
+                raise wrong
+            return wrong
+        return decode(header)
+
+    monkeypatch.setattr(fuzz, "decode", broken)
+    record = fuzz.fuzz_decoder(2000, seed=1)
+    assert record["failures"]
+    assert fuzz.gave_way(record)
+
+
+@pytest.mark.slow
+def test_a_live_server_under_attack(tmp_path: Path) -> None:
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    for number in range(4):
+        # Wide and long enough for the paper's recipe as well.
+        write_clip(clips / f"{number}.mp4", panned_luma(201, 128, 160, step=(1, 1 + number)), gop=12)
+    record = fuzz.fuzz_live(clips, 4000, 1, tmp_path / "run", remakes=50)
+    assert fuzz.gave_way(record) == []
+    assert record["healthy_batches_under_attack"] > 0

@@ -1,0 +1,109 @@
+"""The broker carries instructions out in their order, and reports back what it alone can know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import pytest
+
+from v2v_protocol.messages import Pong, Stop
+from v2v_protocol.wire import encode
+from v2v_server.blame import Cause, Loss
+from v2v_server.broker import Broker
+from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.leases import Task
+from v2v_server.quarantine import Verdict
+
+VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
+RECORD = Record(VERDICT, Task(b"c", 0, 0))
+HUNG = Loss(Cause.HUNG, "slept")
+
+
+class Scripted:
+    """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
+
+    def __init__(self, first: Sequence[Instruction], after_record: Sequence[Instruction] = ()) -> None:
+        self.first: list[Instruction] = list(first)
+        self.after_record = after_record
+        self.told: list[tuple[Any, ...]] = []
+
+    def tick(self, now: float) -> list[Instruction]:
+        said, self.first = self.first, []
+        return said
+
+    def recorded(self, record: Record, written: list[Verdict], now: float) -> list[Instruction]:
+        self.told.append(("recorded", record, written))
+        return list(self.after_record)
+
+    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+        self.told.append(("lost", identity, loss))
+        return []
+
+    def worker_unreachable(self, identity: bytes, now: float) -> list[Instruction]:
+        self.told.append(("unreachable", identity))
+        return []
+
+    def consumer_lost(self, identity: bytes) -> None:
+        self.told.append(("consumer lost", identity))
+
+
+def carried(dispatcher: Scripted, watched: frozenset[bytes] = frozenset()) -> list[tuple[Any, ...]]:
+    """What the dispatcher was told, and what was written, in order."""
+    broker = Broker("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+
+    def record(instruction: Record) -> list[Verdict]:
+        dispatcher.told.append(("written", instruction.verdict))
+        return [instruction.verdict]
+
+    def give_up(instruction: GiveUp) -> Loss:
+        return HUNG
+
+    ticks: list[float] = []
+
+    def every_tick(now: float) -> list[Instruction]:
+        ticks.append(now)
+        return []
+
+    try:
+        broker.run(
+            cast(Dispatcher, dispatcher),
+            give_up=give_up,
+            record=record,
+            watched=watched.__contains__,
+            every_tick=every_tick,
+            stopping=lambda: bool(ticks),
+        )
+    finally:
+        broker.close()
+    return dispatcher.told
+
+
+def test_a_record_is_written_and_reported_before_what_follows() -> None:
+    gone = ToConsumer(b"gone", encode(Pong()))
+    told = carried(Scripted([RECORD, gone], after_record=[ToConsumer(b"first", encode(Pong()))]))
+    assert told == [
+        ("written", VERDICT),
+        ("recorded", RECORD, [VERDICT]),
+        ("consumer lost", b"first"),
+        ("consumer lost", b"gone"),
+    ]
+
+
+def test_a_worker_given_up_is_reported_with_what_its_loss_means() -> None:
+    assert carried(Scripted([GiveUp(b"w", "slept")])) == [("lost", b"w", HUNG)]
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool) -> None:
+    """How a process of ours ended says whether the sample is to blame; that it is not there any more does not."""
+    told = carried(Scripted([ToWorker(b"w", encode(Stop()))]), frozenset({b"w"} if watched else ()))
+    assert told == ([] if watched else [("unreachable", b"w")])
+
+
+def test_a_farewell_to_nobody_is_no_error() -> None:
+    broker = Broker("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    try:
+        broker.say_farewell([ToWorker(b"w", encode(Stop())), ToConsumer(b"c", encode(Pong()))])
+    finally:
+        broker.close()

@@ -1,0 +1,189 @@
+"""Draws: in range, keyed by identity, independent of each other, stable."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_server.simulation.draw import admits, draw, resized_size, smallest_scale
+
+PAPER = Recipe()
+
+
+def drawn(recipe: Recipe = PAPER, count: int = 1, *, video_id: str = "a.mp4", **place: int) -> list[SampleParams]:
+    fixed: Any = {"seed": 1, "epoch": 0, "picture_height_px": 180, "picture_width_px": 596} | place
+    return [draw(recipe, index=index, video_id=video_id, **fixed) for index in range(count)]
+
+
+@pytest.fixture(scope="module")
+def many() -> list[SampleParams]:
+    return drawn(count=1500)
+
+
+def test_ranges_and_float32_thresholds(many: list[SampleParams]) -> None:
+    for params in many:
+        small, large = sorted((params.threshold_pos, params.threshold_neg))
+        assert np.float32(0.05) <= small <= 2
+        assert 1 - 1e-6 <= large / small <= 1.5 + 1e-6
+        assert params.threshold_pos == float(np.float32(params.threshold_pos))
+        assert 0 <= params.noise_sigma <= 0.1
+        assert 0 <= params.hot_pixel_count <= 16
+        assert 0 <= params.hot_pixel_sigma <= 10
+        assert (params.scale, params.contrast) == (1.0, 0.0)
+        assert 0 <= params.crop_top_px <= 52
+        assert 0 <= params.crop_left_px <= 468
+        assert all(0 <= word < 2**32 for word in params.noise_key)
+
+
+def test_uniform_moments_and_coins(many: list[SampleParams]) -> None:
+    n = len(many)
+    small = np.array([min(p.threshold_pos, p.threshold_neg) for p in many])
+    assert abs(small.mean() - 1.025) < 4 * 1.95 / math.sqrt(12 * n)
+    for chance in ([p.flip for p in many], [p.threshold_pos > p.threshold_neg for p in many]):
+        assert abs(np.mean(chance) - 0.5) < 4 * 0.5 / math.sqrt(n)
+    assert {p.crop_top_px for p in many} == set(range(53))
+    assert abs(np.mean([p.crop_left_px for p in many]) - 234) < 4 * 469 / math.sqrt(12 * n)
+
+
+def test_draws_of_a_sample_are_uncorrelated(many: list[SampleParams]) -> None:
+    columns = np.array(
+        [
+            (min(p.threshold_pos, p.threshold_neg), p.noise_sigma, p.hot_pixel_count, p.hot_pixel_sigma, p.crop_top_px,
+             p.crop_left_px, p.flip, sum(length for _, length in p.pauses), p.noise_key[0])
+            for p in many
+        ]
+    )  # fmt: skip
+    matrix = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(matrix).max() < 4.5 / math.sqrt(len(many))
+    successive = [np.corrcoef(column[1:], column[:-1])[0, 1] for column in columns.T]
+    assert np.abs(successive).max() < 4.5 / math.sqrt(len(many))
+
+
+def test_pauses_are_the_stated_markov_chain(many: list[SampleParams]) -> None:
+    starts, stays, running, paused = np.zeros(4, int)
+    for params in many:
+        state = np.zeros(PAPER.steps + 1, bool)
+        for first, length in params.pauses:
+            assert first >= 1
+            state[first : first + length] = True
+        before, after = state[:-1], state[1:]
+        starts += np.count_nonzero(~before & after)
+        stays += np.count_nonzero(before & after)
+        running += np.count_nonzero(~before)
+        paused += np.count_nonzero(before)
+    for hits, tries, p in ((starts, running, 0.0102), (stays, paused, 0.9791)):
+        assert abs(hits - tries * p) < 4 * math.sqrt(tries * p * (1 - p))
+
+
+@pytest.mark.parametrize(("start", "stay", "expected"), [(1.0, 1.0, ((1, 200),)), (0.0, 1.0, ()), (1.0, 0.0, None)])
+def test_extreme_pauses(start: Any, stay: Any, expected: Any) -> None:
+    [params] = drawn(Recipe(pause_probability=start, pause_stay_probability=stay))
+    assert params.pauses == (expected if expected is not None else tuple((k, 1) for k in range(1, 201, 2)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    height=st.integers(1, 3000),
+    width=st.integers(1, 3000),
+    crop=st.tuples(st.integers(1, 400), st.integers(1, 400)),
+    scale=st.tuples(st.floats(0.05, 4), st.floats(0.05, 4)).map(sorted),
+    index=st.integers(0, 2**48 - 1),
+    seed=st.integers(0, 2**64 - 1),
+    epoch=st.integers(0, 2**32 - 1),
+)
+def test_the_crop_lies_in_the_resized_picture_or_is_refused(
+    height: Any, width: Any, crop: Any, scale: Any, index: Any, seed: Any, epoch: Any
+) -> None:
+    recipe = Recipe(crop_height_px=crop[0], crop_width_px=crop[1], resize_scale=tuple(scale), voxels_per_clip=1, bins=1)
+    place = {"picture_height_px": height, "picture_width_px": width}
+    if not admits(recipe, height, width):
+        with pytest.raises(UsageError, match=rf"{width}x{height}.*resize_scale"):
+            draw(recipe, seed=seed, epoch=epoch, index=index, video_id="v", **place)
+        return
+    params = draw(recipe, seed=seed, epoch=epoch, index=index, video_id="v", **place)
+    resized_height, resized_width = resized_size(height, width, params.scale)
+    assert max(scale[0], smallest_scale(recipe, height, width)) <= params.scale <= scale[1]
+    assert 0 <= params.crop_top_px <= resized_height - crop[0]
+    assert 0 <= params.crop_left_px <= resized_width - crop[1]
+    assert params == draw(recipe, seed=seed, epoch=epoch, index=index, video_id="v", **place)
+
+
+def test_seed_epoch_and_index_each_change_the_draw() -> None:
+    base: Any = {"seed": 5, "epoch": 6, "index": 7, "picture_height_px": 180, "picture_width_px": 596, "video_id": "v"}
+    keys = {draw(PAPER, **(base | change)).noise_key for change in ({}, {"seed": 6}, {"epoch": 7}, {"index": 8})}
+    assert len(keys) == 4
+
+
+def test_a_setting_of_one_purpose_leaves_the_others_alone() -> None:
+    [paper] = drawn()
+    [other] = drawn(Recipe(pause_probability=0.0, noise_sigma=(0.0, 0.0), contrast_probability=1.0))
+    assert other.contrast > 0
+    for name in (
+        "threshold_pos",
+        "threshold_neg",
+        "hot_pixel_count",
+        "crop_top_px",
+        "crop_left_px",
+        "flip",
+        "noise_key",
+    ):
+        assert getattr(paper, name) == getattr(other, name)
+
+
+def test_thresholds_of_a_video_are_for_ever() -> None:
+    recipe = Recipe(threshold_source="video")
+    pairs = {(p.threshold_pos, p.threshold_neg) for p in drawn(recipe, 20) + drawn(recipe, 20, seed=9, epoch=3)}
+    assert len(pairs) == 1
+    [other] = drawn(recipe, video_id="b.mp4")
+    assert (other.threshold_pos, other.threshold_neg) not in pairs
+    listed = draw(
+        recipe, seed=0, epoch=0, index=0, picture_height_px=180, picture_width_px=596, video_id="a.mp4",
+        video_thresholds=(0.1, 0.3),
+    )  # fmt: skip
+    assert (listed.threshold_pos, listed.threshold_neg) == (float(np.float32(0.1)), float(np.float32(0.3)))
+
+
+def test_noise_in_units_of_the_threshold() -> None:
+    [plain], [scaled] = drawn(), drawn(Recipe(noise_scales_with_threshold=True))
+    assert scaled.noise_sigma == plain.noise_sigma * plain.threshold_pos
+
+
+def test_hot_pixel_share_rounds_half_up() -> None:
+    for share, count in ((0.5 / 16384, 1), (0.49 / 16384, 0), (1.0, 16384), (0.0, 0)):
+        assert drawn(Recipe(hot_pixel_share=(share, share)))[0].hot_pixel_count == count
+
+
+def test_golden_draw() -> None:
+    assert drawn(Recipe(contrast_probability=1.0, resize_scale=(1.0, 1.3)), seed=2**64 - 1)[0] == GOLDEN
+
+
+GOLDEN = SampleParams(
+    threshold_pos=1.925635576248169,
+    threshold_neg=1.7480026483535767,
+    noise_sigma=0.01592524406129514,
+    hot_pixel_count=16,
+    hot_pixel_sigma=1.3925211487045008,
+    pauses=((4, 14), (47, 61)),
+    scale=1.140676810939945,
+    crop_top_px=21,
+    crop_left_px=171,
+    flip=True,
+    contrast=2.032568600900057,
+    noise_key=(149919779, 3166137466, 252835541, 2296307179),
+)
+
+
+def test_draw_needs_no_compiler() -> None:
+    code = "import sys, v2v_server.simulation.draw; print(sorted({'numba', 'cv2', 'av', 'torch'} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout.strip() == "[]"

@@ -1,0 +1,132 @@
+"""The noise is standard normal, and nothing in it knows of anything else."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from v2v_server.simulation import noise
+
+KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
+
+
+@pytest.fixture(scope="module")
+def normals() -> np.ndarray:
+    """[200, 51200]: 10.24 million draws."""
+    return noise.standard_normals(KEY, 200, 51_200)
+
+
+def test_mean_variance_and_shape(normals: np.ndarray) -> None:
+    z, n = normals.astype(np.float64), normals.size
+    assert abs(z.mean()) < 4 / math.sqrt(n)
+    assert abs(z.var() - 1) < 4 * math.sqrt(2 / n)
+    assert abs((z**3).mean()) < 4 * math.sqrt(15 / n)
+    assert abs((z**4).mean() - 3) < 4 * math.sqrt(96 / n)
+
+
+@pytest.mark.parametrize("sigmas", [0.5, 1.0, 2.0, 3.0, 4.0, 4.5])
+def test_tails(normals: np.ndarray, sigmas: Any) -> None:
+    expected = math.erfc(sigmas / math.sqrt(2)) * normals.size
+    assert abs(np.count_nonzero(np.abs(normals) > sigmas) - expected) < 4 * math.sqrt(expected)
+
+
+def test_tails_reach_beyond_five_sigma(normals: np.ndarray) -> None:
+    # 5.9 expected, 0.3 % chance of none.
+    assert 1 <= np.count_nonzero(np.abs(normals) > 5) <= 16
+
+
+def test_the_largest_radius_is_that_of_the_smallest_word() -> None:
+    cosine, sine = noise.box_muller(np.array([0, 1, 2**31 - 1], np.uint32), np.zeros(3, np.uint32))
+    np.testing.assert_allclose(cosine[:2], math.sqrt(62 * math.log(2)), rtol=1e-5)
+    assert 0 <= cosine[2] < 1e-4
+    np.testing.assert_allclose(sine, 0, atol=1e-6)
+
+
+def test_box_muller_agrees_with_the_textbook() -> None:
+    words = np.random.default_rng(0).integers(0, 2**32, (2, 100_000), dtype=np.uint32)
+    cosine, sine = noise.box_muller(words[0], words[1])
+    radius = np.sqrt(-2 * np.log(((words[0] & 0x7FFFFFFF) | 1) / 2.0**31))
+    angle = 2 * np.pi * words[1].view(np.int32) / 2.0**32
+    np.testing.assert_allclose(cosine, radius * np.cos(angle), atol=1e-4)
+    np.testing.assert_allclose(sine, radius * np.sin(angle), atol=1e-4)
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """In units of its sampling error."""
+    return float((a.astype(np.float64) * b).mean() * math.sqrt(a.size))
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 64, 128, 512, 1024])
+def test_neighbouring_pixels_are_independent(normals: np.ndarray, pixels: Any) -> None:
+    a, b = normals[:, :-pixels], normals[:, pixels:]
+    assert abs(correlation(a, b)) < 4.5
+    assert abs(correlation(a**2 - 1, (b**2 - 1) / 2)) < 4.5
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 8, 64])
+def test_neighbouring_steps_are_independent(normals: np.ndarray, steps: Any) -> None:
+    a, b = normals[:-steps], normals[steps:]
+    assert abs(correlation(a, b)) < 4.5
+    assert abs(correlation(a**2 - 1, (b**2 - 1) / 2)) < 4.5
+
+
+@pytest.mark.parametrize("word", range(4))
+@pytest.mark.parametrize("bit", [0, 1, 16, 31])
+def test_keys_that_differ_in_one_bit_are_independent(normals: np.ndarray, word: Any, bit: Any) -> None:
+    other = list(KEY)
+    other[word] ^= 1 << bit
+    near = noise.standard_normals((other[0], other[1], other[2], other[3]), 40, 25_000)
+    ours = normals[:40, :25_000]
+    assert abs(correlation(ours, near)) < 4.5
+    assert abs(correlation(ours**2 - 1, (near**2 - 1) / 2)) < 4.5
+    assert abs(correlation(ours[:, 1:], near[:, :-1])) < 4.5
+    assert abs(correlation(ours[2:], near[:-2])) < 4.5
+
+
+def test_four_corners_of_pixel_and_pair_are_independent(normals: np.ndarray) -> None:
+    # The words of pixel and pair meet by exclusive or: corners of a rectangle xor to zero before they are mixed.
+    for squares in (normals, normals.astype(np.float64) ** 2 - 1):
+        corner = squares[0:98:2, :25_000] * squares[100:198:2, :25_000]
+        product = corner * (squares[0:98:2, 25_000:50_000] * squares[100:198:2, 25_000:50_000])
+        assert abs(product.mean()) < 5 * product.std() / math.sqrt(product.size)
+
+
+def test_zero_and_tiny_keys_are_as_good_as_any() -> None:
+    for key in ((0, 0, 0, 0), (1, 0, 0, 0), (0, 0, 0, 1)):
+        z = noise.standard_normals(key, 40, 25_000).astype(np.float64)
+        assert abs(z.mean()) < 4.5 / math.sqrt(z.size)
+        assert abs(z.var() - 1) < 4.5 * math.sqrt(2 / z.size)
+        assert np.abs(np.asarray(np.corrcoef(z))[np.triu_indices(40, 1)]).max() < 5 / math.sqrt(25_000)
+
+
+def test_words_of_one_purpose_are_distinct_and_purposes_differ() -> None:
+    place = np.arange(200_000)
+    assert len(np.unique(noise.words(KEY, noise.START, place))) == len(place)
+    agreeing = noise.words(KEY, noise.PIXEL_RADIUS, place) == noise.words(KEY, noise.PIXEL_ANGLE, place)
+    assert np.count_nonzero(agreeing) <= 2
+
+
+def test_start_uniforms_are_uniform() -> None:
+    u = noise.start_uniforms(KEY, 200_000)
+    assert u.min() >= 0
+    assert u.max() < 1
+    counts = np.histogram(u, 50, (0, 1))[0]
+    assert ((counts - 4000) ** 2 / 4000).sum() < 49 + 5 * math.sqrt(98)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 500, 999, 1000])
+def test_hot_pixels_are_distinct_for_every_count(count: Any) -> None:
+    position, normal = noise.hot_pixels(KEY, count, 1000)
+    assert len(position) == len(normal) == count
+    assert (np.diff(position) > 0).all()
+    assert count == 0 or (position[0] >= 0 and position[-1] < 1000)
+
+
+def test_hot_pixels_fall_everywhere_alike() -> None:
+    hits = np.zeros(100)
+    for seed in range(2000):
+        hits[noise.hot_pixels((seed, 0, 0, 0), 5, 100)[0]] += 1
+    assert ((hits - 100) ** 2 / 95).sum() < 99 + 5 * math.sqrt(198)

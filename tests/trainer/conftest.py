@@ -1,0 +1,28 @@
+"""Shared by the tests of the trainer: one thread, and the published weights where they are at hand."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+WEIGHTS = Path(os.environ.get("V2V_TEST_WEIGHTS", Path(__file__).parents[3] / "shared" / "data" / "weights"))
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def published() -> Path:
+    """The folder of published weight files: ``$V2V_TEST_WEIGHTS``, or ``../shared/data/weights``."""
+    if not WEIGHTS.is_dir():
+        pytest.skip(f"no folder {WEIGHTS}: set V2V_TEST_WEIGHTS to one with the published weight files")
+    return WEIGHTS

@@ -1,0 +1,176 @@
+"""Preparing again: after nothing, after changes, after kill -9 at any moment."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.video.test_prepare import opened, psnr_db, run, whole
+from tests.video.test_prepare_isolate import children
+from v2v_protocol.errors import CorpusError
+from v2v_server.prepare_cli import main
+from v2v_server.video.encode import Encoding
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.video.probe import probe
+from v2v_server.video.transcode import PARTIAL_SUFFIX
+
+_KILLED_SECONDS = 60.0
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    (tmp_path / "source" / "sub").mkdir(parents=True)
+    for number in range(4):
+        write_clip(tmp_path / "source" / f"{number}.mp4", panned_luma(24, step=(1, number)))
+    write_clip(tmp_path / "source" / "sub" / "4.mp4", panned_luma(30))
+    return tmp_path / "source"
+
+
+@pytest.fixture(autouse=True)
+def _no_process_left() -> Iterator[None]:
+    yield
+    assert not psutil.wait_procs(children(), timeout=10)[1]
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.stat().st_ino for path in folder.rglob("*.mp4")}
+
+
+def test_a_second_run_keeps_everything(source: Path, tmp_path: Path) -> None:
+    first = run(source, tmp_path / "out")
+    before = inodes(tmp_path / "out")
+    second = run(source, tmp_path / "out")
+    assert (first.kept, second.kept) == (0, 5)
+    assert second.videos == first.videos
+    assert inodes(tmp_path / "out") == before
+
+
+def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    before = inodes(out)
+    write_clip(source / "0.mp4", panned_luma(18))  # the source changed
+    (out / "1.mp4").write_bytes(b"damaged")
+    (out / "2.mp4").unlink()
+    (source / "3.mp4").unlink()
+    write_clip(source / "new.mp4", panned_luma(20))
+    report = run(source, out)
+    assert report.kept == 1
+    assert [video.id for video in report.prepared] == ["0.mp4", "1.mp4", "2.mp4", "new.mp4", "sub/4.mp4"]
+    assert inodes(out)["sub/4.mp4"] == before["sub/4.mp4"]
+    assert [video.frames for video in opened(out).videos] == [18, 24, 24, 20, 30]  # and 3.mp4 is none of it
+
+
+def test_a_failed_one_is_tried_again(source: Path, tmp_path: Path) -> None:
+    sound = (source / "0.mp4").read_bytes()
+    broken = bytearray(sound)
+    middle = len(broken) // 2
+    broken[middle : middle + 400] = bytes(400)
+    (source / "0.mp4").write_bytes(broken)
+    assert [video.id for video in run(source, tmp_path / "out").failed] == ["0.mp4"]
+    assert [video.id for video in run(source, tmp_path / "out").failed] == ["0.mp4"]
+    (source / "0.mp4").write_bytes(sound)
+    report = run(source, tmp_path / "out")
+    assert (report.kept, report.complete) == (4, True)
+
+
+def test_several_processes_make_the_same_files(source: Path, tmp_path: Path) -> None:
+    settings = Encoding("mpeg4", 2, 12)  # whose encoder gives the same bytes every time
+    alone = run(source, tmp_path / "alone", settings)
+    steps: list[tuple[int, int]] = []
+    together = run(source, tmp_path / "together", settings, processes=2, progress=lambda *step: steps.append(step))
+    assert together.videos == alone.videos
+    assert steps[0] == (0, 126)
+    assert steps[-1] == (126, 126)
+    assert sorted(steps) == steps
+
+
+@pytest.mark.parametrize("turn", [0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in (1, 2, 3))])
+def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> None:
+    """Killed in the middle of a file, once a random number of others are done; again; and then finished."""
+    out, rng = tmp_path / "out", random.Random(turn)
+    command = [sys.executable, "-m", "v2v_server.prepare_cli", str(source), str(out), "--gop", "12", "--workers", "2"]
+    environment = os.environ | {"V2V_CACHE_DIR": str(tmp_path / "cache")}
+    for _ in range(1 + turn % 2):
+        seen, limit = set(inodes(out).values()) if out.exists() else set(), time.monotonic() + _KILLED_SECONDS
+        wanted = rng.randrange(3)
+        victim = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while victim.poll() is None and time.monotonic() < limit:
+            there = list(out.rglob("*")) if out.exists() else []
+            fresh = {p.stat().st_ino for p in there if p.suffix == ".mp4"} - seen
+            if len(fresh) >= wanted and any(path.name.endswith(PARTIAL_SUFFIX) for path in there):
+                break
+        below = psutil.Process(victim.pid).children(recursive=True) if victim.poll() is None else []
+        victim.send_signal(signal.SIGKILL)
+        victim.wait()
+        psutil.wait_procs(below, timeout=_KILLED_SECONDS)
+        if victim.returncode == -signal.SIGKILL:
+            records = read_manifest(out).videos
+            assert all(fingerprint(out / id) == record.fingerprint for id, record in records.items())
+    last = run(source, out)
+    assert last.complete
+    assert not list(out.rglob(f"*{PARTIAL_SUFFIX}"))
+    # Whole and right, whoever made them; x264's very bytes may differ from run to run.
+    for video in last.videos:
+        assert fingerprint(out / video.id) == video.fingerprint
+        assert psnr_db(whole(out / video.id), whole(source / video.id)) == pytest.approx(video.psnr_db)
+        assert probe(out / video.id).frames == probe(source / video.id).frames
+
+
+def test_an_unfinished_line_counts_as_not_written(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    manifest = (out / MANIFEST_NAME).read_bytes()
+    (out / MANIFEST_NAME).write_bytes(manifest[:-25])
+    with pytest.raises(CorpusError, match="4 of 5 videos; run v2v-prepare again"):
+        opened(out)
+    assert run(source, out).kept == 4
+    assert len(opened(out).videos) == 5
+
+
+def test_command_line(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "cache"))
+    out = tmp_path / "out"
+    settings = ["--rows", "top:0.54", "--codec", "mpeg4", "--quality", "2", "--gop", "6", "--workers", "1"]
+    main([str(source), str(out), *settings, "--json", str(tmp_path / "report.json")])
+    told = capsys.readouterr().out
+    assert "5 of 5 videos prepared as mpeg4 quality 2 gop 6 (0 of them earlier)" in told
+    assert " MB -> " in told
+    assert (tmp_path / "report.json").read_text().count("psnr_db") == 10
+    (tmp_path / "list.txt").write_text("0.mp4 24 0.3 0.3\nsub/4.mp4\n")
+    main([str(source), str(tmp_path / "two"), "--list", str(tmp_path / "list.txt"), "--workers", "1"])
+    assert "2 of 2 videos prepared as h264" in capsys.readouterr().out
+    for arguments, status, message in (
+        ([str(source), str(out), *settings, "--floor", "99"], 1, "below the floor of 99 dB"),
+        ([str(source), str(source / "in")], 2, "in one another"),
+        ([str(source), str(out), "--quality", "99"], 2, "quality 99"),
+        ([str(source), str(out), "--workers", "0"], 2, "--workers 0"),
+        ([str(tmp_path / "none"), str(out)], 2, "no such folder"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == status
+        shown = capsys.readouterr()
+        assert message in shown.out + shown.err
+    shutil.copy(source / "0.mp4", source / "5.mp4")
+    (source / "6.mp4").write_bytes(b"no video")
+    with pytest.raises(SystemExit) as ended:
+        main([str(source), str(out), *settings])
+    assert ended.value.code == 1
+    shown = capsys.readouterr().out
+    assert "6 of 6 videos prepared" in shown
+    assert "1 cannot be used at all:\n  6.mp4: " in shown

@@ -1,0 +1,138 @@
+"""Checkpoints of a training run: everything that decides its next losses, and nothing that needs code to be read.
+
+A checkpoint holds tensors and plain values only, so it loads with ``weights_only=True``: state dicts of the network,
+the optimiser and the scheduler (never the objects), the state of the random generators, the position in the stream
+after the last batch that was trained on (``Batch.resume_state``), the counters and the configuration.
+
+Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from trainer.unpickle import read_torch_file
+from v2v_protocol.errors import UsageError
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One moment of a training run, between two steps.
+
+    Attributes:
+        step: optimiser steps taken so far, over all epochs.
+        epoch: the epoch that the next batch belongs to.
+        model: state dict of the network itself (unwrapped: not of DistributedDataParallel).
+        optimizer: its state dict.
+        scheduler: its state dict, or None without one.
+        ema: state dict of the averaged network, or None without one.
+        rng: of :func:`capture_rng`.
+        stream: ``resume_state`` of the last batch trained on; None before the first.
+        config: the run's configuration as plain values.
+    """
+
+    step: int
+    epoch: int
+    model: Mapping[str, Tensor]
+    optimizer: Mapping[str, Any]
+    scheduler: Mapping[str, Any] | None
+    ema: Mapping[str, Tensor] | None
+    rng: Mapping[str, Any]
+    stream: Mapping[str, Any] | None
+    config: Mapping[str, Any]
+
+
+def capture_rng() -> dict[str, Any]:
+    """State of PyTorch's generators, on the CPU and on every GPU that this process sees."""
+    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return {"torch": torch.get_rng_state(), "cuda": cuda}
+
+
+def restore_rng(state: Mapping[str, Any]) -> None:
+    """Set the generators back to what :func:`capture_rng` saw.
+
+    Raises:
+        UsageError: the state is of another number of GPUs; drop "cuda" from it to go on with fresh ones.
+    """
+    cuda = state["cuda"]
+    devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if cuda and len(cuda) != devices:
+        raise UsageError(
+            f"the checkpoint has random states of {len(cuda)} GPUs, this process sees {devices}: the run cannot be "
+            "continued bit for bit here"
+        )
+    torch.set_rng_state(state["torch"])
+    if cuda:
+        torch.cuda.set_rng_state_all(cuda)
+
+
+def _plain(value: Any, place: str) -> Any:
+    """``value`` with every mapping as a dict, checked to be readable without code.
+
+    Raises:
+        UsageError: something else than a tensor or a plain value, and where it is.
+    """
+    if isinstance(value, Mapping):
+        return {key: _plain(item, f"{place}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        items = [_plain(item, f"{place}[{index}]") for index, item in enumerate(value)]
+        return tuple(items) if isinstance(value, tuple) else items
+    if value is None or type(value) in (str, int, float, bool, bytes) or isinstance(value, Tensor):
+        return value
+    raise UsageError(f"checkpoint {place} is a {type(value).__name__}: only tensors and plain values are kept")
+
+
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint, replacing ``path`` only once all of it is on the disk.
+
+    Raises:
+        UsageError: a part of it is neither tensor nor plain.
+        OSError: the disk refused; ``path`` is as it was.
+    """
+    path = Path(path)
+    content = {"format": FORMAT}
+    for item in dataclasses.fields(checkpoint):
+        content[item.name] = _plain(getattr(checkpoint, item.name), item.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with temporary.open("wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    # The rename is an entry of the folder: without this it can be lost although the file is not.
+    with contextlib.suppress(PermissionError):  # Windows opens no folders
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read what :func:`save_checkpoint` wrote, with all tensors on the CPU.
+
+    Raises:
+        UsageError: no such file, damaged, not a checkpoint of a training run, or of a newer release.
+    """
+    content = read_torch_file(path, plain=True)
+    names = [item.name for item in dataclasses.fields(Checkpoint)]
+    if not isinstance(content, dict) or not {"format", *names} <= content.keys():
+        raise UsageError(f"{path} is no checkpoint of a training run (for weights alone use load_weights)")
+    if content["format"] != FORMAT:
+        raise UsageError(f"{path} has checkpoint format {content['format']}, this release reads {FORMAT}")
+    return Checkpoint(**{name: content[name] for name in names})

@@ -1,0 +1,321 @@
+"""RAFT, small and large (Teed and Deng, "RAFT: Recurrent All-Pairs Field Transforms for Optical Flow", ECCV 2020).
+
+Both encoders make features at an eighth of the picture's size. The correlation of every pixel of one picture with every
+pixel of the other is kept as a pyramid; a recurrent unit looks it up around where the current flow points and corrects
+the flow, twelve times. Parameters carry torchvision's names, so that its weight files load as they are; those of the
+authors' repository are renamed by :func:`torchvision_names`.
+
+    size   features  context       correlation radius   recurrent unit            upsampling
+    small  128       96 + 64       3                    3 x 3                     bilinear
+    large  256       128 + 128     4                    1 x 5, then 5 x 1         learned convex combination
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+DOWNSCALE = 8
+LEVELS = 4
+SMALLEST_SIDE_PX = DOWNSCALE * 2**LEVELS
+"""The coarsest correlation needs two pixels a side."""
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Widths of one variant, channels."""
+
+    features: tuple[int, int, int, int, int]
+    context: int
+    hidden: int
+    bottleneck: bool
+    radius: int
+    correlation: tuple[int, ...]
+    motion: tuple[int, int]
+    motion_out: int
+    kernels: tuple[tuple[int, int], ...]
+    head: int
+    learned_upsampling: bool
+
+
+SIZES = {
+    "small": Size(
+        features=(32, 32, 64, 96, 128), context=160, hidden=96, bottleneck=True, radius=3, correlation=(96,),
+        motion=(64, 32), motion_out=82, kernels=((3, 3),), head=128, learned_upsampling=False,
+    ),
+    "large": Size(
+        features=(64, 64, 96, 128, 256), context=256, hidden=128, bottleneck=False, radius=4, correlation=(256, 192),
+        motion=(128, 64), motion_out=128, kernels=((1, 5), (5, 1)), head=256, learned_upsampling=True,
+    ),
+}  # fmt: skip
+
+
+def _convolution(
+    inputs: int, outputs: int, kernel: int, stride: int = 1, norm: str = "", relu: bool = True
+) -> nn.Sequential:
+    layers: list[nn.Module] = [nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2)]
+    if norm == "instance":
+        layers.append(nn.InstanceNorm2d(outputs))
+    elif norm == "batch":
+        layers.append(nn.BatchNorm2d(outputs))
+    if relu:
+        layers.append(nn.ReLU())
+    return nn.Sequential(*layers)
+
+
+class _Block(nn.Module):
+    """Residual block: two 3 x 3 convolutions, or (bottleneck) 1 x 1, 3 x 3, 1 x 1 over a quarter of the channels."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, norm: str, bottleneck: bool) -> None:
+        super().__init__()
+        if bottleneck:
+            self.convnormrelu1 = _convolution(inputs, outputs // 4, 1, norm=norm)
+            self.convnormrelu2 = _convolution(outputs // 4, outputs // 4, 3, stride, norm)
+            self.convnormrelu3: nn.Module = _convolution(outputs // 4, outputs, 1, norm=norm)
+        else:
+            self.convnormrelu1 = _convolution(inputs, outputs, 3, stride, norm)
+            self.convnormrelu2 = _convolution(outputs, outputs, 3, norm=norm)
+            self.convnormrelu3 = nn.Identity()
+        self.downsample: nn.Module = nn.Identity()
+        if stride > 1:
+            self.downsample = _convolution(inputs, outputs, 1, stride, norm, relu=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.convnormrelu3(self.convnormrelu2(self.convnormrelu1(x)))
+        return functional.relu(self.downsample(x) + y)
+
+
+class _Encoder(nn.Module):
+    """[N, 3, H, W] -> [N, outputs, H / 8, W / 8]."""
+
+    def __init__(self, size: Size, outputs: int, norm: str) -> None:
+        super().__init__()
+        first, *rest, _ = size.features
+        self.convnormrelu = _convolution(3, first, 7, 2, norm)
+        for number, (inputs, width, stride) in enumerate(zip(size.features, rest, (1, 2, 2), strict=False), start=1):
+            blocks = nn.Sequential(
+                _Block(inputs, width, stride, norm, size.bottleneck), _Block(width, width, 1, norm, size.bottleneck)
+            )
+            self.add_module(f"layer{number}", blocks)
+        self.conv = nn.Conv2d(rest[-1], outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.children():
+            x = layer(x)
+        return x
+
+
+class _MotionEncoder(nn.Module):
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        self.convcorr1 = _convolution(LEVELS * (2 * size.radius + 1) ** 2, size.correlation[0], 1)
+        self.convcorr2 = _convolution(*size.correlation, 3) if len(size.correlation) == 2 else nn.Identity()
+        self.convflow1 = _convolution(2, size.motion[0], 7)
+        self.convflow2 = _convolution(*size.motion, 3)
+        self.conv = _convolution(size.correlation[-1] + size.motion[-1], size.motion_out - 2, 3)
+
+    def forward(self, flow: Tensor, correlation: Tensor) -> Tensor:
+        both = torch.cat([self.convcorr2(self.convcorr1(correlation)), self.convflow2(self.convflow1(flow))], dim=1)
+        return torch.cat([self.conv(both), flow], dim=1)
+
+
+class _ConvGRU(nn.Module):
+    def __init__(self, inputs: int, hidden: int, kernel: tuple[int, int]) -> None:
+        super().__init__()
+        padding = (kernel[0] // 2, kernel[1] // 2)
+        self.convz = nn.Conv2d(hidden + inputs, hidden, kernel, padding=padding)
+        self.convr = nn.Conv2d(hidden + inputs, hidden, kernel, padding=padding)
+        self.convq = nn.Conv2d(hidden + inputs, hidden, kernel, padding=padding)
+
+    def forward(self, hidden: Tensor, x: Tensor) -> Tensor:
+        both = torch.cat([hidden, x], dim=1)
+        update, reset = torch.sigmoid(self.convz(both)), torch.sigmoid(self.convr(both))
+        candidate = torch.tanh(self.convq(torch.cat([reset * hidden, x], dim=1)))
+        return (1 - update) * hidden + update * candidate
+
+
+class _RecurrentBlock(nn.Module):
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__()
+        for number, kernel in enumerate(size.kernels, start=1):
+            self.add_module(f"convgru{number}", _ConvGRU(inputs, size.hidden, kernel))
+
+    def forward(self, hidden: Tensor, x: Tensor) -> Tensor:
+        for unit in self.children():
+            hidden = unit(hidden, x)
+        return hidden
+
+
+class _FlowHead(nn.Module):
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(size.hidden, size.head, 3, padding=1)
+        self.conv2 = nn.Conv2d(size.head, 2, 3, padding=1)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        correction: Tensor = self.conv2(functional.relu(self.conv1(hidden)))
+        return correction
+
+
+class _UpdateBlock(nn.Module):
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        self.motion_encoder = _MotionEncoder(size)
+        self.recurrent_block = _RecurrentBlock(size.motion_out + size.context - size.hidden, size)
+        self.flow_head = _FlowHead(size)
+
+    def forward(self, hidden: Tensor, context: Tensor, correlation: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
+        hidden = self.recurrent_block(hidden, torch.cat([context, self.motion_encoder(flow, correlation)], dim=1))
+        return hidden, self.flow_head(hidden)
+
+
+class _MaskPredictor(nn.Module):
+    """Weights of the 3 x 3 neighbours of each of the 8 x 8 pixels that one coarse pixel becomes."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.convrelu = _convolution(hidden, 256, 3)
+        self.conv = nn.Conv2d(256, 9 * DOWNSCALE**2, 1)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        # A quarter, to balance gradients in training; the weights were trained with it.
+        weights: Tensor = 0.25 * self.conv(self.convrelu(hidden))
+        return weights
+
+
+class RAFT(nn.Module):
+    """The network.
+
+    Args:
+        size: "small" (990,162 parameters) or "large" (5,257,536).
+    """
+
+    def __init__(self, size: str) -> None:
+        super().__init__()
+        self.size = SIZES[size]
+        self.feature_encoder = _Encoder(self.size, self.size.features[-1], "instance")
+        self.context_encoder = _Encoder(self.size, self.size.context, "batch" if size == "large" else "")
+        self.update_block = _UpdateBlock(self.size)
+        self.mask_predictor = _MaskPredictor(self.size.hidden) if self.size.learned_upsampling else None
+
+    def forward(self, first: Tensor, second: Tensor, updates: int = 12) -> Tensor:
+        """Flow from ``first`` to ``second``.
+
+        Args:
+            first, second: [N, 3, H, W] in -1 .. 1; H and W multiples of 8, at least 128.
+            updates: corrections of the flow.
+
+        Returns:
+            [N, 2, H, W] float32, (x, y), px: after the last correction.
+        """
+        features = self.feature_encoder(torch.cat([first, second])).float()
+        pyramid = correlation_pyramid(*features.chunk(2))
+        hidden, context = self.context_encoder(first).split([self.size.hidden, self.size.context - self.size.hidden], 1)
+        hidden, context = torch.tanh(hidden), functional.relu(context)
+        start = _grid(len(first), features.shape[2], features.shape[3], features.device)
+        flow = torch.zeros_like(start)
+        for _ in range(updates):
+            correlation = look_up(pyramid, start + flow, self.size.radius)
+            hidden, correction = self.update_block(hidden, context, correlation, flow)
+            flow = flow + correction.float()
+        if self.mask_predictor is None:
+            shape = [DOWNSCALE * side for side in flow.shape[2:]]
+            return DOWNSCALE * functional.interpolate(flow, shape, mode="bilinear", align_corners=True)
+        return _convex_upsampling(flow, self.mask_predictor(hidden).float())
+
+
+def correlation_pyramid(first: Tensor, second: Tensor) -> list[Tensor]:
+    """Correlation of all pixels with all, the second picture's averaged over 1, 2, 4 and 8 pixels.
+
+    Args:
+        first, second: [N, C, h, w] features.
+
+    Returns:
+        LEVELS tensors [N h w, 1, h / 2^l, w / 2^l].
+    """
+    count, channels, height, width = first.shape
+    # Sums of up to 256 products: too many for the eight bits of bfloat16.
+    with torch.autocast(first.device.type, enabled=False):
+        product = torch.matmul(first.flatten(2).transpose(1, 2), second.flatten(2)) / channels**0.5
+    pyramid = [product.reshape(count * height * width, 1, height, width)]
+    for _ in range(LEVELS - 1):
+        pyramid.append(functional.avg_pool2d(pyramid[-1], 2))
+    return pyramid
+
+
+def look_up(pyramid: list[Tensor], centre: Tensor, radius: int) -> Tensor:
+    """Correlations around a position of the second picture for each pixel of the first, bilinear, zero outside.
+
+    Args:
+        pyramid: of :func:`correlation_pyramid`.
+        centre: [N, 2, h, w] (x, y), pixels of the finest level.
+        radius: neighbours in each direction, pixels of each level.
+
+    Returns:
+        [N, LEVELS (2 radius + 1)^2, h, w]. As in the published networks the offset that varies faster is that in y.
+    """
+    count, _, height, width = centre.shape
+    steps = torch.arange(-radius, radius + 1, dtype=centre.dtype, device=centre.device)
+    offsets = torch.stack(torch.meshgrid(steps, steps, indexing="ij"), dim=-1)
+    centre = centre.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2)
+    found = []
+    for level, plane in enumerate(pyramid):
+        extent = centre.new_tensor([plane.shape[-1] - 1, plane.shape[-2] - 1])
+        where = 2 * (centre / 2**level + offsets) / extent - 1
+        found.append(functional.grid_sample(plane, where, align_corners=True).reshape(count, height, width, -1))
+    return torch.cat(found, dim=-1).permute(0, 3, 1, 2).contiguous()
+
+
+def _grid(count: int, height: int, width: int, device: torch.device) -> Tensor:
+    y, x = torch.meshgrid(torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij")
+    return torch.stack([x, y]).float().expand(count, 2, height, width)
+
+
+def _convex_upsampling(flow: Tensor, weights: Tensor) -> Tensor:
+    """Each fine pixel's flow is a convex combination of its 3 x 3 coarse neighbours (section 3.3 of the paper)."""
+    count, _, height, width = flow.shape
+    share = weights.view(count, 1, 9, DOWNSCALE, DOWNSCALE, height, width).softmax(dim=2)
+    near = functional.unfold(DOWNSCALE * flow, 3, padding=1).view(count, 2, 9, 1, 1, height, width)
+    fine = (share * near).sum(dim=2).permute(0, 1, 4, 2, 5, 3)
+    return fine.reshape(count, 2, DOWNSCALE * height, DOWNSCALE * width)
+
+
+_LONG = {"c": "corr", "f": "flow"}
+_RENAMED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r"^module\.", ""),  # saved from DataParallel
+    (r"^fnet\.", "feature_encoder."),
+    (r"^cnet\.", "context_encoder."),
+    (r"^(\w+_encoder)\.conv1\.", r"\1.convnormrelu.0."),
+    (r"^(\w+_encoder)\.norm1\.", r"\1.convnormrelu.1."),
+    (r"^(\w+_encoder)\.conv2\.", r"\1.conv."),
+    (r"(layer\d\.\d)\.conv(\d)\.", r"\1.convnormrelu\2.0."),
+    (r"(layer\d\.\d)\.norm(\d)\.", r"\1.convnormrelu\2.1."),
+    (r"^update_block\.encoder\.conv(c|f)(\d)\.", lambda m: f"update_block.motion_encoder.conv{_LONG[m[1]]}{m[2]}.0."),
+    (r"^update_block\.encoder\.conv\.", "update_block.motion_encoder.conv.0."),
+    (r"^update_block\.gru\.conv([zrq])\.", r"update_block.recurrent_block.convgru1.conv\1."),
+    (r"^update_block\.gru\.conv([zrq])(\d)\.", r"update_block.recurrent_block.convgru\2.conv\1."),
+    (r"^update_block\.mask\.0\.", "mask_predictor.convrelu.0."),
+    (r"^update_block\.mask\.2\.", "mask_predictor.conv."),
+)
+
+
+def torchvision_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights of the authors' repository (princeton-vl/RAFT) under torchvision's names; those pass unchanged.
+
+    The authors' blocks register the norm of their shortcut twice, as ``norm3`` (``norm4`` in bottlenecks) and as
+    ``downsample.1``: where both are there, the first is left out.
+    """
+    renamed = {}
+    for name, value in weights.items():
+        block = re.sub(r"\.norm[34]\.", ".downsample.1.", name)
+        if block != name and block in weights:
+            continue
+        for pattern, replacement in _RENAMED:
+            name = re.sub(pattern, replacement, name)
+        renamed[name] = value
+    return renamed

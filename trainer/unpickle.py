@@ -1,0 +1,115 @@
+"""Reading files of PyTorch without running anything that is written in them.
+
+``torch.load(weights_only=True)`` does for plain ones. Published checkpoints of the event_cnn_minimal family (E2VID+,
+FireNet+, HyperE2VID, ET-Net) and of V2V also hold pickled objects: a ConfigParser, whole optimisers and schedulers. For
+these there is a second reader that knows the few constructors of tensors and puts an inert :class:`Placeholder` in the
+place of everything else, functions included; what would have been called is never looked up.
+"""
+
+from __future__ import annotations
+
+import pickle
+import struct
+import tarfile
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+import torch._utils
+
+from v2v_protocol.errors import UsageError
+
+
+class Placeholder:
+    """Stands for an object of any class or the result of any call in a pickle. Keeps its state, does nothing."""
+
+    def __init__(self, *_arguments: Any, **_named: Any) -> None:
+        self.content: list[Any] = []
+
+    def __call__(self, *_arguments: Any, **_named: Any) -> Placeholder:
+        return Placeholder()
+
+    def __setstate__(self, state: Any) -> None:
+        self.content = [state]
+
+    def __setitem__(self, _key: Any, value: Any) -> None:
+        """An item of a dict whose class is not known."""
+        self.content.append(value)
+
+    def append(self, item: Any) -> None:
+        """An item of a list whose class is not known."""
+        self.content.append(item)
+
+    def extend(self, items: Iterable[Any]) -> None:
+        """Items of a list whose class is not known."""
+        self.content.extend(items)
+
+    def update(self, items: Iterable[Any]) -> None:
+        """Items of a set whose class is not known."""
+        self.content.extend(items)
+
+
+_KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch", "Size"): torch.Size,
+    ("torch._utils", "_rebuild_tensor"): torch._utils._rebuild_tensor,
+    ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
+    ("torch._utils", "_rebuild_parameter"): torch._utils._rebuild_parameter,
+}
+"""The only names with a meaning (PyTorch resolves its storage classes itself); none runs code of the file."""
+
+
+class _TensorUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        return _KNOWN.get((module, name), Placeholder)
+
+
+def _load(file: Any, **options: Any) -> Any:
+    return _TensorUnpickler(file, **options).load()
+
+
+_TENSORS_ONLY = SimpleNamespace(Unpickler=_TensorUnpickler, load=_load, __name__="pickle")
+"""What ``torch.load`` takes for the pickle module."""
+
+
+_DAMAGE = (
+    *(pickle.UnpicklingError, struct.error, EOFError, OSError, ImportError, AttributeError),
+    *(ArithmeticError, AssertionError, LookupError, MemoryError, RuntimeError, TypeError, ValueError),
+)
+"""What PyTorch and pickle raise on bytes that are not theirs."""
+
+
+def read_torch_file(path: str | Path, *, plain: bool = False) -> Any:
+    """What ``torch.save`` wrote, on the CPU, without running any of it.
+
+    Args:
+        path: the file.
+        plain: refuse what is neither tensor nor plain value, instead of putting a :class:`Placeholder` in its place.
+
+    Raises:
+        UsageError: there is no such file, it is not one of PyTorch, it is damaged, or (``plain``) it holds objects.
+    """
+    if not Path(path).is_file():
+        raise UsageError(f"no file {path}")
+    try:
+        if tarfile.is_tarfile(path):
+            raise UsageError(f"{path} is a tar archive (packed, or PyTorch before 0.1.12): give the checkpoint itself")
+        with warnings.catch_warnings():
+            # They are about how the file was written (its pickle protocol, old storage classes).
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                return torch.load(path, map_location="cpu", weights_only=True)
+            except pickle.UnpicklingError:
+                if plain:
+                    raise
+                return torch.load(path, map_location="cpu", weights_only=False, pickle_module=_TENSORS_ONLY)
+    except _DAMAGE as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise UsageError(
+            f"{path} is not a PyTorch file of {'tensors and plain values' if plain else 'weights'}, "
+            f"or damaged: {reason}"
+        ) from error

@@ -1,0 +1,127 @@
+"""The DEALER socket under a connection: frames in and out, and whether the network was cut in between.
+
+ZeroMQ connects again by itself after a cut, but it tells nobody, and what was under way is gone. Its monitor does tell:
+every handshake after the first means that messages may have been lost, so :meth:`Link.remade` says when to ask again.
+
+Two faults it does not repair by itself: a peer whose packets vanish without any error, and a stream of bytes that is
+no ZeroMQ stream any more (it then leaves the socket dead). For those a :class:`Link` can be connected afresh; it keeps
+its routing id, so that the server knows it again.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import zmq
+
+from v2v_protocol.errors import ServerLost, UsageError
+
+_RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
+
+
+class Link:
+    """One socket to one address; a ZeroMQ context of its own, made here, so never before a fork.
+
+    Args:
+        address: ``tcp://host:port``.
+
+    Every method raises ServerLost once the link is closed.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
+        self._poller = zmq.Poller()
+        self._routing_id = b""
+        self._sockets = 0
+        self._handshakes = 0
+
+    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
+        """Opens a socket, in place of the one before, which is dropped with whatever it holds.
+
+        Args:
+            largest_frame_bytes: a peer that sends a larger frame is cut off before it is received.
+            keep_name: take the routing id of the socket before, so that the server goes on with its session.
+
+        Raises:
+            UsageError: the address is not understood.
+        """
+        self.disconnect(linger_ms=0)
+        if not keep_name:
+            self._routing_id = b"\x01" + os.urandom(15)  # a first byte of 0 is ZeroMQ's own
+        socket = self._context.socket(zmq.DEALER)
+        socket.setsockopt(zmq.ROUTING_ID, self._routing_id)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, 0)
+        socket.setsockopt(zmq.SNDHWM, 0)
+        socket.setsockopt(zmq.IPV6, 1)
+        socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
+        socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
+        self._sockets += 1
+        events = f"inproc://handshakes-{self._sockets}"
+        socket.monitor(events, zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        monitor = self._context.socket(zmq.PAIR)
+        monitor.setsockopt(zmq.LINGER, 0)
+        monitor.connect(events)
+        self._socket, self._monitor, self._handshakes = socket, monitor, 0
+        self._poller = zmq.Poller()
+        self._poller.register(socket, zmq.POLLIN)
+        self._poller.register(monitor, zmq.POLLIN)
+        try:
+            socket.connect(self._address)
+        except zmq.ZMQError as error:
+            raise UsageError(f"address {self._address!r}: {error}; give tcp://host:port") from error
+
+    def disconnect(self, *, linger_ms: int) -> None:
+        """Drops the socket, if there is one; what was sent has ``linger_ms`` to leave, in the background."""
+        socket, self._socket = self._socket, None
+        monitor, self._monitor = self._monitor, None
+        if socket is not None:
+            socket.close(linger=linger_ms)
+        if monitor is not None:
+            monitor.close()
+
+    def close(self) -> None:
+        """Frees context and thread, after the time the socket was given to linger."""
+        self.disconnect(linger_ms=0)
+        self._context.term()
+
+    def send(self, frames: Sequence[Any]) -> None:
+        """Queues a message; it is sent when the peer can be reached."""
+        socket = self._open(self._socket)
+        try:
+            socket.send_multipart(frames, flags=zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            raise ServerLost(f"{self._address}: cannot send: {error}") from error
+
+    def receive(self, seconds: float) -> list[zmq.Frame] | None:
+        """The next message; None when none came in that time, or the network was heard of instead."""
+        socket = self._open(self._socket)
+        try:
+            ready = dict(self._poller.poll(math.ceil(seconds * 1000)))
+            return socket.recv_multipart(flags=zmq.NOBLOCK, copy=False) if socket in ready else None
+        except zmq.Again:  # readiness is a hint
+            return None
+        except zmq.ZMQError as error:
+            raise ServerLost(f"{self._address}: cannot receive: {error}") from error
+
+    def remade(self) -> bool:
+        """Whether ZeroMQ has connected again since the last call. To be asked when nothing is left to receive, or what
+        came before the cut would be taken for lost."""
+        monitor = self._open(self._monitor)
+        before = self._handshakes
+        while monitor.poll(0):
+            monitor.recv_multipart(flags=zmq.NOBLOCK)
+            self._handshakes += 1
+        return self._handshakes > max(1, before)
+
+    def _open(self, socket: zmq.Socket[bytes] | None) -> zmq.Socket[bytes]:
+        if socket is None:
+            raise ServerLost(f"{self._address}: this connection is closed")
+        return socket

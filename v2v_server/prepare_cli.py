@@ -1,0 +1,166 @@
+"""The command line of `v2v-prepare`: arguments -> settings -> call.
+
+Exit status: 0 every video file of the source was prepared, 1 some were not or fall below the floor, 2 wrong usage or
+input, 130 interrupted. Errors are one line on stderr; `--debug` shows the trace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_server.progress import catalogue_progress
+from v2v_server.video import prepare
+from v2v_server.video.catalogue import open_catalogue
+from v2v_server.video.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
+from v2v_server.video.rows import Rows
+
+_SHOWN = 20
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-prepare`."""
+    parser = argparse.ArgumentParser(
+        prog="v2v-prepare",
+        description="Transcode a corpus once to what training needs: chosen rows, grey, fast decode.",
+    )
+    defaults = ", ".join(f"{name} {codec.default}" for name, codec in CODECS.items())
+    parser.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
+    parser.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
+    parser.add_argument(
+        "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
+    )
+    parser.add_argument("--codec", choices=tuple(CODECS), default=DEFAULT_CODEC, help=f"default {DEFAULT_CODEC}")
+    parser.add_argument("--quality", type=int, metavar="Q", help=f"lower is better and larger; default {defaults}")
+    parser.add_argument(
+        "--gop", type=int, default=DEFAULT_GOP, metavar="N", help=f"distance of keyframes (default {DEFAULT_GOP})"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default: one a core)"
+    )
+    parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts SRC")
+    parser.add_argument(
+        "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
+        help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
+    )  # fmt: skip
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_argument("--json", metavar="FILE", help="also write a record of each video")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+    try:
+        complete = _run(arguments)
+    except KeyboardInterrupt:
+        print("v2v-prepare: interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except V2VError as error:
+        if arguments.debug:
+            raise
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
+    if not complete:
+        sys.exit(1)
+
+
+def _run(arguments: argparse.Namespace) -> bool:
+    quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
+    encoding = Encoding(arguments.codec, quality, arguments.gop)
+    if arguments.workers < 1:
+        raise UsageError(f"--workers {arguments.workers}: give at least 1")
+    started = time.monotonic()
+    with catalogue_progress() as probing:
+        catalogue = open_catalogue(
+            arguments.source,
+            list_file=arguments.list,
+            rows=Rows.parse(arguments.rows),
+            cache_dir=arguments.cache_dir,
+            processes=arguments.workers,
+            progress=probing,
+        )
+    with contextlib.closing(catalogue), _progress() as progress:
+        report = prepare.prepare(
+            catalogue,
+            arguments.destination,
+            encoding,
+            processes=arguments.workers,
+            floor_db=arguments.floor,
+            progress=progress,
+        )
+    if arguments.json is not None:
+        _write_json(Path(arguments.json), report)
+    for line in summary(report, encoding, time.monotonic() - started):
+        print(line)
+    return report.complete
+
+
+def summary(report: prepare.Report, encoding: Encoding, seconds: float) -> list[str]:
+    """Lines that say what was made, what it saved, what failed and why."""
+    prepared = report.prepared
+    lines = [
+        f"{len(prepared)} of {len(report.videos)} videos prepared as {encoding} ({report.kept} of them earlier) "
+        f"in {seconds:.0f} s"
+    ]
+    if prepared:
+        before, after = report.source_bytes, report.prepared_bytes
+        change = "saves" if after <= before else "costs"
+        lines.append(
+            f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "
+            f"{change} {abs(before - after) / 1e6:.1f} MB"
+        )
+        quality = {video.id: video.psnr_db or 0.0 for video in prepared}
+        worst = min(quality, key=lambda id: quality[id])
+        lines.append(
+            f"PSNR of a clip to its source: median {statistics.median(quality.values()):.1f} dB, "
+            f"lowest {quality[worst]:.1f} dB ({worst})"
+        )
+    lines += _listed(
+        f"below the floor of {report.floor_db:g} dB (kept; a lower --quality makes them better):",
+        [(video.id, f"{video.psnr_db:.1f} dB") for video in report.below_floor],
+    )
+    lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
+    lines += _listed("cannot be used at all:", [(problem.id, problem.reason) for problem in report.unusable])
+    return lines
+
+
+def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
+    if not items:
+        return []
+    lines = [f"{len(items)} {title}", *(f"  {id}: {why}" for id, why in items[:_SHOWN])]
+    if len(items) > _SHOWN:
+        lines.append(f"  ... and {len(items) - _SHOWN} more; --json FILE has them all")
+    return lines
+
+
+def _write_json(path: Path, report: prepare.Report) -> None:
+    records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in report.unusable]
+    try:
+        path.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--json {path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[prepare.Progress]:
+    columns = (
+        TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(file=sys.stderr)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("prepare", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,288 @@
+"""The manifest of a prepared folder: what was made of which source video, and how.
+
+One JSON object a line. The first describes the folder, each of the others one video, failed ones too. Lines are only
+ever appended; a last line that a killed process left unfinished counts as not written, and where an id comes twice, the
+later line holds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+from typing import Any
+
+from v2v_protocol.errors import CorpusError, UsageError
+from v2v_server.video.encode import Encoding
+from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.rows import Rows
+from v2v_server.video.store import Record
+
+MANIFEST_NAME = "v2v-prepared.jsonl"
+MANIFEST_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What holds for the whole folder.
+
+    Attributes:
+        rows: rows of the source's pictures that it holds, canonical.
+        codec, quality, gop: see :class:`v2v_server.video.encode.Encoding`.
+        videos: how many videos the source corpus has; the folder is finished when it has a record of each.
+        source: name of the source folder, for people.
+        source_digest: digest of the source's catalogue with these rows.
+        version: of this format.
+    """
+
+    rows: str
+    codec: str
+    quality: int
+    gop: int
+    videos: int
+    source: str
+    source_digest: str
+    version: int = MANIFEST_VERSION
+
+    def same_settings(self, other: Header) -> bool:
+        """Whether videos of both may lie in one folder."""
+        return (self.rows, self.codec, self.quality, self.gop) == (other.rows, other.codec, other.quality, other.gop)
+
+    def settings(self) -> str:
+        """rows, codec, quality and gop as text."""
+        return f"rows {self.rows}, {self.codec} quality {self.quality} gop {self.gop}"
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedVideo:
+    """What was made of one video.
+
+    Attributes:
+        id: of the source, and the path of the prepared file below the folder.
+        source_fingerprint, source_bytes: of the source file.
+        frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
+        height_px, width_px: of the prepared picture; 0 where the source has not the rows asked for.
+        fingerprint, bytes: of the prepared file; "" and 0 with a problem.
+        psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
+        worst_psnr_db: the same of the worst frame.
+        problem: why there is no prepared file; None if there is one.
+    """
+
+    id: str
+    source_fingerprint: str
+    source_bytes: int
+    frames: int
+    frames_per_second: float | None
+    height_px: int
+    width_px: int
+    fingerprint: str = ""
+    bytes: int = 0
+    psnr_db: float | None = None
+    worst_psnr_db: float | None = None
+    problem: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """A manifest as read.
+
+    Attributes:
+        root: the prepared folder.
+        header: see :class:`Header`.
+        videos: by id.
+    """
+
+    root: Path
+    header: Header
+    videos: dict[str, PreparedVideo]
+
+    def check_served(self, rows: Rows | None) -> None:
+        """Make sure that the folder can be served, and its rows are not to be cut again.
+
+        Raises:
+            CorpusError: it is not finished, or other rows are asked for than it holds.
+        """
+        if len(self.videos) != self.header.videos:
+            raise CorpusError(
+                f"{self.root}: prepared are {len(self.videos)} of {self.header.videos} videos; run v2v-prepare again "
+                "to finish (what is done is kept)"
+            )
+        if rows is not None and str(rows) not in ("full", self.header.rows):
+            raise CorpusError(
+                f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
+                "source only; leave --rows out, or serve the source"
+            )
+
+    def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
+        """The ids that a corpus of this folder has; files that the manifest does not know are none.
+
+        Args:
+            listed: the ids that a list file names; None takes all.
+            refused: receives, by id, why one cannot be taken in.
+        """
+        wanted = sorted(self.videos) if listed is None else list(listed)
+        for id in wanted:
+            if id not in self.videos:
+                refused[id] = "is not in the prepared folder's manifest: the source had no such usable video"
+            elif not self.videos[id].height_px:
+                refused[id] = f"was not prepared: {self.videos[id].problem}"
+        return tuple(id for id in wanted if id not in refused)
+
+    def describes(self, record: Record) -> bool:
+        """Whether the file that was probed is the one that was prepared."""
+        video = self.videos[record.id]
+        return (record.fingerprint, record.frames) == (video.fingerprint, video.frames)
+
+    def as_source(self, record: Record) -> Record:
+        """The record of a prepared file, with what has to agree with its source even where there is no sound file:
+        the sequences of all others keep their places only if the source's frames are counted."""
+        video = self.videos[record.id]
+        return replace(
+            record,
+            fingerprint=video.fingerprint or f"none-of-{video.source_fingerprint}",
+            frames=video.frames,
+            height_px=video.height_px,
+            width_px=video.width_px,
+            frames_per_second=video.frames_per_second,
+            problem=None,
+        )
+
+
+def find_manifest(root: Path) -> Manifest | None:
+    """The manifest of a resolved folder; None if it is no prepared one.
+
+    Raises:
+        CorpusError: the manifest makes no sense, or the folder is a part of a prepared one.
+    """
+    for folder in root.parents:
+        if (folder / MANIFEST_NAME).exists():
+            raise CorpusError(
+                f"{root} lies in the prepared folder {folder}, where its manifest is: name that folder, and restrict "
+                "it by a list file"
+            )
+    return read_manifest(root) if (root / MANIFEST_NAME).exists() else None
+
+
+def refuse_prepared_below(root: Path, ids: Iterable[str]) -> None:
+    """Make sure that no video of an ordinary corpus comes from a prepared folder, whose rows are cut already.
+
+    Raises:
+        CorpusError: one does.
+    """
+    for folder in sorted({parent for id in ids for parent in PurePosixPath(id).parents}):
+        if (root / folder / MANIFEST_NAME).exists():
+            raise CorpusError(
+                f"{root / folder} is a prepared folder and cannot be a part of another corpus: name it itself, or move "
+                "it out"
+            )
+
+
+def read_manifest(root: Path) -> Manifest:
+    """The manifest in that folder.
+
+    Raises:
+        CorpusError: it cannot be read, or is no manifest of this version.
+    """
+    path = root / MANIFEST_NAME
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise CorpusError(f"{path}: cannot be read: {error.strerror or error}") from error
+    lines.pop()  # empty behind the last line's end; else the beginning of a line whose writer was killed
+    if not lines:
+        raise CorpusError(f"{path}: holds no whole line; prepare another folder")
+    videos = {}
+    for number, line in enumerate(lines, 1):
+        try:
+            if number == 1:
+                header = _header(line)
+            else:
+                video = _video(line)
+                videos[video.id] = video
+        except (ValueError, TypeError, UsageError) as error:
+            raise CorpusError(f"{path}, line {number}: {error}; prepare another folder") from error
+    return Manifest(root, header, videos)
+
+
+class ManifestWriter:
+    """Writes a manifest: first afresh and in one piece, then line by line.
+
+    Args:
+        root: the prepared folder.
+        header: its first line.
+        videos: what is known already.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+
+    def __init__(self, root: Path, header: Header, videos: Iterable[PreparedVideo]) -> None:
+        path = root / MANIFEST_NAME
+        fresh = path.with_name(f".{MANIFEST_NAME}.new")
+        with fresh.open("wb") as file:
+            file.write(_line(header))
+            file.writelines(map(_line, videos))
+            file.flush()
+            os.fsync(file.fileno())
+        fresh.replace(path)
+        self._file = path.open("ab")
+
+    def add(self, video: PreparedVideo) -> None:
+        """Append one record, and make sure that it stays."""
+        self._file.write(_line(video))
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> ManifestWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def _line(item: Header | PreparedVideo) -> bytes:
+    return json.dumps(asdict(item), allow_nan=False).encode() + b"\n"
+
+
+def _header(line: bytes) -> Header:
+    data = _object(line)
+    if data.get("version") != MANIFEST_VERSION:
+        raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
+    header = Header(**data)
+    Encoding(header.codec, header.quality, header.gop)
+    Rows.parse(header.rows)
+    if not _whole(header.videos, 1, math.inf):
+        raise ValueError(f"{header.videos!r} videos")
+    return header
+
+
+def _video(line: bytes) -> PreparedVideo:
+    data = _object(line)
+    unknown = data.keys() - {field.name for field in fields(PreparedVideo)}
+    if unknown:
+        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
+    video = PreparedVideo(**data)
+    path = PurePosixPath(video.id)
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"id {video.id!r} leads out of the folder")
+    sizes = (video.height_px, video.width_px)
+    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(_whole(size, 0, LARGEST_SIDE_PX) for size in sizes):
+        raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
+    return video
+
+
+def _object(line: bytes) -> dict[str, Any]:
+    data = json.loads(line)
+    if not isinstance(data, dict):
+        raise ValueError("is no JSON object")
+    return data
+
+
+def _whole(value: object, least: float, most: float) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
