@@ -33,6 +33,7 @@ from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
+from v2v_server.inspection import flaw
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.metrics import Counters
@@ -295,9 +296,11 @@ class Dispatcher:
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
         asked = self._leases.task(result.lease, identity)
-        if asked is not None and (result.index != asked.index or not payload):
+        session = None if asked is None else self.sessions.get(asked.session)
+        wrong = None if asked is None or session is None else flaw(result, payload, asked, session.layout)
+        if wrong is not None:
             # No worker of ours does this, and one that did it once would do it again.
-            refused = ToWorker(identity, self._malformed(ProtocolError("a result that answers another lease")))
+            refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {wrong}")))
             return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
         task = self._leases.finished(result.lease, identity, now)
         cpu_seconds = min(max(result.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
@@ -307,7 +310,6 @@ class Dispatcher:
         self.counters.samples += 1
         self.counters.bytes += sum(len(frame) for frame in payload)
         self.counters.worker_cpu_seconds += cpu_seconds
-        session = self.sessions.get(task.session)
         if session is not None:
             self.counters.batches += 1 / session.batch_size
         return [ToConsumer(task.session, payload), *self._assign(now)]

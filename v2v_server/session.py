@@ -18,6 +18,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from v2v_protocol.errors import LimitExceeded
+from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
@@ -55,6 +56,11 @@ class Session:
     balance_seconds: float = 0.0
     served: int = 0
     quarantine: int = 0
+
+    @property
+    def layout(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """dtype and shape of each array of one of its samples."""
+        return array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays)
 
 
 class Sessions:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,6 +24,7 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
+from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode
 from v2v_server.blame import Cause, Loss
@@ -37,9 +39,30 @@ CREDIT = 2
 
 
 def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
-    """A whole SampleHeader message of one small array; its provenance says for which seed it was made."""
-    header = SampleHeader(epoch, index, ("voxels",), ("int8",), (1, 3), {"seed": seed}, "w", 0.1)
-    return [*encode(header), memoryview(b"abc")]
+    """A whole SampleHeader message for SMALL_SPEC; its provenance says for which seed it was made."""
+    return frames_of(array_layout(SMALL_SPEC.recipe, "int8", ("voxels",)), epoch, index, seed)
+
+
+def answer_to(lease: Lease) -> list[Buffer]:
+    """What an honest worker sends behind its Result."""
+    spec = StreamSpec.from_dict(json.loads(lease.spec))
+    layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
+    return frames_of(layout, lease.epoch, lease.indices[0], lease.seed)
+
+
+def frames_of(layout: Mapping[str, tuple[str, tuple[int, ...]]], epoch: int, index: int, seed: int) -> list[Buffer]:
+    """A sample message of zeros in that layout."""
+    header = SampleHeader(
+        epoch=epoch,
+        index=index,
+        names=tuple(layout),
+        dtypes=tuple(dtype for dtype, _ in layout.values()),
+        shapes=tuple(extent for _, shape in layout.values() for extent in (len(shape), *shape)),
+        provenance={"seed": seed},
+        worker="w",
+        cpu_seconds=0.1,
+    )
+    return [*encode(header), *(memoryview(bytes(layout_bytes({name: layout[name]}))) for name in layout)]
 
 
 @dataclass
@@ -155,8 +178,7 @@ class Peers:
     def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1) -> Lease:
         """Answers the oldest lease."""
         lease = self.leases[identity].popleft()
-        payload = sample_frames(lease.epoch, lease.indices[0], lease.seed)
-        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *payload)
+        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *answer_to(lease))
         return lease
 
     def fail(self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7) -> Lease:

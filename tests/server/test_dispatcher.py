@@ -6,6 +6,7 @@ import gc
 import math
 import weakref
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from hypothesis import given, settings
 
 from tests.protocol.wire_messages import messages
 from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
-from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, peers, sample_frames
+from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import (
     Begun,
@@ -89,13 +90,13 @@ def test_a_sample_goes_from_want_to_answer() -> None:
 
 
 def test_payload_is_passed_on_untouched() -> None:
-    """The very objects: nothing is copied, decoded or even looked at."""
+    """The very objects: the header is read, nothing is copied."""
     at = peers()
     at.join()
     at.hello()
     at.want(0)
     lease = at.begin()
-    payload: list[Any] = [b"not even a header", memoryview(bytearray(5)), bytearray(b"x")]
+    payload: list[Any] = sample_frames(0, 0)
     instructions = at.dispatcher.from_worker(b"w", [*encode(Result(lease.lease, 0, 0.1)), *payload], 0.0)
     (forwarded,) = instructions
     assert isinstance(forwarded, ToConsumer)
@@ -737,17 +738,35 @@ def test_absurd_costs_neither_stop_nor_unbalance(cpu_seconds: float) -> None:
     assert 0.0 <= at.dispatcher.counters.worker_cpu_seconds < 1e6
 
 
-@pytest.mark.parametrize("wrong", ["index", "payload"])
+def _shortened(frames: list[Any]) -> list[Any]:
+    return [frames[0], frames[1][:-1]]
+
+
+NONSENSE: dict[str, Callable[[], tuple[int, list[Any]]]] = {
+    "index": lambda: (1, sample_frames(0, 1)),
+    "nothing": lambda: (0, []),
+    "garbage": lambda: (0, [b"\xc1garbage", *sample_frames(0, 0)[1:]]),
+    "another message": lambda: (0, [*encode(Ping()), *sample_frames(0, 0)[1:]]),
+    "header of another sample": lambda: (0, sample_frames(0, 1)),
+    "header of another epoch": lambda: (0, sample_frames(1, 0)),
+    "an array too short": lambda: (0, _shortened(sample_frames(0, 0))),
+    "an array too many": lambda: (0, [*sample_frames(0, 0), b"x"]),
+    "no array": lambda: (0, sample_frames(0, 0)[:1]),
+    "another dtype": lambda: (0, frames_of({"voxels": ("uint8", (2, 2, 8, 8))}, 0, 0, 0)),
+    "another shape": lambda: (0, frames_of({"voxels": ("int8", (2, 2, 4, 16))}, 0, 0, 0)),
+    "another name": lambda: (0, frames_of({"frames": ("int8", (2, 2, 8, 8))}, 0, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("wrong", NONSENSE)
 def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_its_order(wrong: str) -> None:
     at = peers()
     at.join()
     at.hello()
     at.want(0, 1, 2)
     lease = at.begin()
-    if wrong == "index":
-        at.worker_says(b"w", Result(lease.lease, 1, 0.1), *sample_frames(0, 1))
-    else:
-        at.worker_says(b"w", Result(lease.lease, 0, 0.1))
+    index, payload = NONSENSE[wrong]()
+    at.worker_says(b"w", Result(lease.lease, index, 0.1), *payload)
     assert at.samples() == []
     counters = at.dispatcher.counters
     assert (counters.malformed, counters.workers_lost, at.dispatcher.workers) == (1, 1, 0)
