@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from v2v_protocol.sample import Provenance
+from v2v_protocol.sample import ARRAYS, Provenance
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -20,6 +20,9 @@ class Batch:
         voxels: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``; None when not asked for. Positive
             counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
         frames: [B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated; None when not asked for.
+        flow: [B, T, 2, H, W] float16, px in (x, y); None when not asked for. flow[:, t] belongs to voxel t of the
+            target sequence and is zero before ``flow_from``.
+        flow_valid: [B, T, 1, H, W] uint8, 1 where forward and backward flow agree; None when not asked for.
         indices: global index of each sample.
         epoch: of the samples.
         provenance: where each sample came from.
@@ -31,6 +34,8 @@ class Batch:
 
     voxels: torch.Tensor | None
     frames: torch.Tensor | None
+    flow: torch.Tensor | None
+    flow_valid: torch.Tensor | None
     indices: tuple[int, ...]
     epoch: int
     provenance: tuple[Provenance, ...]
@@ -52,7 +57,7 @@ class Batch:
     @property
     def arrays(self) -> dict[str, torch.Tensor]:
         """The tensors that were asked for, by name."""
-        named = {"voxels": self.voxels, "frames": self.frames}
+        named = {name: getattr(self, name) for name in ARRAYS}
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     @property
@@ -73,4 +78,5 @@ class Batch:
         return self._with({name: item.to(device, non_blocking=non_blocking) for name, item in self.arrays.items()})
 
     def _with(self, arrays: dict[str, torch.Tensor]) -> Batch:
-        return dataclasses.replace(self, voxels=arrays.get("voxels"), frames=arrays.get("frames"))
+        named: dict[str, Any] = dict(arrays)
+        return dataclasses.replace(self, **named)

@@ -62,8 +62,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         seed: of all random draws and of the order.
         epoch: the first one.
         rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video: see :class:`v2v_protocol.spec.StreamSpec`; None
-            takes the server's.
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, flow_*: see
+            :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
 
@@ -101,6 +101,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         shuffle: bool | None = None,
         max_sequences_per_video: int | None = None,
         on_bad_video: str | None = None,
+        flow_method: str | None = None,
+        flow_direction: str | None = None,
+        flow_from: int | None = None,
+        flow_margin_px: int | None = None,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
     ) -> None:
@@ -117,6 +121,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
             "shuffle": shuffle,
             "max_sequences_per_video": max_sequences_per_video,
             "on_bad_video": on_bad_video,
+            "flow_method": flow_method,
+            "flow_direction": flow_direction,
+            "flow_from": flow_from,
+            "flow_margin_px": flow_margin_px,
         }
         self._asked = {name: value for name, value in asked.items() if value is not None}
         spec = StreamSpec.from_dict(self._asked)  # an error in an option is raised here, not by the server

@@ -98,6 +98,8 @@ def _finished(
     return Batch(
         voxels=tensors.get("voxels"),
         frames=tensors.get("frames"),
+        flow=tensors.get("flow"),
+        flow_valid=tensors.get("flow_valid"),
         indices=indices,
         epoch=epoch,
         provenance=provenance,

@@ -26,7 +26,7 @@ from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.schedule_check import ScheduleCheck
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.sample import ARRAYS
+from v2v_protocol.sample import DEFAULT_ARRAYS
 
 _RSS_EVERY_SECONDS = 0.5
 
@@ -199,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulates a training step of this length"
     )
-    parser.add_argument("--arrays", default=",".join(ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
     parser.add_argument("--recipe", metavar="PRESET", help="default: the server's")
     parser.add_argument(
         "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="changes a recipe field"

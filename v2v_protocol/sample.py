@@ -16,8 +16,9 @@ from v2v_protocol.recipe import Recipe
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
-ARRAYS = ("voxels", "frames")
+ARRAYS = ("voxels", "frames", "flow", "flow_valid")
 """Arrays a consumer may ask for."""
+DEFAULT_ARRAYS = ("voxels", "frames")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,8 @@ class Provenance:
 def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> dict[str, tuple[str, tuple[int, ...]]]:
     """dtype and shape of each asked array of one sample (no batch dimension).
 
-    voxels [T + lead_voxels, bins, H, W] in ``voxel_dtype``; frames [T + lead_frames, 1, H, W] uint8.
+    voxels [T + lead_voxels, bins, H, W] in ``voxel_dtype``; frames [T + lead_frames, 1, H, W] uint8; flow [T, 2, H, W]
+    float16, px in (x, y); flow_valid [T, 1, H, W] uint8, 1 where forward and backward flow agree.
 
     Raises:
         UsageError: an array nobody makes, none at all, or one asked twice.
@@ -182,6 +184,8 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> d
     known = {
         "voxels": (voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, height, width)),
         "frames": ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, height, width)),
+        "flow": ("float16", (recipe.voxels_per_clip, 2, height, width)),
+        "flow_valid": ("uint8", (recipe.voxels_per_clip, 1, height, width)),
     }
     for name in arrays:
         if name not in known:

@@ -12,6 +12,13 @@ from typing import Any
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe, preset
 
+FLOW_METHODS = (
+    "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-1", "dis-fast-1-stride-6",
+    "dis-medium", "dis-medium-0",
+    "farneback", "sparse-to-dense", "deepflow",
+)  # fmt: skip
+FLOW_DIRECTIONS = ("forward", "backward")
+LARGEST_FLOW_MARGIN_PX = 16_384
 VOXEL_DTYPES = ("int8", "int16", "float32")
 ON_BAD_VIDEO = ("substitute", "raise")
 
@@ -31,6 +38,10 @@ class StreamSpec:
         max_sequences_per_video: most sequences one video contributes to an epoch (paper: 10).
         on_bad_video: "substitute" serves the next candidate of an index whose video fails, and says so in the
             provenance; "raise" makes the consumer raise SampleUnavailable.
+        flow_method: how flow is estimated where it is asked for; "auto" chooses for each step by how much moves.
+        flow_direction: "forward", on the grid of a step's earlier frame, or "backward", on that of the later one.
+        flow_from: flow of the voxels before this one is not computed but zero.
+        flow_margin_px: flow is estimated on the crop and this much of the picture around it; -1: on all of it.
 
     Raises:
         UsageError: a value outside its choices or limits.
@@ -41,15 +52,21 @@ class StreamSpec:
     shuffle: bool = True
     max_sequences_per_video: int = 10
     on_bad_video: str = "substitute"
+    flow_method: str = "auto"
+    flow_direction: str = "forward"
+    flow_from: int = 0
+    flow_margin_px: int = 64
 
     def __post_init__(self) -> None:
         _choose("voxel_dtype", self.voxel_dtype, VOXEL_DTYPES)
         _choose("on_bad_video", self.on_bad_video, ON_BAD_VIDEO)
+        _choose("flow_method", self.flow_method, FLOW_METHODS)
+        _choose("flow_direction", self.flow_direction, FLOW_DIRECTIONS)
+        _whole("flow_from", self.flow_from, 0, self.recipe.voxels_per_clip)
+        _whole("flow_margin_px", self.flow_margin_px, -1, LARGEST_FLOW_MARGIN_PX)
         if not isinstance(self.shuffle, bool):
             raise UsageError(f"spec shuffle = {self.shuffle!r}: give true or false")
-        most = self.max_sequences_per_video
-        if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= 1_000_000:
-            raise UsageError(f"spec max_sequences_per_video = {most!r}: give a whole number from 1 to 1000000")
+        _whole("max_sequences_per_video", self.max_sequences_per_video, 1, 1_000_000)
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as plain values."""
@@ -96,6 +113,11 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         named = {str(key): item for key, item in value.items()}
         return Recipe.from_dict(named) if "preset" in named else base.replace(**named)
     return preset(value)
+
+
+def _whole(name: str, value: object, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise UsageError(f"spec {name} = {value!r}: give a whole number from {low} to {high}")
 
 
 def _choose(name: str, value: object, words: tuple[str, ...]) -> None:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import PRESETS
-from v2v_protocol.sample import ARRAYS
-from v2v_protocol.spec import VOXEL_DTYPES
+from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
 
 
@@ -39,11 +38,7 @@ def serve(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--port-file", metavar="FILE", help="receives the bound address once the server is ready")
     parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    _add_recipe(parser)
-    parser.add_argument("--voxel-dtype", choices=VOXEL_DTYPES, help="default int8: saturating, and counted")
-    parser.add_argument("--no-shuffle", dest="shuffle", action="store_false", default=None, help="catalogue order")
-    parser.add_argument("--max-sequences-per-video", type=int, metavar="N", help="per epoch (default 10)")
-    parser.add_argument("--on-bad-video", choices=("substitute", "raise"), help="default substitute")
+    _add_spec(parser)
     parser.add_argument(
         "--lease-deadline-seconds", type=float, metavar="S", help="a worker silent for longer hangs (60)"
     )
@@ -95,9 +90,8 @@ def simulate(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--index", type=int, default=0, help="global index in the epoch")
     parser.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     parser.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    parser.add_argument("--arrays", default=",".join(ARRAYS), help=f"comma separated, default {','.join(ARRAYS)}")
-    parser.add_argument("--voxel-dtype", choices=VOXEL_DTYPES, default="int8")
-    _add_recipe(parser)
+    parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), help=f"comma separated, of {','.join(ARRAYS)}")
+    _add_spec(parser)
 
     def run(arguments: argparse.Namespace) -> None:
         from v2v_server.remake import simulate_to_file
@@ -108,8 +102,8 @@ def simulate(argv: Sequence[str] | None = None) -> None:
             picture=None if arguments.picture is None else Path(arguments.picture),
             list_file=arguments.list,
             rows=arguments.rows,
-            recipe=recipe_setting(arguments.recipe, arguments.set),
-            voxel_dtype=arguments.voxel_dtype,
+            spec={name: getattr(arguments, name) for name in _SPEC_FLAGS}
+            | {"recipe": recipe_setting(arguments.recipe, arguments.set)},
             arrays=tuple(arguments.arrays.split(",")),
             seed=arguments.seed,
             epoch=arguments.epoch,
@@ -126,7 +120,14 @@ def new_parser(name: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_recipe(parser: argparse.ArgumentParser) -> None:
+_SPEC_FLAGS = (
+    "voxel_dtype", "shuffle", "max_sequences_per_video", "on_bad_video",
+    "flow_method", "flow_direction", "flow_from", "flow_margin_px",
+)  # fmt: skip
+
+
+def _add_spec(parser: argparse.ArgumentParser) -> None:
+    """Flags for what a stream is made of: the same for a server's defaults and for remaking one of its samples."""
     parser.add_argument("--recipe", metavar="NAME", help=f"preset ({', '.join(PRESETS)}) or YAML file of recipe fields")
     parser.add_argument(
         "--set",

@@ -36,7 +36,8 @@ class ServeConfig:
         port_file: file that receives the bound address once the server is ready.
         cache_dir: folder of the catalogue index; empty: the user's cache.
         recipe: preset name, or a mapping of recipe fields: the default for consumers that ask for none.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video: defaults of the other spec fields.
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, flow_method, flow_direction, flow_from,
+            flow_margin_px: defaults of the other spec fields, see :class:`v2v_protocol.spec.StreamSpec`.
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
         max_credit_bytes: bound on the bytes in flight to one consumer.
@@ -60,6 +61,10 @@ class ServeConfig:
     shuffle: bool = True
     max_sequences_per_video: int = 10
     on_bad_video: str = "substitute"
+    flow_method: str = "auto"
+    flow_direction: str = "forward"
+    flow_from: int = 0
+    flow_margin_px: int = 64
     lease_deadline_seconds: float = 60.0
     session_idle_seconds: float = 600.0
     max_credit_bytes: int = 2 << 30
@@ -76,15 +81,8 @@ class ServeConfig:
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, self.insecure)
-        spec = StreamSpec.from_dict(
-            {
-                "recipe": self.recipe,
-                "voxel_dtype": self.voxel_dtype,
-                "shuffle": self.shuffle,
-                "max_sequences_per_video": self.max_sequences_per_video,
-                "on_bad_video": self.on_bad_video,
-            }
-        )
+        names = [item.name for item in dataclasses.fields(StreamSpec)]
+        spec = StreamSpec.from_dict({name: getattr(self, name) for name in names})
         object.__setattr__(self, "spec", spec)
 
     @classmethod

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance, Sample
+from v2v_server.flow.colour import draw_flow
 
 _TILE_PX = 168
 _GAP_PX = 6
@@ -37,12 +38,14 @@ class Row:
         bins: [B, H, W], signed event counts.
         provenance: of the sample it is from.
         note: what is particular about this row, e.g. which voxel of the clip it is.
+        flow: [2, H, W], px, of this voxel; drawn where there is one.
     """
 
     frame: npt.NDArray[np.uint8]
     bins: npt.NDArray[Any]
     provenance: Provenance
     note: str
+    flow: npt.NDArray[np.float16] | None = None
 
 
 def draw_sample(sample: Sample, rows: int = 6) -> Image:
@@ -53,9 +56,9 @@ def draw_sample(sample: Sample, rows: int = 6) -> Image:
     """
     if not {"voxels", "frames"} <= sample.arrays.keys():
         raise UsageError("a picture needs both arrays: --arrays voxels,frames")
-    voxels, frames = sample.arrays["voxels"], sample.arrays["frames"]
+    voxels, frames, flow = sample.arrays["voxels"], sample.arrays["frames"], sample.arrays.get("flow")
     # Lead frames and lead voxels stand in front: the last entries of both belong together.
-    count = min(len(voxels), len(frames))
+    count = min(len(array) for array in (voxels, frames, flow) if array is not None)
     picks = np.unique(np.linspace(0, count - 1, rows).round().astype(int))
     return draw_rows(
         [
@@ -64,6 +67,7 @@ def draw_sample(sample: Sample, rows: int = 6) -> Image:
                 voxels[len(voxels) - count + pick],
                 sample.provenance,
                 f"voxel {pick}",
+                None if flow is None else flow[len(flow) - count + pick],
             )
             for pick in picks
         ]
@@ -99,6 +103,8 @@ def _draw_row(row: Row) -> Image:
     frame = np.repeat(row.frame[..., None], 3, axis=2)
     tiles = [_label(row, strongest), _fit(frame)]
     tiles += [_fit(_red_blue(events, strongest)) for events in row.bins]
+    if row.flow is not None:
+        tiles.append(_fit(draw_flow(row.flow)))
     return np.hstack([cv2.copyMakeBorder(tile, 0, _GAP_PX, 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))
                       for tile in tiles])  # fmt: skip
 

@@ -19,6 +19,7 @@ from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
+from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
@@ -38,12 +39,14 @@ class Decoded:
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         clip: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
+        flow: how flow is made where the lease asks for it; then ``clip`` holds its margin too.
     """
 
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
     clip: DecodedClip
+    flow: FlowSettings | None
 
 
 def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
@@ -71,7 +74,10 @@ def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
         video_thresholds=_thresholds(lease.thresholds),
     )
     source = params.source_index(spec.recipe.steps)
-    window = source_window(params, spec.recipe, top, bottom - top, lease.width_px)
+    window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
+    if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
+        flow = FlowSettings.of(spec)
+        window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
     path = _below(root, lease.video)
     try:
         check_fingerprint(path, lease.fingerprint)
@@ -80,7 +86,7 @@ def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return Decoded(spec, params, source, clip)
+    return Decoded(spec, params, source, clip, flow)
 
 
 def make_sample(lease: Lease, index: int, root: Path) -> Sample:
@@ -91,7 +97,11 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
     """
     decoded = decode_for(lease, index, root)
     params, recipe, source = decoded.params, decoded.spec.recipe, decoded.source
-    view = apply_view(decoded.clip.frames, params, recipe)
+    frames, flow = decoded.clip.frames, None
+    if decoded.flow is not None:
+        flow = flow_for(frames, params, recipe, decoded.flow, validity="flow_valid" in lease.arrays)
+        frames = view_part(frames, params, recipe, decoded.flow.margin_px)
+    view = apply_view(frames, params, recipe)
     seconds, irregular = None, 0
     if recipe.noise_unit == "second":
         if not lease.frames_per_second:
@@ -104,6 +114,10 @@ def make_sample(lease: Lease, index: int, root: Path) -> Sample:
             arrays[name], saturated = simulate_clip(view, params, recipe, decoded.spec.voxel_dtype, seconds)
         elif name == "frames":
             arrays[name] = view[source[list(recipe.target_steps)], None]
+        elif name == "flow" and flow is not None:
+            arrays[name] = flow.flow
+        elif name == "flow_valid" and flow is not None and flow.valid is not None:
+            arrays[name] = flow.valid
         else:
             raise ProtocolError(f"lease {lease.lease} asks for an array {name!r} that this worker does not make")
     codec = decoded.clip.codec

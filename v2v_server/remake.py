@@ -99,8 +99,7 @@ def simulate_to_file(
     picture: Path | None,
     list_file: str | None,
     rows: str,
-    recipe: Any,
-    voxel_dtype: str,
+    spec: Mapping[str, Any],
     arrays: tuple[str, ...],
     seed: int,
     epoch: int,
@@ -108,14 +107,21 @@ def simulate_to_file(
 ) -> None:
     """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
 
+    Args:
+        source, list_file, rows: the corpus, as for a server.
+        out: the .npz file.
+        picture: a .png file to draw it into, or None.
+        spec: fields of the StreamSpec; None in any takes the default.
+        arrays, seed, epoch, index: see :func:`remake`.
+
     Raises:
         UsageError, CorpusError, SampleUnavailable: see :func:`remake`; or a file cannot be written.
     """
-    spec = StreamSpec.from_dict({"recipe": recipe, "voxel_dtype": voxel_dtype})
     catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows))
     for problem in catalogue.problems:
         print(f"cannot be used: {problem.id}: {problem.reason}")
-    sample = remake(catalogue, spec, seed=seed, epoch=epoch, index=index, arrays=arrays)
+    stream = StreamSpec.from_dict(spec)
+    sample = remake(catalogue, stream, seed=seed, epoch=epoch, index=index, arrays=arrays)
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:

@@ -188,7 +188,7 @@ def test_the_largest_layout_does_not_overflow() -> None:
     assert layout_bytes(array_layout(recipe, "float32", ("voxels",))) == 976 * 1024 * 16_384**2 * 4
 
 
-@pytest.mark.parametrize("arrays", [(), ("voxels", "voxels"), ("flow",), ("voxels", "")])
+@pytest.mark.parametrize("arrays", [(), ("voxels", "voxels"), ("depth",), ("voxels", "")])
 def test_arrays_nobody_makes_are_refused(arrays: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="arrays"):
         array_layout(Recipe(), "int8", arrays)

@@ -46,17 +46,21 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "shuffle": False,
     "max_sequences_per_video": 11,
     "on_bad_video": "raise",
+    "flow_method": "dis-medium",
+    "flow_direction": "backward",
+    "flow_from": 20,
+    "flow_margin_px": -1,
 }
 
 
 def test_digests_are_stable() -> None:
     """A saved position names this digest: if it changes, so must NUMERICS_VERSION or the digest's own version."""
-    assert StreamSpec().digest == "32a6125cc83642374a10b3667bd15137"
-    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "219aa1305b4fb866bf83565ce4867a58"
+    assert StreamSpec().digest == "1f0eaf0bd1095831fb1ba7265a8976b6"
+    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "7500638959e8374e2ae58769d796943f"
 
 
 def test_canonical_form_of_the_default() -> None:
-    assert StreamSpec().canonical().startswith(b'{"max_sequences_per_video":10,"on_bad_video":"substitute","recipe":{"')
+    assert StreamSpec().canonical().startswith(b'{"flow_direction":"forward","flow_from":0,')
     assert b'"resize_scale":[1.0,1.0]' in StreamSpec().canonical()
 
 

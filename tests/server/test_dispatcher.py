@@ -179,7 +179,7 @@ def test_want_without_a_session() -> None:
         ({"recipe": {"self": 1}}, ("voxels",), 4, "unknown recipe key 'self'"),
         ({"recipe": {"bins": 1.5}}, ("voxels",), 4, "recipe bins = 1.5"),
         ({}, (), 4, "arrays"),
-        ({}, ("flow",), 4, "unknown array 'flow'"),
+        ({}, ("depth",), 4, "unknown array 'depth'"),
         ({}, ("voxels",), 0, "batch_size = 0"),
         ({}, ("voxels",), MOST_BATCH_SIZE + 1, f"batch_size = {MOST_BATCH_SIZE + 1}"),
         ({"recipe": "paper"}, ("voxels",), 4, "none of the 5 videos gives a sequence; v0.mp4: 100 frames"),
@@ -791,7 +791,7 @@ _hellos = st.builds(
         st.sampled_from((None, "paper", "int16", True, 1, 2.5, [1], {"gamma": 2}, {"bins": 1000}, {"": {}}, b"x")),
         max_size=3,
     ),
-    arrays=st.lists(st.sampled_from(("voxels", "frames", "flow")), max_size=3).map(tuple),
+    arrays=st.lists(st.sampled_from(("voxels", "frames", "depth")), max_size=3).map(tuple),
     batch_size=st.integers(0, 2**64 - 1),
     seed=st.integers(0, 2**64 - 1),
 )

@@ -1,0 +1,183 @@
+"""The flow of a clip: which pictures, on which part, in which order, transformed together with the frames.
+
+Order: resize the picture, estimate on the crop with its margin, crop, flip. The contrast of a degraded view is left
+out: it moves nothing and clips what could be matched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_server.flow.auto import choose
+from v2v_server.flow.estimator import Estimator, Picture, one_thread
+from v2v_server.flow.methods import method
+from v2v_server.flow.settings import AUTO, FlowSettings
+from v2v_server.flow.validity import consistent
+from v2v_server.simulation.draw import resized_size
+from v2v_server.simulation.view import Frames, Window
+
+SKIPPED = "skipped"
+PAUSED = "paused"
+
+
+@dataclass(frozen=True, slots=True)
+class FlowClip:
+    """The flow of one sample.
+
+    Attributes:
+        flow: [T, 2, H, W] float16, (x, y), px; flow[t] belongs to voxel t of the target sequence.
+        valid: [T, 1, H, W] uint8, 1 where the forward-backward check holds; None where it was not asked for.
+        methods: what made each flow[t]: a method's name, "paused" or "skipped".
+    """
+
+    flow: npt.NDArray[np.float16]
+    valid: npt.NDArray[np.uint8] | None
+    methods: tuple[str, ...]
+
+
+def flow_window(
+    params: SampleParams,
+    recipe: Recipe,
+    margin_px: int | None,
+    picture_top_px: int,
+    picture_height_px: int,
+    picture_width_px: int,
+) -> Window:
+    """The part of the video picture that :func:`flow_for` needs; it holds what the view needs.
+
+    Args:
+        params, recipe: the draw and its recipe.
+        margin_px: of the :class:`FlowSettings`.
+        picture_top_px: first usable row of the upright video picture.
+        picture_height_px, picture_width_px: size of the usable picture.
+    """
+    if params.scale != 1.0:
+        return Window(picture_top_px, 0, picture_height_px, picture_width_px)
+    top, left, height, width = _region(params, recipe, margin_px, picture_height_px, picture_width_px)
+    return Window(picture_top_px + top, left, height, width)
+
+
+def view_part(frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None) -> Frames:
+    """The part of the frames of a :func:`flow_window` that ``apply_view`` takes, as a view of them."""
+    if params.scale != 1.0:
+        return frames
+    top, left = _offset(params, margin_px)
+    return frames[:, top : top + recipe.crop_height_px, left : left + recipe.crop_width_px]
+
+
+def flow_for(
+    frames: Frames, params: SampleParams, recipe: Recipe, settings: FlowSettings, *, validity: bool = False
+) -> FlowClip:
+    """Flow between the ends of each voxel of one drawn sample.
+
+    A voxel whose two ends are the same frame of the video (the camera pauses) has exactly zero flow.
+
+    Args:
+        frames: [n, h, w] uint8, the decoded frames in the window of :func:`flow_window`.
+        params, recipe: the draw and its recipe.
+        settings: how.
+        validity: also make the mask, which takes a second estimate of each pair.
+
+    Raises:
+        UsageError: the frames do not hold the crop or what the draw shows, or there is no voxel to begin at.
+    """
+    count, height, width = recipe.voxels_per_clip, recipe.crop_height_px, recipe.crop_width_px
+    if settings.first_voxel > count:
+        raise UsageError(f"flow from voxel {settings.first_voxel}: the clip has {count} voxels")
+    source = params.source_index(recipe.steps)
+    pictures = _Pictures(frames, params, recipe, settings.margin_px, int(source[-1]) + 1)
+    flow = np.zeros((count, 2, height, width), np.float16)
+    valid = np.zeros((count, 1, height, width), np.uint8) if validity else None
+    methods = [SKIPPED] * settings.first_voxel
+    estimators: dict[str, Estimator] = {}
+    with one_thread():
+        for voxel in range(settings.first_voxel, count):
+            span = recipe.bins * recipe.frames_per_bin
+            start = (recipe.lead_voxels + voxel) * span
+            ends = int(source[start]), int(source[start + span])
+            if ends[0] == ends[1]:
+                methods.append(PAUSED)
+                if valid is not None:
+                    valid[voxel] = 1
+                continue
+            earlier, later = pictures.pair(*ends)
+            first, second = (earlier, later) if settings.direction == "forward" else (later, earlier)
+            name = choose(first, second) if settings.method == AUTO else settings.method
+            methods.append(name)
+            estimate = estimators.setdefault(name, method(name).estimator())
+            field = estimate(first, second)
+            flow[voxel] = pictures.crop(field, params.flip).transpose(2, 0, 1)
+            if params.flip:
+                np.negative(flow[voxel, 0], out=flow[voxel, 0])
+            if valid is not None:
+                valid[voxel, 0] = pictures.crop(consistent(field, estimate(second, first)), params.flip)
+    return FlowClip(flow, valid, tuple(methods))
+
+
+class _Pictures:
+    """The pictures that flow is estimated on, made when they are asked for."""
+
+    def __init__(
+        self, frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None, needed: int
+    ) -> None:
+        if frames.ndim != 3 or frames.dtype != np.uint8 or len(frames) < needed:
+            raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: this draw shows {needed}, uint8 [n, h, w]")
+        self._frames = frames
+        self._scale = params.scale
+        self._size: tuple[int, int] = (frames.shape[1], frames.shape[2])
+        self._top, self._left = _offset(params, margin_px)
+        self._height, self._width = recipe.crop_height_px, recipe.crop_width_px
+        self._region = Window(0, 0, self._size[0], self._size[1])
+        if params.scale != 1.0:
+            self._size = resized_size(self._size[0], self._size[1], params.scale)
+            self._region = _region(params, recipe, margin_px, self._size[0], self._size[1])
+        self._made: dict[int, Picture] = {}
+        if self._region.height_px < self._top + self._height or self._region.width_px < self._left + self._width:
+            raise UsageError(
+                f"frames of {frames.shape[2]}x{frames.shape[1]} pixels at scale {params.scale} do not hold a crop of "
+                f"{self._width}x{self._height} with its margin: decode the window that flow_window() names"
+            )
+
+    def pair(self, earlier: int, later: int) -> tuple[Picture, Picture]:
+        # One pair's later picture is mostly the next one's earlier one; nothing older is asked for again.
+        self._made = {number: self._made[number] if number in self._made else self._make(self._frames[number])
+                      for number in (earlier, later)}  # fmt: skip
+        return self._made[earlier], self._made[later]
+
+    def _make(self, frame: Picture) -> Picture:
+        if self._scale == 1.0:
+            return np.ascontiguousarray(frame)
+        method = cv2.INTER_AREA if self._scale < 1.0 else cv2.INTER_LINEAR
+        resized = cv2.resize(frame, (self._size[1], self._size[0]), interpolation=method)
+        top, left, height, width = self._region
+        return np.ascontiguousarray(resized[top : top + height, left : left + width], np.uint8)
+
+    def crop(self, field: npt.NDArray[Any], flip: bool) -> npt.NDArray[Any]:
+        """The crop's part of something on the grid of the pictures, mirrored where the view is; values as they are."""
+        part = field[self._top : self._top + self._height, self._left : self._left + self._width]
+        return part[:, ::-1] if flip else part
+
+
+def _region(params: SampleParams, recipe: Recipe, margin_px: int | None, height_px: int, width_px: int) -> Window:
+    """The crop with its margin, in the resized picture."""
+    if margin_px is None:
+        return Window(0, 0, height_px, width_px)
+    top, left = max(0, params.crop_top_px - margin_px), max(0, params.crop_left_px - margin_px)
+    bottom = min(height_px, params.crop_top_px + recipe.crop_height_px + margin_px)
+    right = min(width_px, params.crop_left_px + recipe.crop_width_px + margin_px)
+    return Window(top, left, bottom - top, right - left)
+
+
+def _offset(params: SampleParams, margin_px: int | None) -> tuple[int, int]:
+    """Row and column of the crop in its region."""
+    if margin_px is None:
+        return params.crop_top_px, params.crop_left_px
+    return min(params.crop_top_px, margin_px), min(params.crop_left_px, margin_px)

@@ -1,0 +1,39 @@
+"""Dense inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016), by OpenCV.
+
+Patches are matched from coarse to fine down to a finest scale, whose field is then enlarged: scale 2 is a quarter of
+the picture's size. Scale 1 takes about four times as long and resolves motion that scale 2 blurs.
+"""
+
+from __future__ import annotations
+
+import cv2
+
+from v2v_server.flow.estimator import Estimator, Field, Picture
+
+ULTRAFAST = cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
+FAST = cv2.DISOPTICAL_FLOW_PRESET_FAST
+MEDIUM = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+
+SMALLEST_SIDE_PX = 64
+"""OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
+
+
+def dis(preset: int, finest_scale: int, patch_stride_px: int | None = None) -> Estimator:
+    """An estimator with a preset's number of iterations, patch stride and refinement.
+
+    Args:
+        preset: ULTRAFAST, FAST or MEDIUM.
+        finest_scale: the pyramid level that matching ends at; 0 is the full picture.
+        patch_stride_px: distance of patches on each level; None: the preset's, 4 (medium: 3). Patches have 8 pixels.
+    """
+    search = cv2.DISOpticalFlow.create(preset)
+    if patch_stride_px is not None:
+        search.setPatchStride(patch_stride_px)
+
+    def estimate(first: Picture, second: Picture) -> Field:
+        # A small picture makes OpenCV lower the finest scale, and leave it so for the pictures that follow.
+        search.setFinestScale(finest_scale)
+        field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
+        return field
+
+    return estimate
