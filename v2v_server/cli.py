@@ -14,6 +14,7 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import PRESETS
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
+from v2v_protocol.spec import FLOW_DIRECTIONS, FLOW_METHODS, ON_BAD_VIDEO, VOXEL_DTYPES
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
 
 
@@ -136,6 +137,14 @@ def _add_spec(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="change one recipe field, e.g. voxels_per_clip=5",
     )
+    parser.add_argument("--voxel-dtype", choices=VOXEL_DTYPES, help="default int8: saturating, and counted")
+    parser.add_argument("--no-shuffle", dest="shuffle", action="store_false", default=None, help="catalogue order")
+    parser.add_argument("--max-sequences-per-video", type=int, metavar="N", help="per epoch (default 10)")
+    parser.add_argument("--on-bad-video", choices=ON_BAD_VIDEO, help="default substitute")
+    parser.add_argument("--flow-method", choices=FLOW_METHODS, help="where flow is asked for (default auto)")
+    parser.add_argument("--flow-direction", choices=FLOW_DIRECTIONS, help="default forward")
+    parser.add_argument("--flow-from", type=int, metavar="T", help="first voxel whose flow is computed (default 0)")
+    parser.add_argument("--flow-margin-px", type=int, metavar="N", help="picture around the crop (64; -1: all of it)")
 
 
 def run_command(

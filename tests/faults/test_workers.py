@@ -25,6 +25,7 @@ from v2v_server.video.catalogue import open_catalogue
 
 INJECT = Path(__file__).parent / "inject"
 STAGES = ("decode", "simulate", "send")
+pytestmark = pytest.mark.slow
 
 
 @contextmanager

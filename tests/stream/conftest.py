@@ -66,14 +66,21 @@ def _no_process_left() -> Iterator[None]:
     before = set(psutil.Process().children(recursive=True))
     yield
     left = [process for process in psutil.Process().children(recursive=True) if process not in before]
-    left = [process for process in left if "resource_tracker" not in " ".join(process.cmdline())]
+    left = [process for process in left if "resource_tracker" not in _command(process)]
     psutil.wait_procs(left, timeout=10)
     assert not [process for process in left if process.is_running()]
 
 
 def server_workers(pid: int) -> list[psutil.Process]:
     """The worker processes of a server (it has other helpers, which come and go)."""
-    return [child for child in psutil.Process(pid).children() if "worker" in child.cmdline()]
+    return [child for child in psutil.Process(pid).children() if " worker " in _command(child)]
+
+
+def _command(process: psutil.Process) -> str:
+    try:
+        return " ".join(process.cmdline())
+    except (psutil.NoSuchProcess, psutil.ZombieProcess):
+        return ""
 
 
 def digest(batch: Batch) -> str:
