@@ -136,7 +136,8 @@ class Worker:
         note(self._logbook, lease.lease)
         self._send(encode(Begun(lease.lease)))
         self._make(lease)
-        # A decoder that waits in a reference cycle for the collector is few objects to Python, but much memory.
+        # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to Python's
+        # collector, which waits for many, but each holds pictures.
         gc.collect()
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
 
