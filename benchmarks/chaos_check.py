@@ -32,7 +32,7 @@ from benchmarks.chaos_log import BatchLine, Line, OrderVerdict, Sighting, Sighti
 from v2v_protocol.errors import V2VError, VideoError
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
-from v2v_server.produce import make_sample
+from v2v_server.produce import decode_for, make_sample
 from v2v_server.remake import remake
 from v2v_server.schedule import MOST_CANDIDATES, Schedule
 from v2v_server.sequences import Sequence, SequenceTable
@@ -60,7 +60,7 @@ class StreamOracle:
         self._catalogue = catalogue
         self._asked = asked
         self._spec = asked.stream_spec
-        self._schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, self._spec), shuffle=True)
+        self._schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, self._spec), self._spec)
         self.sequences = self._schedule.count
 
     def sequence(self, epoch: int, index: int, candidate: int) -> Sequence:
@@ -98,7 +98,7 @@ class StreamOracle:
             arrays=("voxels", "frames"),
             deadline_seconds=60.0,
         )
-        made = make_sample(lease, sample.index, self._catalogue.root)
+        made = make_sample(lease, decode_for(lease, lease.indices, self._catalogue.root)[0])
         return sighting(made.arrays, made.provenance)
 
 

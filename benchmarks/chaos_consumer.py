@@ -55,7 +55,12 @@ PROFILES = (
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=4, think_seconds=0.02, save_every=5),
     Profile({"recipe": {"preset": "paper"}}, seed=2, batch_size=1),
     Profile(
-        {"recipe": {**_SMALL, "preset": "paper-contrast", "voxels_per_clip": 6}, "voxel_dtype": "int16"},
+        {
+            "recipe": {**_SMALL, "preset": "paper-contrast", "voxels_per_clip": 6},
+            "voxel_dtype": "int16",
+            "samples_per_decode": 3,
+            "sibling_spacing": 3,
+        },
         seed=2**63 + 5,
         batch_size=3,
         think_seconds=0.2,
@@ -64,7 +69,7 @@ PROFILES = (
     # The stream of the first one in other batches: all samples of the two are compared with each other.
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=5, think_seconds=0.05),
 )
-"""Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer."""
+"""Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings."""
 
 
 def profile(number: int) -> Profile:

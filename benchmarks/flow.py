@@ -212,7 +212,7 @@ def cost(corpus: Path, rows: str, methods: Sequence[str], samples: int) -> list[
 
 def _jobs(catalogue: Catalogue, samples: int) -> Iterator[tuple[Path, Any, int, SampleParams, tuple[int, int], int]]:
     spec = StreamSpec(recipe=preset("paper"))
-    schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, spec), shuffle=True)
+    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
     if not schedule.count:
         raise UsageError(f"--corpus {catalogue.root}: no clip of {spec.recipe.frames_needed} frames or more")
     for number in range(samples):

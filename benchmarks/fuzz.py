@@ -44,6 +44,7 @@ MOST_GROWTH_MIB = 16.0
 MOST_PEAK_GROWTH_MIB = 64.0
 """More than that at any moment of the decoder's run: something was allocated because a frame said so."""
 MOST_DECODE_SECONDS = 1.0
+"""Processor time: a busy host is not the decoder's fault."""
 _SHOWN_BYTES = 400
 
 
@@ -68,7 +69,7 @@ def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
             header, payload = fuzzer.sample()
         else:
             header = fuzzer.header()
-        asked = time.perf_counter()
+        asked = time.thread_time()
         try:
             if whole_sample:
                 decode_sample(header, payload)
@@ -85,7 +86,7 @@ def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
         except Exception as error:  # noqa: BLE001 - that there is no other kind is what is tested
             shown = repr(header) if whole_sample else header[:_SHOWN_BYTES].hex()
             failures.append(f"frame {number}: {type(error).__name__}: {error}; {shown[: 2 * _SHOWN_BYTES]}")
-        longest = max(longest, time.perf_counter() - asked)
+        longest = max(longest, time.thread_time() - asked)
     return {
         "target": "decoder",
         "frames": frames,
@@ -95,7 +96,7 @@ def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
         "refused": outcomes["refused"],
         "failures": failures,
         "seconds": time.perf_counter() - began,
-        "longest_seconds": longest,
+        "longest_cpu_seconds": longest,
         "rss_before_mib": before,
         "rss_after_mib": psutil.Process().memory_info().rss / MIB,
         "peak_growth_mib": _peak_mib() - peak_before,
@@ -180,8 +181,9 @@ def gave_way(record: dict[str, Any]) -> list[str]:
         wrong.append(f"resident memory grew by {growth:.1f} MiB; the limit is {MOST_GROWTH_MIB:g}")
     if record.get("peak_growth_mib", 0.0) > MOST_PEAK_GROWTH_MIB:
         wrong.append(f"memory peaked {record['peak_growth_mib']:.1f} MiB higher; the limit is {MOST_PEAK_GROWTH_MIB:g}")
-    if record["target"] == "decoder" and record["longest_seconds"] > MOST_DECODE_SECONDS:
-        wrong.append(f"one frame took {record['longest_seconds']:.2f} s; the limit is {MOST_DECODE_SECONDS:g}")
+    if record["target"] == "decoder" and record["longest_cpu_seconds"] > MOST_DECODE_SECONDS:
+        taken = record["longest_cpu_seconds"]
+        wrong.append(f"one frame took {taken:.2f} s of processor time; the limit is {MOST_DECODE_SECONDS:g}")
     return wrong
 
 

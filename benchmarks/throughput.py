@@ -28,6 +28,7 @@ from typing import Any
 import psutil
 from torch.utils.data import DataLoader
 
+from benchmarks.plots import bars, panels
 from benchmarks.released import ReleasedStyleDataset
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -129,7 +130,7 @@ def decode(setting: Setting) -> Measured:
 def _decode_jobs(setting: Setting, number: int, count: Any, stop: Event) -> None:
     spec = StreamSpec()
     with _catalogue(setting) as catalogue:
-        schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, spec), shuffle=True)
+        schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
         for turn in itertools.count(number, setting.workers):
             if stop.is_set():
                 return
@@ -138,7 +139,7 @@ def _decode_jobs(setting: Setting, number: int, count: Any, stop: Event) -> None
                 Task(b"", epoch, index), number=1, sequence=schedule.candidate(0, epoch, index, 0), quarantine=0,
                 catalogue=catalogue, spec=spec, seed=0, arrays=("voxels",), deadline_seconds=60.0,
             )  # fmt: skip
-            decode_for(lease, index, catalogue.root)
+            decode_for(lease, lease.indices, catalogue.root)
             count.value += 1
 
 
@@ -234,6 +235,7 @@ def main() -> int:
     parser.add_argument("--repeat", type=int, default=3, help="turns")
     parser.add_argument("--warmup-batches", type=int, default=2)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the medians")
     arguments = parser.parse_args()
     setting = Setting(
         arguments.videos, arguments.rows, arguments.workers, arguments.batch_size, arguments.seconds,
@@ -249,6 +251,10 @@ def main() -> int:
         )
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+    if arguments.plot is not None:
+        with panels(arguments.plot, 2, height_inches=3.0) as (speed, cost):
+            bars(speed, {record["name"]: record["batches_per_second"] for record in records}, "batches/s")
+            bars(cost, {record["name"]: record["cpu_seconds_per_batch"] for record in records}, "CPU seconds a batch")
     missed = [record for record in records if record["ratio_to_baseline"] < BARS.get(record["name"], 0.0)]
     for record in missed:
         print(

@@ -1,4 +1,4 @@
-"""`make demo`: real clips through a server into a dataset; batches a second, and a picture.
+"""`make demo`: real clips through a server into a dataset, batches a second and a picture; then a minute of training.
 
 python -m examples.demo --videos DIR --picture out/demo.png
 """
@@ -6,9 +6,13 @@ python -m examples.demo --videos DIR --picture out/demo.png
 from __future__ import annotations
 
 import argparse
+import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
 
+from examples.demo_training import judge
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_server.picture import Row, draw_rows, write_png
@@ -16,42 +20,62 @@ from v2v_server.picture import Row, draw_rows, write_png
 _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2
 _VOXELS_PER_CLIP = 10
+_CONFIGURATION = "tiny-cpu"
 
 
-def main() -> None:
-    """Runs the demo."""
-    parser = argparse.ArgumentParser(description="Stream real clips through a server into a dataset.")
+def main() -> int:
+    """Runs the demo; returns 0, or 1 if the trained network is no better than a grey picture."""
+    parser = argparse.ArgumentParser(description="Stream real clips through a server into a dataset, then train.")
     parser.add_argument("--videos", required=True, metavar="DIR")
-    parser.add_argument("--picture", required=True, metavar="FILE.png")
+    parser.add_argument(
+        "--picture", required=True, metavar="FILE.png", help="training.png and training/ come beside it"
+    )
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of streaming alone")
+    parser.add_argument("--training-seconds", type=float, default=60.0)
     arguments = parser.parse_args()
+    picture = Path(arguments.picture)
+    picture.parent.mkdir(parents=True, exist_ok=True)
 
     with LocalServer(arguments.videos, workers=arguments.workers) as server:
-        # The demo's clips are short: 10 voxel grids need 51 frames, the paper's 40 need 201.
-        dataset = V2VStreamDataset(
-            server.address, batch_size=_BATCH_SIZE, recipe={"preset": "paper", "voxels_per_clip": _VOXELS_PER_CLIP}
+        _stream(server.address, arguments.seconds, arguments.workers, picture)
+        run = picture.parent / "training"
+        shutil.rmtree(run, ignore_errors=True)
+        trained = subprocess.run(
+            [
+                *(sys.executable, "-m", "trainer.train", _CONFIGURATION, "--connect", server.address),
+                *("--out", str(run), "--set", f"run.seconds={arguments.training_seconds}"),
+            ],
+            check=False,
         )
-        shown: list[Row] = []
-        batches, started = 0, 0.0
-        while not batches or time.monotonic() - started < arguments.seconds:
-            for batch in dataset:
-                if len(shown) < 6:
-                    shown += _rows(batch)
-                batches += 1
-                if batches == _WARMUP_BATCHES:
-                    started = time.monotonic()
-        seconds = time.monotonic() - started
+        if trained.returncode:
+            return trained.returncode
+        return 0 if judge(server.address, _CONFIGURATION, run, picture.with_name("training.png")) else 1
+
+
+def _stream(address: str, seconds: float, workers: int, picture: Path) -> None:
+    # The demo's clips are short: 10 voxel grids need 51 frames, the paper's 40 need 201.
+    dataset = V2VStreamDataset(
+        address, batch_size=_BATCH_SIZE, recipe={"preset": "paper", "voxels_per_clip": _VOXELS_PER_CLIP}
+    )
+    shown: list[Row] = []
+    batches, started = 0, 0.0
+    while not batches or time.monotonic() - started < seconds:
+        for batch in dataset:
+            if len(shown) < 6:
+                shown += _rows(batch)
+            batches += 1
+            if batches == _WARMUP_BATCHES:
+                started = time.monotonic()
+    elapsed = time.monotonic() - started
 
     counted = batches - _WARMUP_BATCHES
     print(f"last batch: {batch}")
     print(
-        f"{counted / seconds:.2f} batches/s ({counted * _BATCH_SIZE / seconds:.1f} samples/s) over {seconds:.1f} s "
-        f"with {arguments.workers} workers; batches of {_BATCH_SIZE} clips of {_VOXELS_PER_CLIP} voxel grids, "
+        f"{counted / elapsed:.2f} batches/s ({counted * _BATCH_SIZE / elapsed:.1f} samples/s) over {elapsed:.1f} s "
+        f"with {workers} workers; batches of {_BATCH_SIZE} clips of {_VOXELS_PER_CLIP} voxel grids, "
         f"first {_WARMUP_BATCHES} batches left out"
     )
-    picture = Path(arguments.picture)
-    picture.parent.mkdir(parents=True, exist_ok=True)
     write_png(picture, draw_rows(shown[:6]))
     print(f"picture: {picture}")
 
@@ -68,4 +92,4 @@ def _rows(batch: Batch) -> list[Row]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

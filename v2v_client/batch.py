@@ -30,6 +30,7 @@ class Batch:
             save that of the last batch you trained on. It holds for any number of loader workers.
         wait_seconds: how long the consumer (with a DataLoader: the loader worker) waited for this batch.
         cpu_seconds: processor time that the server's workers spent on it.
+        decodes: clips that were decoded for it; fewer than its samples where siblings share one.
     """
 
     voxels: torch.Tensor | None
@@ -42,6 +43,7 @@ class Batch:
     resume_state: Mapping[str, Any]
     wait_seconds: float
     cpu_seconds: float
+    decodes: int
 
     def __len__(self) -> int:
         return len(self.indices)

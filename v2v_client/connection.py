@@ -67,6 +67,7 @@ class Arrival:
         provenance: where it came from.
         worker: name of the server worker that made it.
         cpu_seconds: processor time that took there.
+        decoded: whether a clip was decoded for it.
     """
 
     index: int
@@ -74,6 +75,7 @@ class Arrival:
     provenance: Provenance
     worker: str
     cpu_seconds: float
+    decoded: bool
 
 
 class Connection:
@@ -364,7 +366,7 @@ class Connection:
         self._credit_refusals = 0
         self._last = header.index
         self.want(())
-        return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds)
+        return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds, header.decoded)
 
     # --- the link -----------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,16 +15,20 @@ from v2v_client.batch import Batch
 from v2v_client.connection import Connection
 from v2v_client.delivery import deliver
 from v2v_client.liveness import Patience
+from v2v_client.options import Options
 from v2v_client.progress import Progress
 from v2v_client.state import LoaderShare, ResumeState, Stream
 from v2v_client.world import EpochPlan, resumed
 from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, array_layout
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 
 _NO_BATCH_YET = 0
+_NOT_SHARED = (
+    "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
+    "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +67,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         seed: of all random draws and of the order.
         epoch: the first one.
         rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, flow_*: see
-            :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
+        preset: speed against accuracy: "exact", "balanced" or "fast" (:data:`v2v_protocol.spec.SPEED_PRESETS`); the
+            options below may change what it sets.
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
+            flow_*: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
 
@@ -71,8 +78,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
     sample comes once relative to the state that was saved, whichever process died in between.
 
     Memory of an iterating process (each loader worker is one), however slow its trainer, with S bytes in a sample, k
-    batches that the trainer itself still holds, and a credit of C samples (the server grants twice ``batch_size``, or
-    twice its number of workers if that is more, or less where ``--max-credit-bytes`` says so):
+    batches that the trainer itself still holds, and a credit of C samples. The server grants twice ``batch_size``, or
+    twice its number of workers if that is more; ``samples_per_decode`` times as much (in whole batches) where siblings
+    share a decode; less where ``--max-credit-bytes`` says so.
 
         received, waiting in ZeroMQ    C S           (2 C S while everything is asked for again)
         batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
@@ -97,10 +105,14 @@ class V2VStreamDataset(IterableDataset[Batch]):
         epoch: int = 0,
         rank: int | None = None,
         world_size: int | None = None,
+        preset: str | None = None,
         voxel_dtype: str | None = None,
         shuffle: bool | None = None,
         max_sequences_per_video: int | None = None,
         on_bad_video: str | None = None,
+        loop_filter: str | None = None,
+        samples_per_decode: int | None = None,
+        sibling_spacing: int | None = None,
         flow_method: str | None = None,
         flow_direction: str | None = None,
         flow_from: int | None = None,
@@ -115,20 +127,22 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._batch_size = _whole("batch_size", batch_size, 1, 65_536)
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._seed = _whole("seed", seed, 0, LARGEST_SEED)
-        asked = {
-            "recipe": recipe.to_dict() if isinstance(recipe, Recipe) else recipe,
-            "voxel_dtype": voxel_dtype,
-            "shuffle": shuffle,
-            "max_sequences_per_video": max_sequences_per_video,
-            "on_bad_video": on_bad_video,
-            "flow_method": flow_method,
-            "flow_direction": flow_direction,
-            "flow_from": flow_from,
-            "flow_margin_px": flow_margin_px,
-        }
-        self._asked = {name: value for name, value in asked.items() if value is not None}
-        spec = StreamSpec.from_dict(self._asked)  # an error in an option is raised here, not by the server
-        array_layout(spec.recipe, spec.voxel_dtype, self._arrays)
+        self._options = Options(
+            self._arrays,
+            preset=preset,
+            recipe=recipe,
+            voxel_dtype=voxel_dtype,
+            shuffle=shuffle,
+            max_sequences_per_video=max_sequences_per_video,
+            on_bad_video=on_bad_video,
+            loop_filter=loop_filter,
+            samples_per_decode=samples_per_decode,
+            sibling_spacing=sibling_spacing,
+            flow_method=flow_method,
+            flow_direction=flow_direction,
+            flow_from=flow_from,
+            flow_margin_px=flow_margin_px,
+        )
         self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
@@ -240,7 +254,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 f"seed: the state has {loaded.seed}, this dataset {self._seed}; give seed={loaded.seed}"
             )
         if loaded.stream is not None:
-            self._resolved(loaded.stream, "the state")
+            self._options.spec(loaded.stream, "the state")
         loader = get_worker_info()
         if loaded.share is not None:
             self._require_share(loaded, loader)
@@ -317,14 +331,16 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self, epoch: int, state: ResumeState | None, loader: _Loader | None, done: int, mine: int
     ) -> Iterator[Batch]:
         pinned = self.stream
+        workers = loader or _Loader(0, 1, "", 0)
         connection = Connection(
             self._address,
             Hello(
-                self._resolved(pinned, "this dataset's stream"),
+                self._options.spec(pinned, "this dataset's stream"),
                 self._arrays,
                 self._batch_size,
                 self._seed,
                 quarantine=None if state is None else state.quarantine,
+                stride=self._batch_size * self.world_size * workers.workers,
             ),
             epoch,
             pinned=pinned,
@@ -342,7 +358,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
             plan = self._plan(stream, state)
             if state is None:
                 plan.require_batches()
-            workers = loader or _Loader(0, 1, "", 0)
+            if stream.resolved.samples_per_decode > 1 and not plan.shares_decodes(
+                stream.resolved.sibling_spacing, workers.workers
+            ):
+                warnings.warn(_NOT_SHARED, stacklevel=2)
             batches = plan.batches_of_worker(workers.worker, workers.workers)[done:]
 
             def after(batch: int, quarantine: int) -> dict[str, Any]:
@@ -394,15 +413,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
         origin, position = (0, 0) if state is None else (state.origin, state.position)
         share = LoaderShare(loader.worker, loader.workers, self._batch_size, done)
         return ResumeState(stream, self._seed, epoch, origin, position, self.world_size, share, quarantine)
-
-    def _resolved(self, pinned: Stream | None, side: str) -> dict[str, Any]:
-        """What to ask the server for: the pinned stream's spec, which must be what the options say."""
-        if pinned is None:
-            return dict(self._asked)
-        spec = StreamSpec.from_dict(self._asked, default=pinned.resolved)
-        ours = dataclasses.replace(pinned, spec=spec.to_dict(), spec_digest=spec.digest)
-        ours.require_same(pinned, ours="the options given to this dataset", theirs=side)
-        return dict(pinned.spec)
 
 
 def _distributed() -> tuple[int, int] | None:

@@ -25,12 +25,14 @@ class _Draft:
         self.arrays = arrays
         self.provenance: list[Provenance | None] = [None] * samples
         self.cpu_seconds = 0.0
+        self.decodes = 0
 
     def fill(self, row: int, sample: Arrival) -> None:
         for name, array in sample.arrays.items():
             self.arrays[name][row] = array  # the one copy between the wire and the trainer
         self.provenance[row] = sample.provenance
         self.cpu_seconds += sample.cpu_seconds
+        self.decodes += sample.decoded
 
 
 def deliver(
@@ -106,4 +108,5 @@ def _finished(
         resume_state=resume_state,
         wait_seconds=wait_seconds,
         cpu_seconds=draft.cpu_seconds,
+        decodes=draft.decodes,
     )

@@ -27,6 +27,7 @@ from v2v_client.local_server import LocalServer
 from v2v_client.schedule_check import ScheduleCheck
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.spec import SPEED_PRESETS
 
 _RSS_EVERY_SECONDS = 0.5
 
@@ -53,6 +54,7 @@ class Measurement:
     waits: list[float] = field(default_factory=list)
     samples: int = 0
     bytes: int = 0
+    decodes: int = 0
     worker_cpu_seconds: float = 0.0
     compute_seconds: float = 0.0
 
@@ -60,6 +62,7 @@ class Measurement:
         self.waits.append(wait_seconds)
         self.samples += len(batch)
         self.bytes += batch.nbytes
+        self.decodes += batch.decodes
         self.worker_cpu_seconds += batch.cpu_seconds
         self.compute_seconds += compute_seconds
 
@@ -153,6 +156,7 @@ def measure(
         "bytes_per_second": measured.bytes / elapsed,
         "client_stall_fraction": sum(measured.waits) / elapsed,
         "peak_rss_bytes": usage.peak_rss_bytes,
+        "samples_per_decode": measured.samples / max(measured.decodes, 1),
         "lost": check.lost,
         "duplicated": check.duplicated,
         "foreign": check.foreign,
@@ -200,6 +204,8 @@ def _parser() -> argparse.ArgumentParser:
         "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulates a training step of this length"
     )
     parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    parser.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
+    parser.add_argument("--samples-per-decode", type=int, metavar="K", help="default: the preset's")
     parser.add_argument("--recipe", metavar="PRESET", help="default: the server's")
     parser.add_argument(
         "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="changes a recipe field"
@@ -246,6 +252,8 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
         address,
         batch_size=arguments.batch_size,
         arrays=tuple(arguments.arrays.split(",")),
+        preset=arguments.preset,
+        samples_per_decode=arguments.samples_per_decode,
         recipe=recipe_of(arguments.recipe, arguments.changes),
         seed=arguments.seed,
         rank=0,

@@ -3,9 +3,9 @@
 ``DataLoader(num_workers=...)`` copies the dataset into processes of its own, by fork or by pickling, and tells the
 original nothing. But an epoch must begin when the last loader worker has finished the one before, a late worker must
 begin the epoch that its siblings began, and the original must know that its own state is stale. So all copies share a
-log: a small temporary file (not shared memory: that may be missing or tiny in a container) to which each appends
-whole lines, which the kernel keeps apart, and from which each computes the same answers. It has no name, so that it is
-gone with the last process that has it open, however that one ends:
+log: a small file in memory (a temporary one where the system has none; never in /dev/shm, which may be missing or tiny
+in a container) to which each appends whole lines, which the kernel keeps apart, and from which each computes the same
+answers. It has no name, so that it is gone with the last process that has it open, however that one ends:
 
     set     an epoch to be in, and the state to start it from: from the user, or a state that was loaded
     main    the original itself iterates
@@ -97,8 +97,11 @@ class Progress:
         self.set(epoch, None)
 
     def _create(self) -> None:
-        descriptor, path = tempfile.mkstemp(prefix="v2v-progress-")
-        os.unlink(path)
+        if hasattr(os, "memfd_create"):
+            descriptor = os.memfd_create("v2v-progress")
+        else:
+            descriptor, path = tempfile.mkstemp(prefix="v2v-progress-")
+            os.unlink(path)
         fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | os.O_APPEND)
         self._adopt(descriptor)
 

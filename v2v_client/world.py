@@ -80,6 +80,21 @@ class EpochPlan:
             raise UsageError(f"loader worker {worker} of {workers}: workers are 0 .. {workers - 1}")
         return range(worker, self.batches, workers)
 
+    def shares_decodes(self, spacing: int, workers: int) -> bool:
+        """Whether all siblings, ``spacing`` apart in the epoch, go to the same loader worker of the same rank.
+
+        Raises:
+            UsageError: two of them could be in one global batch.
+        """
+        together = self.world_size * self.batch_size
+        if spacing < together:
+            raise UsageError(
+                f"sibling_spacing = {spacing}: samples of one decode would come in one global batch of "
+                f"{self.world_size} x {self.batch_size} = {together} samples (world size x batch_size); use a smaller "
+                "batch_size, or begin a new stream"
+            )
+        return spacing % (together * workers) == 0
+
     def require_batches(self) -> None:
         """
         Raises:

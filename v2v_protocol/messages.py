@@ -43,6 +43,8 @@ class Hello:
         batch_size: samples of a batch; it only sizes the suggested credit.
         seed: seed of the stream.
         quarantine: number of the quarantine snapshot to go on under; None: the newest.
+        stride: samples from the beginning of one batch of this consumer to that of its next: batch size x ranks x
+            loader workers. It settles a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
     """
 
     spec: Mapping[str, Any]
@@ -50,6 +52,7 @@ class Hello:
     batch_size: int
     seed: int
     quarantine: int | None = None
+    stride: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +111,7 @@ class SampleHeader:
         provenance: ``Provenance.to_dict()``.
         worker: name of the server worker that made it.
         cpu_seconds: processor time it took there.
+        decoded: whether a clip was decoded for it; False where it came from that of a sibling.
     """
 
     epoch: int
@@ -118,6 +122,7 @@ class SampleHeader:
     provenance: Mapping[str, Any]
     worker: str
     cpu_seconds: float
+    decoded: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,11 +170,15 @@ class Begun:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One sample of a lease is done; the frames of its SampleHeader message follow, to be passed on unopened."""
+    """A lease's sample is done; the frames of its SampleHeader message follow, to be passed on unopened.
+
+    ``cpu_seconds`` and ``decoded`` are those of the header.
+    """
 
     lease: int
     index: int
     cpu_seconds: float
+    decoded: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,14 +195,16 @@ class JobFailed:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """A decode group: one clip of one video, and the indices to be made from it.
+    """One clip of one video, and the sample to be made from it.
 
     Attributes:
         lease: number of the lease.
         reply_to: routing identity of the consumer (opaque; lets a direct data path be added without a new message).
         spec: canonical bytes of the StreamSpec.
         spec_digest, catalogue_digest: of the identity of its samples.
-        seed, epoch, indices: of the identity of its samples.
+        seed, epoch: of the identity of its samples.
+        indices: first the sample to be made; then its siblings, which are made from the same clip and follow in leases
+            of their own, if nothing comes in between: a worker that decodes for all of them at once decodes once.
         arrays: names of the arrays to send.
         video: catalogue id; the worker finds the file below its own root.
         fingerprint: what the file must still be.

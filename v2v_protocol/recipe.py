@@ -32,6 +32,10 @@ Range = tuple[float, float]
 _LARGEST_FRAMES = 1_000_001
 LARGEST_SCALE = 100.0
 _LARGEST_SIDE_PX = 16_384
+LARGEST_NORMAL = 6.56
+"""No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
+LARGEST_EVENTS = 2.0**49
+"""Most events a pixel may fire in a clip: beyond, float64 does not resolve a threshold any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,7 @@ class Recipe:
         frames_per_bin: steps between video frames that fall into one bin.
         lead_frames: 1 puts the frame before the first target frame in front (flow networks), else 0.
         lead_voxels: 1 puts one more voxel grid in front (ERAFT), else 0.
+        frame_stride: n uses every n-th frame, as if the video had been recorded at 1/n of its rate.
 
     View
         crop_height_px, crop_width_px: size of the random crop, pixels.
@@ -79,6 +84,7 @@ class Recipe:
     frames_per_bin: int = 1
     lead_frames: int = 0
     lead_voxels: int = 0
+    frame_stride: int = 1
 
     crop_height_px: int = 128
     crop_width_px: int = 128
@@ -115,8 +121,16 @@ class Recipe:
                 raise RecipeError(f"recipe {name} = {getattr(self, name)!r}: choose one of {', '.join(words)}")
         if self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
-                f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin + 1); "
+                f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
+                f"frame_stride + 1); "
                 f"the limit is {_LARGEST_FRAMES}"
+            )
+        if self.most_events > LARGEST_EVENTS:
+            raise RecipeError(
+                f"recipe: a pixel may fire {self.most_events:.4g} events in a clip; the limit is {LARGEST_EVENTS:.4g} "
+                f"(smallest threshold {self.smallest_and_largest_threshold[0]:.4g}, noise_sigma "
+                f"{self.noise_sigma[1]:.4g}, hot_pixel_sigma {self.hot_pixel_sigma[1]:.4g}, {self.steps} steps): raise "
+                "threshold or threshold_ratio, lower noise_sigma or hot_pixel_sigma, or make the clip shorter"
             )
 
     @property
@@ -127,12 +141,12 @@ class Recipe:
     @property
     def frames_needed(self) -> int:
         """Consecutive video frames a sample needs when the camera never pauses (paper: 201)."""
-        return self.steps + 1
+        return self.steps * self.frame_stride + 1
 
     @property
     def frames_per_sequence(self) -> int:
         """L, the stride between the starts of a video's sequences (paper: 200)."""
-        return self.steps
+        return self.steps * self.frame_stride
 
     @property
     def target_steps(self) -> tuple[int, ...]:
@@ -140,6 +154,21 @@ class Recipe:
         span = self.bins * self.frames_per_bin
         first = (self.lead_voxels + 1 - self.lead_frames) * span
         return tuple(range(first, self.steps + 1, span))
+
+    @property
+    def smallest_and_largest_threshold(self) -> tuple[float, float]:
+        """Ends of what the recipe itself can draw for either polarity, log units."""
+        (low, high), (ratio_low, ratio_high) = self.threshold, self.threshold_ratio
+        return low * min(1.0, ratio_low), high * max(1.0, ratio_high)
+
+    @property
+    def most_events(self) -> float:
+        """:func:`most_events` of the worst draw; with ``noise_unit`` "second", at one frame a second."""
+        smallest, largest = self.smallest_and_largest_threshold
+        sigma = self.noise_sigma[1] * (largest if self.noise_scales_with_threshold else 1.0)
+        hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
+        ends = math.log(self.log_eps), math.log1p(self.log_eps)
+        return most_events(self.steps, ends, (smallest, largest), self.steps * (sigma + hot))
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as plain values (ranges as lists), in a stable order."""
@@ -175,12 +204,30 @@ class Recipe:
         return dataclasses.replace(self, **changes)
 
 
+def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
+    """An upper bound of the events that one pixel can fire in a clip, and the measure of the arithmetic it needs.
+
+    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
+    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
+
+    Args:
+        steps: differences between frames.
+        log_ends: smallest and largest log intensity L.
+        thresholds: smallest and largest contrast threshold, log units.
+        noise_sum: standard deviations of noise and of hot drift, summed over the steps, log units.
+    """
+    low, high = log_ends
+    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
+    return (change + max(abs(low), abs(high))) / min(thresholds)
+
+
 _LIMITS: dict[str, tuple[float, float]] = {
     "voxels_per_clip": (1, 1_000_000),
     "bins": (1, 1024),
     "frames_per_bin": (1, 1024),
     "lead_frames": (0, 1),
     "lead_voxels": (0, 1),
+    "frame_stride": (1, 1000),
     "crop_height_px": (1, _LARGEST_SIDE_PX),
     "crop_width_px": (1, _LARGEST_SIDE_PX),
     "resize_scale": (0.01, LARGEST_SCALE),

@@ -96,6 +96,7 @@ def encode_sample(
     provenance: Mapping[str, Any],
     worker: str,
     cpu_seconds: float,
+    decoded: bool = True,
 ) -> Frames:
     """A whole SampleHeader message. The arrays are not copied: leave them alone until they are sent.
 
@@ -116,6 +117,7 @@ def encode_sample(
         provenance=provenance,
         worker=worker,
         cpu_seconds=cpu_seconds,
+        decoded=decoded,
     )
     return [*encode(header), *(array.reshape(-1).view(np.uint8).data for array in arrays.values())]
 

@@ -19,7 +19,8 @@ import zmq
 from v2v_protocol.errors import UsageError
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_HEADER_BYTES
 from v2v_server.blame import Loss
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.dispatcher import Dispatcher
+from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
 from v2v_server.quarantine import Verdict
 
 MOST_QUEUED = 512

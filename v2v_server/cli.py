@@ -14,7 +14,7 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import PRESETS
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec import FLOW_DIRECTIONS, FLOW_METHODS, ON_BAD_VIDEO, VOXEL_DTYPES
+from v2v_protocol.spec import FLOW_DIRECTIONS, FLOW_METHODS, LOOP_FILTERS, ON_BAD_VIDEO, SPEED_PRESETS, VOXEL_DTYPES
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
 
 
@@ -122,13 +122,15 @@ def new_parser(name: str, description: str) -> argparse.ArgumentParser:
 
 
 _SPEC_FLAGS = (
-    "voxel_dtype", "shuffle", "max_sequences_per_video", "on_bad_video",
+    "preset", "voxel_dtype", "shuffle", "max_sequences_per_video", "on_bad_video",
+    "loop_filter", "samples_per_decode", "sibling_spacing",
     "flow_method", "flow_direction", "flow_from", "flow_margin_px",
 )  # fmt: skip
 
 
 def _add_spec(parser: argparse.ArgumentParser) -> None:
     """Flags for what a stream is made of: the same for a server's defaults and for remaking one of its samples."""
+    parser.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed against accuracy (default exact)")
     parser.add_argument("--recipe", metavar="NAME", help=f"preset ({', '.join(PRESETS)}) or YAML file of recipe fields")
     parser.add_argument(
         "--set",
@@ -141,6 +143,11 @@ def _add_spec(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-shuffle", dest="shuffle", action="store_false", default=None, help="catalogue order")
     parser.add_argument("--max-sequences-per-video", type=int, metavar="N", help="per epoch (default 10)")
     parser.add_argument("--on-bad-video", choices=ON_BAD_VIDEO, help="default substitute")
+    parser.add_argument("--loop-filter", choices=LOOP_FILTERS, help="how exactly to decode (default exact)")
+    parser.add_argument("--samples-per-decode", type=int, metavar="K", help="samples made from each decoded clip (1)")
+    parser.add_argument(
+        "--sibling-spacing", type=int, metavar="S", help="how far apart those are (default: one batch of the consumer)"
+    )
     parser.add_argument("--flow-method", choices=FLOW_METHODS, help="where flow is asked for (default auto)")
     parser.add_argument("--flow-direction", choices=FLOW_DIRECTIONS, help="default forward")
     parser.add_argument("--flow-from", type=int, metavar="T", help="first voxel whose flow is computed (default 0)")

@@ -35,9 +35,11 @@ class ServeConfig:
         insecure: allow addresses other than loopback although nothing is encrypted or authenticated.
         port_file: file that receives the bound address once the server is ready.
         cache_dir: folder of the catalogue index; empty: the user's cache.
-        recipe: preset name, or a mapping of recipe fields: the default for consumers that ask for none.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, flow_method, flow_direction, flow_from,
-            flow_margin_px: defaults of the other spec fields, see :class:`v2v_protocol.spec.StreamSpec`.
+        preset: speed preset ("exact", "balanced", "fast"), see :data:`v2v_protocol.spec.SPEED_PRESETS`.
+        recipe: recipe preset name, or a mapping of recipe fields: the default for consumers that ask for none.
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
+            flow_method, flow_direction, flow_from, flow_margin_px: defaults of the other spec fields, see
+            :class:`v2v_protocol.spec.StreamSpec`.
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
         max_credit_bytes: bound on the bytes in flight to one consumer.
@@ -56,11 +58,15 @@ class ServeConfig:
     insecure: bool = False
     port_file: str = ""
     cache_dir: str = ""
+    preset: str = "exact"
     recipe: Any = None
     voxel_dtype: str = "int8"
     shuffle: bool = True
     max_sequences_per_video: int = 10
     on_bad_video: str = "substitute"
+    loop_filter: str | None = None
+    samples_per_decode: int | None = None
+    sibling_spacing: int | None = None
     flow_method: str = "auto"
     flow_direction: str = "forward"
     flow_from: int = 0
@@ -81,7 +87,7 @@ class ServeConfig:
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, self.insecure)
-        names = [item.name for item in dataclasses.fields(StreamSpec)]
+        names = ["preset", *(item.name for item in dataclasses.fields(StreamSpec))]
         spec = StreamSpec.from_dict({name: getattr(self, name) for name in names})
         object.__setattr__(self, "spec", spec)
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
@@ -25,7 +24,6 @@ from v2v_protocol.messages import (
     Refused,
     Result,
     Stop,
-    Unavailable,
     Want,
     WorkerHello,
 )
@@ -33,63 +31,20 @@ from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
+from v2v_server.candidates import Candidates
 from v2v_server.inspection import flaw
+from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker, refusal
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.metrics import Counters
 from v2v_server.quarantine import Quarantine, Verdict
 from v2v_server.reception import Reception
-from v2v_server.schedule import MOST_CANDIDATES
-from v2v_server.sequences import Sequence as VideoSequence
 from v2v_server.session import Session, Sessions
 from v2v_server.video.catalogue import Catalogue
-from v2v_server.workers import SILENCE_SECONDS, Workers
+from v2v_server.workers import MOST_WORKERS, SILENCE_SECONDS, Workers
 
 MOST_SESSIONS = 4096
-_LONGEST_TEXT = 2000
-"""Characters of a refusal: it quotes what the peer sent, which may be long, and must itself fit a header."""
-_LONGEST_REASON = 500
 _MOST_CPU_SECONDS = 86_400.0
-
-
-@dataclass(frozen=True, slots=True)
-class ToConsumer:
-    """Send these frames to a consumer."""
-
-    identity: bytes
-    frames: Sequence[Any]
-
-
-@dataclass(frozen=True, slots=True)
-class ToWorker:
-    """Send these frames to a worker."""
-
-    identity: bytes
-    frames: Frames
-
-
-@dataclass(frozen=True, slots=True)
-class GiveUp:
-    """This worker hangs: end its process where that is in our power, and report its loss."""
-
-    identity: bytes
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """Write this verdict down before anything that follows is sent, and report what came of it.
-
-    Attributes:
-        verdict: not numbered yet.
-        task: whose candidate it refuses.
-    """
-
-    verdict: Verdict
-    task: Task
-
-
-Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record
 
 
 class Dispatcher:
@@ -124,12 +79,11 @@ class Dispatcher:
         self.sessions = Sessions(session_idle_seconds)
         self._catalogue = catalogue
         self._quarantine = quarantine
-        self._wall_clock = wall_clock
+        self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
         self._reception = Reception(catalogue, default_spec, max_credit_bytes, quarantine)
         self._leases = LeaseBook(lease_deadline_seconds)
         self._workers = Workers(self._leases)
         self._lone: deque[Task] = deque()
-        self._refusals: list[Refusal] = []
 
     @property
     def workers(self) -> int:
@@ -143,8 +97,7 @@ class Dispatcher:
 
     def take_refusals(self) -> list[Refusal]:
         """The candidates that failed since the last call, for the log."""
-        taken, self._refusals = self._refusals, []
-        return taken
+        return self._candidates.take_refusals()
 
     # --- consumers ----------------------------------------------------------------------------------------------------
 
@@ -204,7 +157,7 @@ class Dispatcher:
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1
         code = ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED
-        return _refused(code, str(error))
+        return refusal(code, str(error))
 
     # --- workers ------------------------------------------------------------------------------------------------------
 
@@ -226,7 +179,7 @@ class Dispatcher:
                 return self._result(identity, message, frames[1:], now)
             case JobFailed(lease, frame, reason):
                 task = self._leases.finished(lease, identity, now)
-                failed = [] if task is None else self._refuse_candidate(task, frame, reason)
+                failed = [] if task is None else self._candidates.refuse(task, frame, reason)
                 return [*failed, *self._assign(now)]
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
@@ -262,7 +215,7 @@ class Dispatcher:
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self._refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
+        return [*self._candidates.refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
 
     def tick(self, now: float) -> list[Instruction]:
         """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
@@ -291,6 +244,9 @@ class Dispatcher:
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
             return [ToWorker(identity, encode(Refused(ErrorCode.VERSION, text))), *instructions]
+        if len(self._workers) >= MOST_WORKERS:
+            text = f"this server has {MOST_WORKERS} workers, its limit"
+            return [ToWorker(identity, refusal(ErrorCode.BUSY, text)), *instructions]
         self._workers.add(identity, hello.credit, now)
         return instructions + self._assign(now)
 
@@ -308,6 +264,7 @@ class Dispatcher:
             self.counters.late_results += 1
             return self._assign(now)
         self.counters.samples += 1
+        self.counters.decodes += result.decoded
         self.counters.bytes += sum(len(frame) for frame in payload)
         self.counters.worker_cpu_seconds += cpu_seconds
         if session is not None:
@@ -324,53 +281,10 @@ class Dispatcher:
             if isinstance(verdict, Task):
                 self.sessions.put_back(verdict)
             else:
-                instructions += self._condemn(task, verdict)
+                instructions += self._candidates.condemn(task, verdict)
         return instructions + self._assign(now)
 
     # --- tasks --------------------------------------------------------------------------------------------------------
-
-    def _condemn(self, task: Task, reason: str) -> list[Instruction]:
-        """The task's candidate brought its worker down: a verdict, unless there is one already."""
-        session = self.sessions.get(task.session)
-        if session is None:
-            return []
-        if self._quarantined(session, task, self._quarantine.latest) is not None:
-            return self._refuse_condemned(task, reason)
-        sequence = self._sequence(session, task)
-        video, text = sequence.video, reason[:_LONGEST_REASON]
-        return [Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), task)]
-
-    def _refuse_condemned(self, task: Task, reason: str) -> list[Instruction]:
-        """On to the next candidate: by the quarantine if the task's snapshot has the verdict, which says the same to
-        whoever makes the sample again; else by what happened."""
-        session = self.sessions.get(task.session)
-        if session is None:
-            return []
-        if self._quarantined(session, task, session.quarantine) is None:
-            return self._refuse_candidate(task, None, reason)
-        self.sessions.put_back(replace(task, deaths=0))
-        return []
-
-    def _refuse_candidate(self, task: Task, frame: int | None, reason: str, *, log: bool = True) -> list[Instruction]:
-        """The task's candidate cannot be used: on to the next, or to the consumer with the whole story."""
-        session = self.sessions.get(task.session)
-        if session is None:
-            return []
-        self.counters.refused_candidates += 1
-        video = self._sequence(session, task).video.id
-        refusal = Refusal(task.candidate, video, frame, reason[:_LONGEST_REASON])
-        if log:
-            self._refusals.append(refusal)
-        refusals = (*task.refusals, refusal)
-        candidate = task.candidate + 1
-        if candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
-            self.sessions.put_back(replace(task, candidate=candidate, refusals=refusals, deaths=0))
-            return []
-        if not self.sessions.answered(task, 0.0):
-            return []
-        self.counters.unavailable += 1
-        text = "; ".join(map(str, refusals))
-        return [ToConsumer(task.session, encode(Unavailable(task.epoch, task.index, text)))]
 
     def _assign(self, now: float) -> list[Instruction]:
         """Gives waiting tasks to workers, until there is no task or no room."""
@@ -379,7 +293,7 @@ class Dispatcher:
             if self._lone:
                 empty = self._workers.for_lone_task()
                 if empty is not None:
-                    instructions += self._try(self._lone.popleft(), empty, now)
+                    instructions += self._give([self._lone.popleft()], empty, now)
                     continue
             worker = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone))
             task = self.sessions.next_task() if worker is not None else None
@@ -388,23 +302,27 @@ class Dispatcher:
             if runs_alone(task):
                 self._lone.append(task)
             else:
-                instructions += self._try(task, worker, now)
+                instructions += self._give([task, *self.sessions.take_siblings(task)], worker, now)
 
-    def _try(self, task: Task, worker: bytes, now: float) -> list[Instruction]:
-        """Grants the task, unless its candidate is in quarantine."""
-        session = self.sessions.get(task.session)
+    def _give(self, tasks: list[Task], worker: bytes, now: float) -> list[Instruction]:
+        """Gives a worker the tasks of one clip, except those whose candidate is in quarantine."""
+        session = self.sessions.get(tasks[0].session)
         if session is None:
             return []
-        if task.snapshot != session.quarantine:
-            # Under another snapshot others may be passed over: from the first candidate, as whoever makes it again.
-            deaths = 0 if task.candidate else task.deaths
-            task = replace(task, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
-        refusal = self._quarantined(session, task, session.quarantine)
-        if refusal is not None:
-            return self._refuse_candidate(task, None, refusal, log=False)
-        return self._grant(task, worker, now)
+        instructions: list[Instruction] = []
+        good: list[Task] = []
+        for task in tasks:
+            current = self._candidates.current(task, session)
+            quarantined = self._candidates.quarantined(session, current, session.quarantine)
+            if quarantined is None:
+                good.append(current)
+            else:
+                instructions += self._candidates.refuse(current, None, quarantined, log=False)
+        for place, task in enumerate(good):
+            instructions += self._grant(task, worker, now, tuple(other.index for other in good[place + 1 :]))
+        return instructions
 
-    def _grant(self, task: Task, worker: bytes, now: float) -> list[Instruction]:
+    def _grant(self, task: Task, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Instruction]:
         session = self.sessions.get(task.session)
         if session is None:
             return []
@@ -413,28 +331,20 @@ class Dispatcher:
             lease = describe(
                 task,
                 number=number,
-                sequence=self._sequence(session, task),
+                sequence=self._candidates.sequence(session, task),
                 quarantine=task.snapshot,
                 catalogue=self._catalogue,
                 spec=session.spec,
                 seed=session.seed,
                 arrays=session.arrays,
                 deadline_seconds=self._leases.deadline_seconds,
+                siblings=siblings,
             )
             return [ToWorker(worker, encode(lease))]
         except V2VError as error:
             # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
             returned = self._leases.finished(number, worker, now)
-            return [] if returned is None else self._refuse_candidate(returned, None, str(error))
-
-    def _quarantined(self, session: Session, task: Task, snapshot: int) -> str | None:
-        """Why the task's candidate is refused under a snapshot; None when it is not."""
-        sequence = self._sequence(session, task)
-        video = sequence.video
-        return self._quarantine.refusal(snapshot, video.id, video.fingerprint, sequence.start_frame)
-
-    def _sequence(self, session: Session, task: Task) -> VideoSequence:
-        return session.schedule.candidate(session.seed, task.epoch, task.index, task.candidate)
+            return [] if returned is None else self._candidates.refuse(returned, None, str(error))
 
 
 def _only(frames: Sequence[Buffer]) -> Message:
@@ -443,9 +353,5 @@ def _only(frames: Sequence[Buffer]) -> Message:
     return decode(frames[0])
 
 
-def _refused(code: ErrorCode, text: str) -> Frames:
-    return encode(Refused(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
-
-
 def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
-    return ToConsumer(identity, _refused(code, text))
+    return ToConsumer(identity, refusal(code, text))

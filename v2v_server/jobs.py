@@ -23,6 +23,7 @@ def describe(
     seed: int,
     arrays: tuple[str, ...],
     deadline_seconds: float,
+    siblings: tuple[int, ...] = (),
 ) -> Lease:
     """The lease for one task.
 
@@ -34,6 +35,7 @@ def describe(
         catalogue, spec, seed: of the sample's identity.
         arrays: to be sent.
         deadline_seconds: see :class:`v2v_protocol.messages.Lease`.
+        siblings: indices that are made from the same clip and follow in leases of their own.
 
     Raises:
         CorpusError: the catalogue's index can no longer be read.
@@ -51,7 +53,7 @@ def describe(
         catalogue_digest=catalogue.digest,
         seed=seed,
         epoch=task.epoch,
-        indices=(task.index,),
+        indices=(task.index, *siblings),
         arrays=arrays,
         video=video.id,
         fingerprint=video.fingerprint,

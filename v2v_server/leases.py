@@ -36,6 +36,7 @@ class Task:
         refusals: the candidates that failed before it.
         deaths: unexplained deaths of workers that were at this candidate.
         snapshot: number of the quarantine snapshot under which those candidates were passed over.
+        place: of the index in the epoch's order (:mod:`v2v_server.schedule`); None: the index itself.
     """
 
     session: bytes
@@ -45,6 +46,12 @@ class Task:
     refusals: tuple[Refusal, ...] = ()
     deaths: int = 0
     snapshot: int = 0
+    place: int | None = None
+
+    @property
+    def clip(self) -> tuple[bytes, int, int, int]:
+        """What it is made from: tasks of equal clip are made from the same decoded frames."""
+        return self.session, self.epoch, self.index if self.place is None else self.place, self.candidate
 
     @property
     def sample(self) -> tuple[bytes, int, int]:
@@ -57,6 +64,7 @@ class _Lease:
     task: Task | None  # None: answered, or its consumer is gone; but the worker still has to get through it
     worker: bytes
     deadline: float
+    clip: tuple[bytes, int, int, int]
     begun_at: float | None = None
 
 
@@ -79,8 +87,8 @@ class LeaseBook:
         return len(self._leases)
 
     def held_by(self, worker: bytes) -> int:
-        """Leases that are out to this worker."""
-        return len(self._held.get(worker, ()))
+        """Clips that this worker has to decode for the leases that are out to it."""
+        return len({self._leases[number].clip for number in self._held.get(worker, ())})
 
     def tasks_of(self, worker: bytes) -> Iterator[Task]:
         """The tasks that this worker holds and somebody still waits for."""
@@ -98,7 +106,7 @@ class LeaseBook:
         """Gives the task to a worker; returns the number of the lease."""
         number = self._next
         self._next += 1
-        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
+        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds, task.clip)
         self._held.setdefault(worker, []).append(number)
         self._out.setdefault(task.sample, []).append(number)
         return number

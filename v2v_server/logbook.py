@@ -18,7 +18,9 @@ class Logbook:
     """The pool's side: made before a worker is started, read when it is gone."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - kept as long as the worker lives
+        # In memory where the system can: a server needs no writable folder for this.
+        in_memory = hasattr(os, "memfd_create")
+        self._file = os.fdopen(os.memfd_create("v2v-logbook"), "rb") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
 
     @property
     def descriptor(self) -> int:

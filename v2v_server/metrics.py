@@ -13,6 +13,7 @@ class Counters:
     Attributes:
         samples: samples handed to consumers.
         batches: the same in batches of each consumer's own size (a fraction while one is filling).
+        decodes: clips decoded for those samples; fewer than samples where siblings share one.
         bytes: payload bytes of those samples.
         worker_cpu_seconds: processor time the workers took for them.
         refused_candidates: videos passed over because they could not give what they promised.
@@ -26,6 +27,7 @@ class Counters:
 
     samples: int = 0
     batches: float = 0.0
+    decodes: int = 0
     bytes: int = 0
     worker_cpu_seconds: float = 0.0
     refused_candidates: int = 0

@@ -6,6 +6,7 @@ Server workers and `v2v-simulate` both come through here, which is why a sample 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
@@ -24,41 +25,43 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.view import apply_view, source_window
-from v2v_server.video.decode import DecodedClip, decode_luma
+from v2v_server.video.decode import Cut, DecodedClip, decode_cuts
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.index import FrameIndex
 from v2v_server.video.rows import Rows
 
 
 @dataclass(frozen=True, slots=True)
-class Decoded:
-    """The decoded part of a sample.
+class Draft:
+    """What one sample needs of its clip.
 
     Attributes:
         spec: the stream's spec.
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
-        clip: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
-        flow: how flow is made where the lease asks for it; then ``clip`` holds its margin too.
+        cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
+        flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
     """
 
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
-    clip: DecodedClip
+    cut: Cut
     flow: FlowSettings | None
 
 
-def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
-    """Draws the camera and decodes the frames that one sample of a lease needs, and no more.
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """The decoded part of a sample."""
 
-    Args:
-        lease: the work.
-        index: one of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to, on this host.
+    draft: Draft
+    clip: DecodedClip
+
+
+def draft_of(lease: Lease, index: int) -> Draft:
+    """Draws the camera of one of a lease's indices.
 
     Raises:
-        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
         ProtocolError: the lease does not fit its form.
     """
     spec = _spec(lease.spec)
@@ -78,40 +81,70 @@ def decode_for(lease: Lease, index: int, root: Path) -> Decoded:
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
+    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow)
+
+
+def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:
+    """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
+
+    Args:
+        lease: the work.
+        indices: of ``lease.indices``.
+        root: folder that the catalogue's ids are relative to, on this host.
+
+    Raises:
+        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
+        ProtocolError: the lease does not fit its form.
+    """
+    drafts = [draft_of(lease, index) for index in indices]
+    spec = drafts[0].spec
     path = _below(root, lease.video)
     try:
         check_fingerprint(path, lease.fingerprint)
         frame_index = FrameIndex.from_bytes(lease.frame_index)
-        clip = decode_luma(path, frame_index, lease.start_frame, int(source[-1]) + 1, window)
+        clips = decode_cuts(
+            path,
+            frame_index,
+            lease.start_frame,
+            [draft.cut for draft in drafts],
+            stride=spec.recipe.frame_stride,
+            loop_filter=spec.loop_filter,
+        )
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return Decoded(spec, params, source, clip, flow)
+    return tuple(Decoded(draft, clip) for draft, clip in zip(drafts, clips, strict=True))
 
 
-def make_sample(lease: Lease, index: int, root: Path) -> Sample:
-    """Makes one sample of a lease: :func:`decode_for`, then view and simulation.
+def make_sample(lease: Lease, decoded: Decoded) -> Sample:
+    """Makes a lease's sample of what was decoded for it: view, flow, simulation.
 
     Raises:
-        VideoError, ProtocolError: see :func:`decode_for`.
+        VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
+            are beyond what can be simulated.
+        ProtocolError: the lease does not fit its form.
     """
-    decoded = decode_for(lease, index, root)
-    params, recipe, source = decoded.params, decoded.spec.recipe, decoded.source
+    draft, index = decoded.draft, lease.indices[0]
+    params, recipe, source = draft.params, draft.spec.recipe, draft.source
     frames, flow = decoded.clip.frames, None
-    if decoded.flow is not None:
-        flow = flow_for(frames, params, recipe, decoded.flow, validity="flow_valid" in lease.arrays)
-        frames = view_part(frames, params, recipe, decoded.flow.margin_px)
+    if draft.flow is not None:
+        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays)
+        frames = view_part(frames, params, recipe, draft.flow.margin_px)
     view = apply_view(frames, params, recipe)
     seconds, irregular = None, 0
     if recipe.noise_unit == "second":
         if not lease.frames_per_second:
             raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe states noise per second")
-        seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second)
+        seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     arrays: dict[str, npt.NDArray[Any]] = {}
     saturated = 0
     for name in lease.arrays:
         if name == "voxels":
-            arrays[name], saturated = simulate_clip(view, params, recipe, decoded.spec.voxel_dtype, seconds)
+            try:
+                arrays[name], saturated = simulate_clip(view, params, recipe, draft.spec.voxel_dtype, seconds)
+            except UsageError as error:
+                # The recipe was checked; what is left is what the corpus says of the video: thresholds, time stamps.
+                raise VideoError(lease.video, None, f"cannot be simulated: {error}") from error
         elif name == "frames":
             arrays[name] = view[source[list(recipe.target_steps)], None]
         elif name == "flow" and flow is not None:

@@ -23,6 +23,19 @@ MOST_TABLES = 16
 """Sequence tables kept for consumers to come; a session keeps its own."""
 
 
+def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
+    """Samples a consumer should have asked for at any time: one batch ahead, and two a worker.
+
+    With K samples of a decode these are counted in blocks of ``batch_size`` clips, K samples each, because a worker
+    gets the siblings of a clip at once only if all of them have been asked for: the blocks that the workers are at, two
+    clips each, and one more.
+    """
+    ahead = 2 * max(1, workers)
+    if samples_per_decode == 1:
+        return max(2 * batch_size, ahead)
+    return batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
+
+
 class Reception:
     """Turns what consumers ask for into sessions.
 
@@ -54,10 +67,11 @@ class Reception:
         Raises:
             UsageError, CorpusError: what is asked cannot be had.
         """
-        spec = StreamSpec.from_dict(hello.spec, self._default_spec)
-        layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
         if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
             raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
+        spec = StreamSpec.from_dict(hello.spec, self._default_spec)
+        spec = spec.spaced(hello.stride or hello.batch_size)
+        layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
         self._check_sizes(layout)
         newest = self._quarantine.latest
         quarantine = newest if hello.quarantine is None else hello.quarantine
@@ -66,8 +80,14 @@ class Reception:
                 f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: its quarantine file "
                 f"is not the one that the stream was begun with"
             )
-        schedule = Schedule(self._table(spec), shuffle=spec.shuffle)
-        suggested = max(2 * hello.batch_size, 2 * max(1, workers))
+        table = self._table(spec)
+        schedule = Schedule.of(table, spec)
+        if not schedule.count:
+            raise UsageError(
+                f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "
+                "smaller batch size, fewer ranks or loader workers, samples_per_decode = 1, or more videos"
+            )
+        suggested = suggested_credit(hello.batch_size, workers, spec.samples_per_decode)
         session = Session(
             identity=identity,
             spec=spec,
@@ -110,6 +130,7 @@ class Reception:
         geometry = (
             recipe.frames_needed,
             recipe.frames_per_sequence,
+            recipe.frame_stride,
             recipe.crop_height_px,
             recipe.crop_width_px,
             recipe.resize_scale,

@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError
-from v2v_protocol.sample import Refusal, Sample, SampleId, array_layout
+from v2v_protocol.sample import Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_server.candidates import next_candidate
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.picture import draw_sample, write_png
-from v2v_server.produce import make_sample
+from v2v_server.produce import decode_for, make_sample
 from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule
 from v2v_server.sequences import SequenceTable
@@ -58,9 +58,9 @@ def remake(
             f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
         )
         raise CorpusError(f"no video gives a sequence: {story}")
-    if index >= table.count:
-        raise UsageError(f"index {index}: the epoch has {table.count} sequences, 0 .. {table.count - 1}")
-    schedule = Schedule(table, shuffle=spec.shuffle)
+    schedule = Schedule.of(table, spec)
+    if index >= schedule.count:
+        raise UsageError(f"index {index}: the epoch has {schedule.count} samples, 0 .. {schedule.count - 1}")
     held = quarantine or Quarantine()
     task = Task(b"", epoch, index)
     most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
@@ -68,7 +68,7 @@ def remake(
         sequence = schedule.candidate(seed, epoch, index, task.candidate)
         quarantined = held.refusal(snapshot, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
         if quarantined is not None:
-            task = _passed_over(task, Refusal(task.candidate, sequence.video.id, None, quarantined))
+            task = next_candidate(task, sequence.video.id, None, quarantined)
             continue
         lease = describe(
             task,
@@ -82,14 +82,10 @@ def remake(
             deadline_seconds=60.0,
         )
         try:
-            return make_sample(lease, index, catalogue.root)
+            return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
         except VideoError as error:
-            task = _passed_over(task, Refusal(task.candidate, lease.video, error.frame, error.reason))
+            task = next_candidate(task, lease.video, error.frame, error.reason)
     raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
-
-
-def _passed_over(task: Task, refusal: Refusal) -> Task:
-    return replace(task, candidate=task.candidate + 1, refusals=(*task.refusals, refusal))
 
 
 def simulate_to_file(

@@ -97,8 +97,12 @@ class SequenceTable:
 def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | None:
     needed = recipe.frames_needed
     if video.frames < needed:
-        most = (video.frames - 1) // (recipe.bins * recipe.frames_per_bin) - recipe.lead_voxels
-        remedy = f"voxels_per_clip at most {most}" if most >= 1 else "fewer bins or frames_per_bin, no lead_voxels"
+        most = (video.frames - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels
+        remedy = (
+            f"voxels_per_clip at most {most}"
+            if most >= 1
+            else "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+        )
         if video.frames < 2:
             remedy = "none: a voxel grid needs two frames"
         return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy, max(most, 0))

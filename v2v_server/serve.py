@@ -17,13 +17,14 @@ from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
 from v2v_server.config import ServeConfig
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record
+from v2v_server.dispatcher import Dispatcher
+from v2v_server.instructions import GiveUp, Instruction, Record
 from v2v_server.pool import Pool
 from v2v_server.process import keep_freed_memory
 from v2v_server.progress import catalogue_progress
 from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.sequences import SequenceTable
-from v2v_server.status import StatusLine, summary
+from v2v_server.status import StatusLine, summary, write
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.rows import Rows
 
@@ -202,4 +203,4 @@ def _utc_now() -> str:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    write(sys.stderr, text + "\n")

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_server.blame import runs_alone
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
 
@@ -115,7 +116,7 @@ class Sessions:
             )
         for index in new:
             session.unanswered.add((epoch, index))
-            session.waiting.append(Task(session.identity, epoch, index))
+            session.waiting.append(Task(session.identity, epoch, index, place=session.schedule.place(index)))
 
     def next_task(self) -> Task | None:
         """The next task to give to a worker, by deficit round robin; None when nobody waits."""
@@ -134,6 +135,16 @@ class Sessions:
             quanta = int(debt / _QUANTUM_SECONDS) + 1
             for identity in waiting:
                 self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
+
+    def take_siblings(self, task: Task) -> list[Task]:
+        """The waiting tasks that are made from the same clip as ``task``; they wait no more."""
+        session = self._sessions.get(task.session)
+        if session is None or session.spec.samples_per_decode == 1:
+            return []
+        siblings = [other for other in session.waiting if other.clip == task.clip and not runs_alone(other)]
+        for sibling in siblings:
+            session.waiting.remove(sibling)
+        return siblings
 
     def put_back(self, task: Task) -> None:
         """A task that comes back unanswered: it is next, because its consumer has waited longest for it."""

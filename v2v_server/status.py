@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import TextIO
 
 from v2v_protocol.spec import StreamSpec
@@ -49,6 +50,14 @@ def _shorter_clips(table: SequenceTable) -> list[str]:
     return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]
 
 
+def write(stream: TextIO, text: str) -> None:
+    """Says something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
+    and there is nowhere left to say so."""
+    with suppress(OSError):
+        stream.write(text)
+        stream.flush()
+
+
 class StatusLine:
     """One line that is kept up to date on a terminal, or printed every ten seconds into a log.
 
@@ -75,28 +84,30 @@ class StatusLine:
     def interrupt(self) -> None:
         """Clears the live line, because something else is about to be printed."""
         if self._live and self._width:
-            self._stream.write("\r" + " " * self._width + "\r")
+            write(self._stream, "\r" + " " * self._width + "\r")
             self._width = 0
 
     def close(self) -> None:
         """Leaves the last line standing."""
         if self._live and self._width:
-            self._stream.write("\n")
-            self._stream.flush()
+            write(self._stream, "\n")
 
     def _text(self, now: float, dispatcher: Dispatcher, running: int) -> str:
         counters = dispatcher.counters
+        achieved = ""
+        if 0 < counters.decodes < counters.samples:
+            achieved = f"{counters.samples / counters.decodes:.1f} a decode  "
         return (
             f"{self._batches.update(now, counters.batches):.2f} batches/s  "
             f"{self._samples.update(now, counters.samples):.1f} samples/s  "
+            f"{achieved}"
             f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
             f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
         )
 
     def _show(self, text: str) -> None:
         if self._live:
-            self._stream.write("\r" + text.ljust(self._width))
+            write(self._stream, "\r" + text.ljust(self._width))
             self._width = len(text)
         else:
-            self._stream.write(text + "\n")
-        self._stream.flush()
+            write(self._stream, text + "\n")

@@ -1,8 +1,8 @@
-"""The server worker: takes a lease, makes its samples, sends them, takes the next.
+"""The server worker: takes a lease, makes its sample, sends it, takes the next.
 
-It holds two leases at a time, so that the next one is at hand when a sample is done; sending happens in ZeroMQ's own
-thread while the next sample is made. Its life is in others' hands: it may be killed at any moment, and does nothing
-that would have to be undone.
+It holds the leases of two clips at a time, so that the next one is at hand when a sample is done; sending happens in
+ZeroMQ's own thread while the next sample is made. Its life is in others' hands: it may be killed at any moment, and
+does nothing that would have to be undone.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from v2v_protocol.messages import (
     WorkerHello,
 )
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, encode_sample
+from v2v_server.clips import Clips
 from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
@@ -61,7 +62,7 @@ class Worker:
     def __init__(self, name: str, root: Path, address: str, logbook: int | None = None) -> None:
         self._name = name
         self._logbook = logbook
-        self._root = root
+        self._clips = Clips(root)
         self._leases: deque[Lease] = deque()
         self._stopping = False
         self._context = zmq.Context()
@@ -142,23 +143,25 @@ class Worker:
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
 
     def _make(self, lease: Lease) -> None:
-        for index in lease.indices:
-            started = time.process_time()
-            try:
-                sample = make_sample(lease, index, self._root)
-            except VideoError as error:
-                self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
-                return
-            cpu_seconds = time.process_time() - started
-            frames = encode_sample(
-                epoch=lease.epoch,
-                index=index,
-                arrays=sample.arrays,
-                provenance=sample.provenance.to_dict(),
-                worker=self._name,
-                cpu_seconds=cpu_seconds,
-            )
-            self._send([*encode(Result(lease.lease, index, cpu_seconds)), *frames])
+        started = time.process_time()
+        try:
+            clip, decoded = self._clips.take(lease)
+            sample = make_sample(lease, clip)
+        except VideoError as error:
+            self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
+            return
+        cpu_seconds = time.process_time() - started
+        index = lease.indices[0]
+        frames = encode_sample(
+            epoch=lease.epoch,
+            index=index,
+            arrays=sample.arrays,
+            provenance=sample.provenance.to_dict(),
+            worker=self._name,
+            cpu_seconds=cpu_seconds,
+            decoded=decoded,
+        )
+        self._send([*encode(Result(lease.lease, index, cpu_seconds, decoded)), *frames])
 
     def _send(self, frames: Frames) -> None:
         self._socket.send_multipart(frames, copy=False)

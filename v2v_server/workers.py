@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from v2v_server.blame import runs_alone
 from v2v_server.leases import LeaseBook
 
+MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
 SILENCE_SECONDS = 30.0
 """A worker without work says so every five seconds; after this long without a word it is taken for gone."""

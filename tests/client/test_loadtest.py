@@ -9,7 +9,7 @@ from v2v_protocol.errors import UsageError
 KEYS = {
     "workers", "batches_per_second", "samples_per_second", "p50_ms", "p99_ms", "cpu_seconds_per_batch",
     "bytes_per_second", "client_stall_fraction", "peak_rss_bytes", "lost", "duplicated", "accelerator_utilisation",
-    "batches", "seconds", "warmup_batches", "batch_size", "epochs", "address",
+    "samples_per_decode", "batches", "seconds", "warmup_batches", "batch_size", "epochs", "address",
 }  # fmt: skip
 
 

@@ -27,6 +27,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "flip_probability": 0.25,
     "pause_probability": 0.01,
     "pause_stay_probability": 0.5,
+    "frame_stride": 2,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
     "gamma": 1.0,
@@ -46,6 +47,9 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "shuffle": False,
     "max_sequences_per_video": 11,
     "on_bad_video": "raise",
+    "loop_filter": "skip",
+    "samples_per_decode": 2,
+    "sibling_spacing": 24,
     "flow_method": "dis-medium",
     "flow_direction": "backward",
     "flow_from": 20,
@@ -55,8 +59,8 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
 
 def test_digests_are_stable() -> None:
     """A saved position names this digest: if it changes, so must NUMERICS_VERSION or the digest's own version."""
-    assert StreamSpec().digest == "1f0eaf0bd1095831fb1ba7265a8976b6"
-    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "7500638959e8374e2ae58769d796943f"
+    assert StreamSpec().digest == "6df0ce602ec44c7943dbe655e81d18e2"
+    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "66d11296efcaed2ccb21c9c4cdd2a68c"
 
 
 def test_canonical_form_of_the_default() -> None:
@@ -74,7 +78,8 @@ def test_every_field_changes_the_digest() -> None:
     for name, value in OTHER_RECIPE_VALUES.items():
         digests.add(StreamSpec.from_dict({"recipe": {name: value}}).digest)
     for name, value in OTHER_SPEC_VALUES.items():
-        digests.add(StreamSpec.from_dict({name: value}).digest)
+        needed = {"samples_per_decode": 3} if name == "sibling_spacing" else {}
+        digests.add(StreamSpec.from_dict({name: value, **needed}).digest)
     # lead_frames alone is the preset paper-flow: one digest comes twice.
     assert len(digests) == 1 + len(OTHER_RECIPE_VALUES) + len(OTHER_SPEC_VALUES) - 1
 
@@ -141,7 +146,7 @@ def test_odd_recipe_keys_are_refused_as_such(recipe: Any) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"voxels": 1}, "unknown spec key 'voxels'; known: recipe, voxel_dtype"),
+        ({"voxels": 1}, "unknown spec key 'voxels'; known: preset, recipe, voxel_dtype"),
         ({b"shuffle": True}, "unknown spec key"),
         ({"voxel_dtype": "int32"}, "voxel_dtype = 'int32': choose one of int8, int16, float32"),
         ({"voxel_dtype": ["int8"]}, "voxel_dtype"),

@@ -28,7 +28,8 @@ from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode
 from v2v_server.blame import Cause, Loss
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.dispatcher import Dispatcher
+from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
 from v2v_server.quarantine import Quarantine, Verdict
 from v2v_server.video.catalogue import Catalogue
 

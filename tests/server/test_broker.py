@@ -11,7 +11,8 @@ from v2v_protocol.messages import Pong, Stop
 from v2v_protocol.wire import encode
 from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
-from v2v_server.dispatcher import Dispatcher, GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.dispatcher import Dispatcher
+from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
 from v2v_server.leases import Task
 from v2v_server.quarantine import Verdict
 

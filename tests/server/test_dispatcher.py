@@ -42,7 +42,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
 from v2v_server import dispatcher as dispatcher_module
 from v2v_server.blame import Cause
-from v2v_server.dispatcher import GiveUp, Record, ToConsumer
+from v2v_server.instructions import GiveUp, Record, ToConsumer
 from v2v_server.reception import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.schedule import MOST_CANDIDATES
 from v2v_server.video.index import FrameIndex
@@ -756,6 +756,18 @@ NONSENSE: dict[str, Callable[[], tuple[int, list[Any]]]] = {
     "another shape": lambda: (0, frames_of({"voxels": ("int8", (2, 2, 4, 16))}, 0, 0, 0)),
     "another name": lambda: (0, frames_of({"frames": ("int8", (2, 2, 8, 8))}, 0, 0, 0)),
 }
+
+
+def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatcher_module, "MOST_WORKERS", 2)
+    at = peers()
+    for name in (b"a", b"b", b"c"):
+        at.join(name)
+    (refused,) = at.told[b"c"]
+    assert isinstance(refused, Refused)
+    assert (refused.code, refused.text) == (ErrorCode.BUSY, "this server has 2 workers, its limit")
+    at.join(b"a")  # one that is known says hello again
+    assert at.dispatcher.workers == 2
 
 
 @pytest.mark.parametrize("wrong", NONSENSE)

@@ -462,14 +462,15 @@ def remade(
     """The lease that remake() works on in the end, when these videos cannot be decoded."""
     leases: list[Lease] = []
 
-    def make_sample(lease: Lease, of: int, root: object) -> Sample:
-        assert of == index
+    def decode_for(lease: Lease, indices: tuple[int, ...], root: object) -> tuple[Lease]:
+        assert indices == (index,)
         if lease.video in failing:
             raise VideoError(lease.video, 7, "cut short")
         leases.append(lease)
-        return cast(Sample, lease)
+        return (lease,)
 
-    monkeypatch.setattr(remake_module, "make_sample", make_sample)
+    monkeypatch.setattr(remake_module, "decode_for", decode_for)
+    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded: cast(Sample, decoded))
     remake(catalogue, spec, seed=0, epoch=0, index=index, arrays=("voxels",), quarantine=quarantine, snapshot=snapshot)
     return leases[0]
 

@@ -134,7 +134,7 @@ def test_the_remedy_for_a_short_video_admits_it(frames: int, voxels: int, bins: 
         more = recipe.replace(voxels_per_clip=most + 1)
         assert table(video("short", frames), spec=StreamSpec(recipe=more)).count == 0
     else:
-        assert rejections[0].remedy == "fewer bins or frames_per_bin, no lead_voxels"
+        assert rejections[0].remedy == "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
         least = recipe.replace(voxels_per_clip=1, bins=1, frames_per_bin=1, lead_voxels=0)
         assert table(video("short", frames), spec=StreamSpec(recipe=least)).count >= 1
 
@@ -224,7 +224,7 @@ def test_an_index_outside_the_epoch_is_refused(candidate: int) -> None:
     assert of.count == 1
     assert of.candidate(0, 0, 0, candidate).video.id == "v0"
     for index in (-1, 1):
-        with pytest.raises(IndexError, match=f"index {index} of an epoch of 1 sequences"):
+        with pytest.raises(IndexError, match=f"index {index} of an epoch of 1 samples"):
             of.candidate(0, 0, index, candidate)
 
 

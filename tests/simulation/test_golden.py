@@ -21,13 +21,13 @@ from v2v_server.video.catalogue import Catalogue, open_catalogue
 
 SMALL: dict[str, Any] = {"voxels_per_clip": 4, "crop_height_px": 40, "crop_width_px": 56}
 GOLDEN = {
-    "paper": "273507059f8d8e66f942177ec408010a",
-    "paper-fixed-thresholds": "a17979ba9105abea272479f68234a579",
-    "paper-contrast": "67caeaec0953c2db9fbbc59a25a9666a",
-    "paper-flow": "e0eb04bae626cc78e5c5347ee7f1f38e",
-    "paper-eraft": "cbca48e93e5087b42c5e18dab73c6e93",
-    "noise-free": "ef9f7773fed6f8c72a045db1b5fa92be",
-    "per second, float32": "bb6d217d12f8fc11f2fca35e89e73205",
+    "paper": "aa93f6fec240497f44e080787d654739",
+    "paper-fixed-thresholds": "5f7f761fbed5c5dd45fcaf19f2f03b6d",
+    "paper-contrast": "71af75da928c71443ee55bebcb497068",
+    "paper-flow": "9c819032f427d1f827afaac5a7b3eac6",
+    "paper-eraft": "d06af98cbee13f01861f1c4d1e694473",
+    "noise-free": "cf498957dd961f2dd82486f6922e2d69",
+    "per second, float32": "37f0f6a7b12a00262c219778b72e62fe",
 }
 
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from tests.simulation import oracle, reference
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import noise, simulate, simulate_clip, simulate_log
+from v2v_server.simulation import noise, pixel, simulate, simulate_clip, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.voxel import rounding_tolerance
@@ -95,8 +96,26 @@ def test_kernel_equals_its_numpy_definition(
     assert got.saturated_bins == saturated
 
 
+@numba.njit
+def look_up(table: Any, row: Any, coming: Any, levels: Any) -> None:
+    pixel._look_up(table, row, coming, levels)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64], ids=["permuted", "portable"])
+def test_look_up_is_indexing_and_writes_nothing_else(real: Any) -> None:
+    """float32 takes the way of the processor's permutations where there are any, float64 never."""
+    table = np.random.default_rng(0).permutation(256).astype(real) - real(0.5)
+    row = np.random.default_rng(1).permutation(np.arange(1024) % 256).astype(np.uint8)
+    for width in (*range(70), 256, 511, 512):
+        shown = row[width % 7 :][:width]  # at any address, not only at that of a vector
+        levels = np.full(600, np.nan, real)
+        look_up(table, shown, shown[::-1].copy(), levels)
+        np.testing.assert_array_equal(levels[:width], table[shown])
+        assert np.isnan(levels[width:]).all()
+
+
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize(("height", "width"), [(16, 32), (31, 33), (1, 1), (1, 1025), (32, 48)])
+@pytest.mark.parametrize(("height", "width"), [(16, 32), (31, 33), (1, 1), (1, 513), (1, 1025), (32, 48)])
 def test_log_frames_of_any_size_and_precision_equal_the_definition(precision: Any, height: Any, width: Any) -> None:
     steps = 15
     level = np.sin(np.arange((steps + 1) * height * width) * 0.37).reshape(steps + 1, height, width) * 2
@@ -218,6 +237,33 @@ def test_saturation_is_clipped_and_counted_never_wrapped(dtype: Any, limit: Any)
     assert abs(exact.voxels[0, 0, 0, 0] - limit * 1.5) <= 1
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("frames_per_bin", [1, 3])
+@pytest.mark.parametrize(("dtype", "limit"), [("int8", 127), ("int16", 32767)])
+def test_saturation_in_some_blocks_equals_the_definition(
+    dtype: Any, limit: Any, frames_per_bin: Any, precision: Any
+) -> None:
+    """Counts just below, at and beyond the limit; in the second of three blocks and in the narrow last one only."""
+    width, steps, threshold = 2 * pixel.BLOCK_PX + 21, 4 * frames_per_bin, 2.0**-4
+    level = np.zeros((steps + 1, width))
+    for place, beyond in ((pixel.BLOCK_PX, 0), (pixel.BLOCK_PX + 17, 1), (width - 6, 2), (width - 1, -1)):
+        jump = (limit + beyond) * threshold
+        level[frames_per_bin : 2 * frames_per_bin, place] = jump
+        level[3 * frames_per_bin :, place] = -jump
+    got = simulate_log(
+        level[:, None, :], threshold_pos=threshold, threshold_neg=2 * threshold, start_residual=None, bins=2,
+        frames_per_bin=frames_per_bin, seed=1, dtype=dtype, precision=precision,
+    )  # fmt: skip
+    expected, saturated = reference.simulate(
+        level.astype(precision), noise_key_of_seed(1), threshold_pos=threshold, threshold_neg=2 * threshold,
+        noise_scale=None, hot_count=0, hot_sigma=0.0, hot_scale=np.ones(steps), frames_per_bin=frames_per_bin,
+        dtype=dtype,
+    )  # fmt: skip
+    np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
+    assert got.saturated_bins == saturated > 0
+    assert np.abs(expected[:, : pixel.BLOCK_PX]).max() < limit
+
+
 def test_hot_pixels_fire_and_no_other_pixel_does() -> None:
     frames = np.full((11, 50, 50), 80, np.uint8)
     got = simulate(frames, threshold_pos=0.5, hot_pixel_count=25, hot_pixel_sigma=50.0, seed=2, dtype="float32").voxels
@@ -230,9 +276,9 @@ def test_hot_pixels_fire_and_no_other_pixel_does() -> None:
 
 
 GOLDEN = {
-    "int8": "0b73d22e86e2f7bef2ce8d8922460e4f29a43d06e51cbdc07348dcf36907bfdb",
-    "int16": "2b32a17d7c6fb0a66fb128ad530651f48b4093a2a31343311e6b467ebbdf8c54",
-    "float32": "f047d422d2cf78d15bc8a227581ac8796602022fa4406a9ebaa1df4ca0169261",
+    "int8": "0531ffcd2b89f671c0b418e0b11865d09ba1ddc1c2c9b53e42a2e79cd50932f9",
+    "int16": "59eb5b9ab91e11864cffa9dafe53345b0a3dc2b99cd9f99db0e7be8a7d88ac27",
+    "float32": "b345133d41b778fcede9908d375dea828f4e3225b122fb1a0e7d023f7c02859a",
 }
 
 

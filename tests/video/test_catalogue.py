@@ -226,8 +226,30 @@ def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
     names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
     records = {record.id: record for record in survey(corpus, names, 2, _lethal)}
     assert set(records) == set(names)
-    assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died"
+    assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
+    assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
     assert [records[id].frames for id in ("a.mp4", "sub/b.mp4")] == [30, 30]
+
+
+def _killed_once(root: str, id: str) -> Record:
+    mark = Path(root, f"{id}.killed")
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return examine(root, id)
+
+
+def _always_killed(root: str, id: str) -> Record:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return examine(root, id)
+
+
+def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
+    names = ["a.mp4", "sub/b.mp4"]
+    assert {record.id: record.problem for record in survey(corpus, names, 2, _killed_once)} == dict.fromkeys(names)
+    (record,) = survey(corpus, ["a.mp4"], 2, _always_killed)
+    assert "from outside or for want of memory (signal SIGKILL)" in (record.problem or "")
+    assert record.size_bytes == -1  # which no file has: the next start tries again
 
 
 def test_fingerprints(tmp_path: Path) -> None:

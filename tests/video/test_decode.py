@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video import decode
-from v2v_server.video.decode import decode_luma
+from v2v_server.video.decode import Cut, decode_cuts, decode_luma
 from v2v_server.video.luma import range_table
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -124,6 +124,26 @@ def test_the_pan_is_recognised(clip: Clip) -> None:
     for number in range(1, FRAMES - 1):
         errors = [np.abs(whole.frames[number].astype(int) - known[number + by]).mean() for by in (-1, 0, 1)]
         assert np.argmin(errors) == 1
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_cuts_of_one_pass_are_those_of_passes_of_their_own(clip: Clip, data: st.DataObject) -> None:
+    start, stride = data.draw(st.integers(0, FRAMES - 1)), data.draw(st.integers(1, 4))
+    height, width = clip.facts.height_px, clip.facts.width_px
+    cuts = []
+    for _ in range(data.draw(st.integers(1, 3))):
+        top, left = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
+        window = (top, left, data.draw(st.integers(1, height - top)), data.draw(st.integers(1, width - left)))
+        count = data.draw(st.integers(1, min(12, (FRAMES - 1 - start) // stride + 1)))
+        cuts.append(Cut(count, data.draw(st.sampled_from((window, None)))))
+    together = decode_cuts(clip.path, clip.facts.index, start, cuts, stride=stride)
+    assert len(together) == len(cuts)
+    for got, cut in zip(together, cuts, strict=True):
+        alone = decode_luma(clip.path, clip.facts.index, start, (cut.count - 1) * stride + 1, cut.window)
+        np.testing.assert_array_equal(got.frames, alone.frames[::stride])
+        np.testing.assert_array_equal(got.seconds, alone.seconds[::stride])
+        assert got.codec == alone.codec
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -301,3 +321,30 @@ def test_missing_file(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(VideoError, match="cannot be opened: No such file"):
         decode_luma(path, index, 0, 5)
+
+
+def test_a_damaged_frame_that_the_stride_leaves_out_spoils_what_refers_to_it(tmp_path: Path) -> None:
+    """The first frame that cannot be had is named by its place in the file, whatever the stride."""
+    write_clip(tmp_path / "whole.mp4", panned_luma(60, 48, 64), gop=60)
+    damaged(tmp_path / "whole.mp4", tmp_path / "bad.mp4", 30)
+    index = probe(tmp_path / "whole.mp4").index
+    with pytest.raises(VideoError) as caught:
+        decode_cuts(tmp_path / "bad.mp4", index, 0, [Cut(20)], stride=3)
+    assert caught.value.frame is not None
+    assert caught.value.frame % 3 == 0
+    assert 30 <= caught.value.frame <= 33
+
+
+def test_the_loop_filter_changes_pictures_a_little_and_no_time_stamp(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    write_clip(path, panned_luma(40, 96, 128), gop=20, b_frames=2, options={"crf": "35"})
+    index = probe(path).index
+    exact, unreferenced, skipped = (
+        decode_cuts(path, index, 5, [Cut(30)], loop_filter=name)[0] for name in ("exact", "skip-unreferenced", "skip")
+    )
+    differs = [(other.frames != exact.frames).reshape(30, -1).any(axis=1) for other in (unreferenced, skipped)]
+    assert 0 < differs[0].sum() < 30
+    assert differs[0].sum() < differs[1].sum()
+    for other in (unreferenced, skipped):
+        np.testing.assert_array_equal(other.seconds, exact.seconds)
+        assert np.abs(other.frames.astype(int) - exact.frames).mean() < 8

@@ -27,6 +27,9 @@ def children() -> list[psutil.Process]:
     return [process for process in below if "resource_tracker" not in " ".join(process.cmdline())]
 
 
+MASK_AT_IMPORT = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
 def square_or_die(number: int) -> int:
     if number == 3:
         os.kill(os.getpid(), signal.SIGSEGV)
@@ -37,8 +40,8 @@ def square_or_die(number: int) -> int:
 
 def test_a_crash_costs_one_job() -> None:
     results = dict(run_isolated(square_or_die, range(9), processes=2))
-    assert results.pop(3) == Died("signal SIGSEGV")
-    assert results.pop(5) == Died("exit status 7")
+    assert results.pop(3) == Died(-signal.SIGSEGV)
+    assert results.pop(5) == Died(7)
     assert results == {n: n * n for n in (0, 1, 2, 4, 6, 7, 8)}
     assert dict(run_isolated(square_or_die, [1, 2], processes=0)) == {1: 1, 2: 4}
     assert dict(run_isolated(square_or_die, [], processes=2)) == {}
@@ -49,3 +52,31 @@ def test_leaving_early_ends_the_processes() -> None:
     next(results)
     results.close()  # type: ignore[attr-defined]
     assert not children()
+
+
+def test_how_a_process_died() -> None:
+    deaths = [Died(7), Died(-signal.SIGSEGV), Died(-signal.SIGKILL), Died(-signal.SIGTERM), Died(-40)]
+    assert [death.how for death in deaths] == [
+        "exit status 7", "signal SIGSEGV", "signal SIGKILL", "signal SIGTERM", "signal 40",
+    ]  # fmt: skip
+    assert [death.from_outside for death in deaths] == [False, False, True, True, False]
+
+
+def interrupts_let_through(job: None) -> tuple[bool, bool]:
+    """Whether Ctrl-C could have struck this process while it started, and whether it can now."""
+    return signal.SIGINT not in MASK_AT_IMPORT, signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+
+
+def test_an_interrupt_strikes_the_caller_only() -> None:
+    assert list(run_isolated(interrupts_let_through, [None, None, None], processes=2)) == [(None, (False, False))] * 3
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_a_process_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(process: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
+    with pytest.raises(BlockingIOError):
+        list(run_isolated(square_or_die, [1], processes=1))
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

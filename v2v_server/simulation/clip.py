@@ -9,16 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import Recipe, most_events
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.pixel import pixel_words, simulate_pixels
+from v2v_server.simulation.pixel import simulate_pixels, words
+from v2v_server.simulation.precision import AUTO, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
-
-_PRECISIONS: dict[str, type[np.floating[Any]]] = {"float32": np.float32, "float64": np.float64}
 
 
 class Voxels(NamedTuple):
@@ -48,7 +47,7 @@ def simulate(
     log_eps: float = 1e-3,
     seed: int = 0,
     dtype: str = "int8",
-    precision: str = "float32",
+    precision: str = AUTO,
 ) -> Voxels:
     """Simulate an event camera that watches a clip.
 
@@ -64,13 +63,14 @@ def simulate(
         gamma, log_eps: see ``intensity.py``.
         seed: 0 .. 2**64 - 1; the same seed gives the same bytes.
         dtype: "int8", "int16" or "float32".
-        precision: arithmetic of the pixels, "float32" or "float64".
+        precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
+            below half a threshold (``precision.py``).
 
     Returns:
         voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins.
 
     Raises:
-        UsageError: an argument of the wrong type, shape or range.
+        UsageError: an argument of the wrong type, shape or range, or more events than the precision can count.
     """
     frames = np.asarray(frames)
     if frames.ndim != 3 or frames.dtype != np.uint8:
@@ -78,8 +78,8 @@ def simulate(
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
     return _simulate_array(
-        frames, _table(gamma, log_eps, _real(precision)), threshold_pos, threshold_neg, noise_sigma,
-        hot_pixel_count, hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype,
+        frames, (gamma, log_eps), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
+        start_residual, bins, frames_per_bin, seed, dtype, precision,
     )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def simulate_log(
     frames_per_bin: int = 1,
     seed: int = 0,
     dtype: str = "int8",
-    precision: str = "float32",
+    precision: str = AUTO,
 ) -> Voxels:
     """The same for log intensities.
 
@@ -108,12 +108,11 @@ def simulate_log(
     log_frames = np.asarray(log_frames)
     if log_frames.ndim != 3 or log_frames.dtype.kind != "f":
         raise UsageError(f"log_frames {log_frames.dtype}{list(log_frames.shape)}: give floating point [n, H, W]")
-    real = _real(precision)
     if not np.isfinite(log_frames).all():
         raise UsageError("log_frames: a value is NaN or infinite; give the logarithm of positive intensities")
     return _simulate_array(
-        log_frames.astype(real), np.empty(0, real), threshold_pos, threshold_neg, noise_sigma,
-        hot_pixel_count, hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype,
+        log_frames, None, threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
+        start_residual, bins, frames_per_bin, seed, dtype, precision,
     )  # fmt: skip
 
 
@@ -137,7 +136,8 @@ def simulate_clip(
         voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
 
     Raises:
-        UsageError: too few frames, or ``step_seconds`` missing, unwanted or of the wrong length.
+        UsageError: too few frames, ``step_seconds`` missing, unwanted or of the wrong length, or a draw beyond what
+            float64 can count (``precision.py``).
     """
     source_index = params.source_index(recipe.steps)
     if frames.ndim != 3 or frames.dtype != np.uint8 or len(frames) <= source_index[-1]:
@@ -154,8 +154,11 @@ def simulate_clip(
         raise UsageError(
             f"step_seconds {list(step_seconds.shape)}: give {recipe.steps} positive finite durations, one per step"
         )
+    check_thresholds(params.threshold_pos, params.threshold_neg)
+    ends = _log_ends(recipe.gamma, recipe.log_eps)
+    real = choose(AUTO, _most_events(params, ends, step_seconds))
     return _run(
-        frames, _table(recipe.gamma, recipe.log_eps, np.float32), source_index, params, step_seconds,
+        frames, _table(recipe.gamma, recipe.log_eps, real), source_index, params, step_seconds,
         recipe.bins, recipe.frames_per_bin, voxel_dtype,
     )  # fmt: skip
 
@@ -170,7 +173,7 @@ def warm_up() -> None:
 
 def _simulate_array(
     frames: npt.NDArray[Any],
-    table: npt.NDArray[Any],
+    intensity: tuple[float, float] | None,
     threshold_pos: float,
     threshold_neg: float | None,
     noise_sigma: float,
@@ -181,10 +184,13 @@ def _simulate_array(
     frames_per_bin: int,
     seed: int,
     dtype: str,
+    precision: str,
 ) -> Voxels:
+    """``intensity``: gamma and log_eps of grey levels, None where the frames are log intensities."""
     threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
     _check_number("threshold_pos", threshold_pos, positive=True)
     _check_number("threshold_neg", threshold_neg, positive=True)
+    check_thresholds(threshold_pos, threshold_neg)
     _check_number("noise_sigma", noise_sigma)
     _check_number("hot_pixel_sigma", hot_pixel_sigma)
     if start_residual is not None and not -threshold_neg <= start_residual <= threshold_pos:
@@ -204,7 +210,26 @@ def _simulate_array(
         )
     steps = count - 1
     params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed)
+    ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(*intensity)
+    real = choose(precision, _most_events(params, ends, np.ones(steps)))
+    if intensity is None:
+        frames, table = frames.astype(real), np.empty(0, real)
+    else:
+        table = _table(*intensity, real)
     return _run(frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual)
+
+
+def _most_events(params: SampleParams, log_ends: tuple[float, float], step_seconds: npt.NDArray[np.float64]) -> float:
+    thresholds = params.threshold_pos, params.threshold_neg
+    hot_sigma = params.hot_pixel_sigma if params.hot_pixel_count else 0.0
+    noise_total = noise_sum(params.noise_sigma, hot_sigma, step_seconds)
+    return most_events(len(step_seconds), log_ends, thresholds, noise_total)
+
+
+def _log_ends(gamma: float, log_eps: float) -> tuple[float, float]:
+    # From the table, not from a maths library: the choice of arithmetic must not depend on the host.
+    table = log_table_float64(gamma, log_eps)
+    return float(table[0]), float(table[-1])
 
 
 def _run(
@@ -225,8 +250,7 @@ def _run(
     noise_scale = params.noise_sigma * np.sqrt(step_seconds) if params.noise_sigma > 0.0 else np.empty(0)
     hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
     key = np.array(params.noise_key, np.uint32)
-    place_words = pixel_words(key, np.uint32(noise.HOT_PLACE), pixels) if hot_count else None
-    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels, place_words)
+    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels, _compiled_words)
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
     if start_residual is None:
         start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
@@ -253,6 +277,10 @@ def _run(
     return Voxels(voxels, int(saturated))
 
 
+def _compiled_words(key: noise.NoiseKey, purpose: int, counters: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
+    return words(np.array(key, np.uint32), np.uint32(purpose), counters.astype(np.uint32))  # type: ignore[no-any-return]
+
+
 def _params(
     threshold_pos: float, threshold_neg: float, noise_sigma: float, hot_count: int, hot_sigma: float, seed: int
 ) -> SampleParams:
@@ -275,12 +303,6 @@ def _params(
 
 def _table(gamma: float, log_eps: float, real: type[np.floating[Any]]) -> npt.NDArray[Any]:
     return log_table(gamma, log_eps) if real is np.float32 else log_table_float64(gamma, log_eps)
-
-
-def _real(precision: str) -> type[np.floating[Any]]:
-    if precision not in _PRECISIONS:
-        raise UsageError(f"precision {precision!r}: choose one of {', '.join(_PRECISIONS)}")
-    return _PRECISIONS[precision]
 
 
 def _check_number(name: str, value: float, *, positive: bool = False) -> None:

@@ -16,21 +16,28 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
 from v2v_server.simulation import noise
+from v2v_server.simulation.vectors import (
+    aligned_rows,
+    bits_of_float,
+    float_of_bits,
+    look_up_by_permutation,
+    use_widest_vectors,
+)
 
-BLOCK_PX = 1024
+BLOCK_PX = 512
 """Pixels of a block. Fewer would touch each page of frames and voxels more often, more would not stay in the cache."""
 
 _PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
+_ROWS_AHEAD = 3  # how many steps before its use a row of frames is fetched into the cache
 
 _GOLDEN = noise.GOLDEN
 _S0, _S1, _S2 = noise.SCRAMBLE_FACTORS
 _M0, _M1, _M2 = noise.MIX_FACTORS
-_L0, _L1, _L2, _L3, _L4, _L5 = noise.LOG_COEFFICIENTS
+_L0, _L1, _L2, _L3, _L4 = noise.LOG_COEFFICIENTS
 _A0, _A1, _A2, _A3 = noise.SIN_COEFFICIENTS
 _C0, _C1, _C2, _C3 = noise.COS_COEFFICIENTS
 _SQRT_HALF_BITS, _MINUS_2_LN_2 = noise.SQRT_HALF_BITS, noise.MINUS_2_LN_2
@@ -39,37 +46,6 @@ _PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_A
 _START = np.uint32(noise.START)
 _ONE, _TURN, _UNIT = np.float32(1), np.float32(2.0**-32), np.float32(2.0**-24)
 _LOW_31_BITS = np.uint32(0x7FFFFFFF)
-
-
-@intrinsic
-def _float_of_bits(typing_context: Any, bits: Any) -> Any:
-    """The float32 whose bit pattern the int32 is."""
-    return types.float32(types.int32), lambda context, builder, signature, args: builder.bitcast(
-        args[0], ir.FloatType()
-    )
-
-
-@intrinsic
-def _bits_of_float(typing_context: Any, value: Any) -> Any:
-    """The bit pattern of the float32, as int32."""
-    return types.int32(types.float32), lambda context, builder, signature, args: builder.bitcast(
-        args[0], ir.IntType(32)
-    )
-
-
-@intrinsic
-def _use_widest_vectors(typing_context: Any) -> Any:
-    """Lets LLVM use 512-bit vectors in the calling function where the processor has them; ignored elsewhere.
-
-    For some processors LLVM halves them by default, lest a few wide instructions lower the clock of all the others.
-    Here the wide ones are the work. llvmlite knows no attributes with a value, hence ``set.add``.
-    """
-
-    def generate(context, builder, signature, args):
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-        return context.get_dummy_value()
-
-    return types.none(), generate
 
 
 def _log_intensity(table, value):
@@ -96,53 +72,62 @@ def _scramble(x):
 
 
 @numba.njit(nogil=True)
-def _word(key, purpose, counter):
-    word = _scramble(np.uint32(np.uint32(counter) + np.uint32(purpose * _GOLDEN)))
+def _fold(key, constant):
+    word = _scramble(np.uint32(constant * _GOLDEN))
     word = _scramble(np.uint32(word + key[0]))
     word = _scramble(np.uint32(word + key[1]))
     word = _scramble(np.uint32(word + key[2]))
     return _scramble(np.uint32(word + key[3]))
 
 
+@numba.njit(nogil=True)
+def _folds(key, purpose):
+    return _fold(key, np.uint32(2) * purpose), _fold(key, np.uint32(2) * purpose + np.uint32(1))
+
+
+@numba.njit(nogil=True)
+def _word(folds, counter):
+    return _scramble(np.uint32(_scramble(np.uint32(np.uint32(counter) + folds[0])) + folds[1]))
+
+
 @numba.njit(nogil=True, cache=True)
-def pixel_words(key, purpose, pixels):
-    """``noise.words(key, purpose, arange(pixels))``: [pixels] uint32."""
-    words = np.empty(pixels, np.uint32)
-    for p in range(pixels):
-        words[p] = _word(key, purpose, p)
-    return words
+def words(key, purpose, counters):
+    """``noise.words`` of [count] uint32 counters: [count] uint32."""
+    found = np.empty(len(counters), np.uint32)
+    folds = _folds(key, purpose)
+    for i in range(len(counters)):
+        found[i] = _word(folds, counters[i])
+    return found
 
 
 @numba.njit(nogil=True, inline="always")
-def _two_normals(hashed, radius_word, angle_word, normal, scratch):
-    """``noise.mix`` and ``noise.box_muller`` of a block.
+def _two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
+    """``noise.mix`` and ``noise.box_muller`` of a block: into ``normal`` [2, block], by way of the three other rows.
 
-    Many short loops: a processor overlaps the rounds of a loop only as far as its window of waiting instructions
+    Several short loops: a processor overlaps the rounds of a loop only as far as its window of waiting instructions
     reaches, and a long chain of dependent operations fills that window with a single round.
     """
     for i in range(BLOCK_PX):
-        x = np.uint32(hashed[0, i] ^ radius_word)
+        x = np.uint32(radius_words[i] ^ radius_word)
         x = np.uint32(x ^ (x >> np.uint32(16)))
         x = np.uint32(x * _M0)
         x = np.uint32(x ^ (x >> np.uint32(15)))
-        hashed[2, i] = np.uint32(x * _M1)
+        x = np.uint32(x * _M1)
+        y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(angle_words[i] ^ angle_word))
+        x_row[i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
+        y_row[i] = np.uint32(y * _M2)
     for i in range(BLOCK_PX):
-        x = hashed[2, i]
-        y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(hashed[1, i] ^ angle_word))
-        hashed[2, i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
-        hashed[3, i] = np.uint32(y * _M2)
-    for i in range(BLOCK_PX):
-        bits: Any = _bits_of_float(np.float32(np.int32(hashed[2, i])))  # type: ignore[call-arg]
+        bits: Any = bits_of_float(np.float32(np.int32(x_row[i])))  # type: ignore[call-arg]
         exponent = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
-        scratch[0, i] = _float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
-        scratch[1, i] = np.float32(np.int32(exponent - np.int32(31))) * _MINUS_2_LN_2
+        normal[0, i] = float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
+        normal[1, i] = np.float32(np.int32(exponent - np.int32(31))) * _MINUS_2_LN_2
     for i in range(BLOCK_PX):
-        fraction = scratch[0, i]
+        fraction = normal[0, i]
         square = fraction * fraction
-        high = (_L2 + _L3 * fraction) + (_L4 + _L5 * fraction) * square
-        scratch[1, i] = np.sqrt(scratch[1, i] + fraction * ((_L0 + _L1 * fraction) + high * square))
+        high = (_L2 + _L3 * fraction) + _L4 * square
+        radius_row[i] = np.sqrt(normal[1, i] + fraction * ((_L0 + _L1 * fraction) + high * square))
     for i in range(BLOCK_PX):
-        turn = np.float32(np.int32(hashed[3, i])) * _TURN
+        turn = np.float32(np.int32(y_row[i])) * _TURN
         square = turn * turn
         fourth = square * square
         normal[0, i] = turn * ((_A0 + _A1 * square) + (_A2 + _A3 * square) * fourth)
@@ -150,33 +135,46 @@ def _two_normals(hashed, radius_word, angle_word, normal, scratch):
     for i in range(BLOCK_PX):
         sine, cosine = normal[0, i], normal[1, i]
         twice = sine + sine
-        normal[0, i] = scratch[1, i] * (_ONE - twice * sine)
-        normal[1, i] = scratch[1, i] * (twice * cosine)
+        normal[0, i] = radius_row[i] * (_ONE - twice * sine)
+        normal[1, i] = radius_row[i] * (twice * cosine)
 
 
 @numba.njit(nogil=True, inline="always")
-def _look_up(table, row, levels):
-    for i in range(len(row)):
+def _look_up(table, row, coming, levels):
+    for i in range(look_up_by_permutation(table, row, coming, levels), len(row)):  # type: ignore[call-arg]
         levels[i] = _log_intensity(table, row[i])
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _crossed(potential, threshold_pos, threshold_neg, tolerance):
-    """Signed events of a potential, and the residual they leave: the rule of ``voxel.py``."""
-    rising = potential >= tolerance - tolerance
+    """Signed events of a potential, and the residual they leave: the rule of ``voxel.py``. No event is +0, never -0."""
+    zero = tolerance - tolerance
+    rising = potential >= zero
     threshold = threshold_pos if rising else threshold_neg
     events = np.floor((abs(potential) + tolerance) / threshold)
-    signed = events if rising else -events
+    signed = events if rising else zero - events
     return signed, potential - signed * threshold
 
 
 @numba.njit(nogil=True, inline="always")
 def _store(counts, limit, stored):
-    saturated = np.int32(0)
+    """One bin of each pixel into the voxels; returns how many had to be clipped."""
+    exceeded = False
     for i in range(len(stored)):
-        saturated = np.int32(saturated + np.int32(abs(counts[i]) > limit))
+        exceeded |= abs(counts[i]) > limit
+        stored[i] = counts[i]
+    if exceeded:
+        return _store_clipped(counts, limit, stored)
+    return 0
+
+
+@numba.njit(nogil=True, inline="always")
+def _store_clipped(counts, limit, stored):
+    clipped = 0
+    for i in range(len(stored)):
+        clipped += abs(counts[i]) > limit
         stored[i] = min(max(counts[i], -limit), limit)
-    return saturated
+    return clipped
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -204,63 +202,65 @@ def simulate_pixels(
     Returns:
         number of bins clipped to the limit.
     """
-    _use_widest_vectors()  # type: ignore[call-arg]
+    use_widest_vectors()  # type: ignore[call-arg]
     steps, pixels = len(source_index) - 1, frames.shape[1]
     noisy = len(noise_scale) > 0
-    zero = tolerance - tolerance
-    residual, count = np.zeros(BLOCK_PX, table.dtype), np.zeros(BLOCK_PX, table.dtype)
-    levels = np.zeros((2, _PITCH), table.dtype)
-    hashed = np.zeros((4, _PITCH), np.uint32)
-    scratch = np.zeros((2, _PITCH), np.float32)
-    normal = np.zeros((2, _PITCH), np.float32)
+    state = aligned_rows(4, _PITCH, table.dtype)
+    residual, count, levels = state[0], state[1], state[2:]
+    words = aligned_rows(4, _PITCH, np.uint32)
+    floats = aligned_rows(3, _PITCH, np.float32)
+    radius_words, angle_words, normal = words[0], words[1], floats[:2]
     pairs = np.empty((2, (steps + 1) // 2), np.uint32)
+    start, pixel_radius, pixel_angle = _folds(key, _START), _folds(key, _PIXEL_RADIUS), _folds(key, _PIXEL_ANGLE)
     if noisy:
+        pair_radius, pair_angle = _folds(key, _PAIR_RADIUS), _folds(key, _PAIR_ANGLE)
         for pair in range(pairs.shape[1]):
-            pairs[0, pair] = _word(key, _PAIR_RADIUS, pair)
-            pairs[1, pair] = _word(key, _PAIR_ANGLE, pair)
+            pairs[0, pair] = _word(pair_radius, pair)
+            pairs[1, pair] = _word(pair_angle, pair)
     saturated, next_hot = 0, 0
 
     for first in range(0, pixels, BLOCK_PX):
-        width = min(BLOCK_PX, pixels - first)
+        last = min(first + BLOCK_PX, pixels)
         hot = next_hot
-        while next_hot < len(hot_position) and hot_position[next_hot] < first + width:
+        while next_hot < len(hot_position) and hot_position[next_hot] < last:
             next_hot += 1
         for i in range(BLOCK_PX):
-            uniform = np.float32(np.int32(_word(key, _START, first + i) >> np.uint32(8))) * _UNIT
+            uniform = np.float32(np.int32(_word(start, first + i) >> np.uint32(8))) * _UNIT
             residual[i] = uniform * start_span + start_low
         if noisy:
             for i in range(BLOCK_PX):
-                hashed[0, i] = _word(key, _PIXEL_RADIUS, first + i)
-                hashed[1, i] = _word(key, _PIXEL_ANGLE, first + i)
-        now = 0
-        _look_up(table, frames[source_index[0], first : first + width], levels[now])
+                radius_words[i] = _word(pixel_radius, first + i)
+                angle_words[i] = _word(pixel_angle, first + i)
+        now, row = 0, 0
+        shown = frames[source_index[0], first:last]
+        _look_up(table, shown, shown, levels[now])
 
-        row, due = 0, steps_per_bin
         for step in range(steps):
             before = now
             if source_index[step + 1] != source_index[step]:
                 now = 1 - now
-                _look_up(table, frames[source_index[step + 1], first : first + width], levels[now])
+                coming = frames[source_index[min(step + 1 + _ROWS_AHEAD, steps)], first:last]
+                _look_up(table, frames[source_index[step + 1], first:last], coming, levels[now])
             for each in range(hot, next_hot):
                 residual[hot_position[each] - first] += hot_drift[each] * hot_scale[step]
-            if noisy:
-                pair, odd = step >> 1, step & 1
-                if not odd:
-                    _two_normals(hashed, pairs[0, pair], pairs[1, pair], normal, scratch)
-                scale = noise_scale[step]
+            pair, odd = step >> 1, step & 1
+            if noisy and not odd:
+                _two_normals(
+                    radius_words, angle_words, pairs[0, pair], pairs[1, pair], words[2], words[3], floats[2], normal
+                )
+            # Without noise its row is zeros, which changes no more than the sign of a zero, and that is never seen.
+            scale = noise_scale[step] if noisy else tolerance - tolerance
+            of_bin = step - row * steps_per_bin
+            if of_bin == 0:
+                for i in range(BLOCK_PX):
+                    change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+                    count[i], residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+            else:
                 for i in range(BLOCK_PX):
                     change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
                     signed, residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
                     count[i] += signed
-            else:
-                for i in range(BLOCK_PX):
-                    change = levels[now, i] - levels[before, i]
-                    signed, residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
-                    count[i] += signed
-            due -= 1
-            if due == 0:
-                saturated += _store(count, limit, voxels[row, first : first + width])
-                for i in range(BLOCK_PX):
-                    count[i] = zero
-                row, due = row + 1, steps_per_bin
+            if of_bin == steps_per_bin - 1:
+                saturated += _store(count, limit, voxels[row, first:last])
+                row += 1
     return saturated

@@ -6,6 +6,7 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -217,9 +218,10 @@ def _refreshed(
         stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
         wanted = set(ids)
         store.forget([id for id in known if id not in wanted and not (root / id).is_file()])
-        for batch in _batches(survey(root, stale, processes), len(stale), progress):
-            store.put(batch)
-            known.update((record.id, record) for record in batch)
+        with closing(survey(root, stale, processes)) as found:
+            for batch in _batches(found, len(stale), progress):
+                store.put(batch)
+                known.update((record.id, record) for record in batch)
         return store, {id: known[id] for id in ids}
     except BaseException:
         store.close()

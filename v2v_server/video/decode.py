@@ -14,7 +14,7 @@ version: 4:4:4 H.264 of x264 before build 151 comes out wrong otherwise. So they
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -58,6 +58,19 @@ class DecodedClip:
     bit_exact: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What one sample takes of a clip.
+
+    Attributes:
+        count: number of frames, at least 1; with a stride, of those that are taken.
+        window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+    """
+
+    count: int
+    window: Window | None = None
+
+
 class _SeekFailed(Exception):
     """Decoding did not begin at the keyframe that the index names."""
 
@@ -65,32 +78,53 @@ class _SeekFailed(Exception):
 def decode_luma(
     path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
 ) -> DecodedClip:
-    """Frames start .. start + count - 1 of a video, or a window of them.
+    """Frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` for a single cut."""
+    return decode_cuts(path, index, start, [Cut(count, window)])[0]
+
+
+def decode_cuts(
+    path: str | os.PathLike[str],
+    index: FrameIndex,
+    start: int,
+    cuts: Sequence[Cut],
+    *,
+    stride: int = 1,
+    loop_filter: str = "exact",
+) -> tuple[DecodedClip, ...]:
+    """Several cuts of the frames from ``start`` on, from one pass of the decoder.
+
+    Memory: the cuts themselves (frames x height x width bytes each) and what the decoder holds.
 
     Args:
         path: the file.
         index: its index, or a slice of it that holds the range.
         start: ordinal of the first frame, presentation order.
-        count: number of frames, at least 1.
-        window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+        cuts: at least one.
+        stride: takes frames start, start + stride ...
+        loop_filter: one of ``v2v_protocol.spec.LOOP_FILTERS``.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
-        VideoError: a frame of the range is missing or damaged, the file is shorter than its index, or the picture's
-            size or format is not the same all along. Its ``frame`` is the ordinal of the first frame that could not
-            be had.
+        VideoError: a frame of the longest cut is missing or damaged, the file is shorter than its index, or the
+            picture's size or format is not the same all along. Its ``frame`` is the ordinal of the first frame that
+            could not be had.
     """
-    index.position(start, count)
-    window = _checked(window, index)
-    stack = _Stack(os.fspath(path), index, start, count, window)
+    for cut in cuts:
+        index.position(start, (cut.count - 1) * stride + 1)
+    checked = [Cut(cut.count, _checked(cut.window, index)) for cut in cuts]
+    stack = _Stack(os.fspath(path), index, start, checked, stride)
     try:
-        done = _decode_quickly(stack)
+        done = _decode_quickly(stack, loop_filter)
     except (_SeekFailed, VideoError):
         done = False
-        stack = _Stack(os.fspath(path), index, start, count, window)
+        stack = _Stack(os.fspath(path), index, start, checked, stride)
     if not done:
-        _decode_plainly(stack)
-    return DecodedClip(stack.grey(), index.seconds(start, count), stack.codec, stack.codec in BIT_EXACT_CODECS)
+        _decode_plainly(stack, loop_filter)
+    exact = stack.codec in BIT_EXACT_CODECS
+    return tuple(
+        DecodedClip(grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], stack.codec, exact)
+        for grey, cut in zip(stack.grey(), checked, strict=True)
+    )
 
 
 def _checked(window: Window | None, index: FrameIndex) -> Window:
@@ -106,7 +140,7 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode_quickly(stack: _Stack) -> bool:
+def _decode_quickly(stack: _Stack, loop_filter: str) -> bool:
     """Decode from the last keyframe at or before the range, leaving out what nothing refers to; False when there is
     nothing to be saved.
 
@@ -119,7 +153,7 @@ def _decode_quickly(stack: _Stack) -> bool:
     which = int(np.searchsorted(index.keyframes, stack.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
     begin = int(index.pts[index.position(stack.start, 1)])
-    with opened(stack.path) as (container, stream):
+    with opened(stack.path, loop_filter) as (container, stream):
         codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
@@ -139,9 +173,9 @@ def _decode_quickly(stack: _Stack) -> bool:
     return True
 
 
-def _decode_plainly(stack: _Stack) -> None:
+def _decode_plainly(stack: _Stack, loop_filter: str) -> None:
     """Decode every frame from the beginning of the file."""
-    with opened(stack.path) as (container, stream):
+    with opened(stack.path, loop_filter) as (container, stream):
         try:
             _fill(stack, _decoded(stream, packets(container, stream)))
         except av.FFmpegError as error:
@@ -224,19 +258,21 @@ def _packets_from(container: InputContainer, stream: VideoStream, pts: int, dts:
 class _Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, path: str, index: FrameIndex, start: int, count: int, window: Window) -> None:
+    def __init__(self, path: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int) -> None:
         self.path = path
         self.index = index
         self.start = start
         self.codec = ""
         self.sparse = False  # whether frames before the range are left out on purpose
-        self._window = window
-        self._expected = index.pts[start - index.first : start - index.first + count].tolist()
+        self._cuts = cuts
+        self._stride = stride
+        first, most = start - index.first, max(cut.count for cut in cuts)
+        self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
         self._taken = 0
         self._cursor = 0  # where the next frame is expected in the index
         self._damaged = False
-        self._raw: npt.NDArray[np.uint8] | None = None
+        self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
@@ -263,7 +299,7 @@ class _Stack:
 
     def _is_next(self, frame: VideoFrame, ordinal: int) -> bool:
         if not self.index.seekable:
-            return ordinal >= self.start
+            return ordinal >= self.start and (ordinal - self.start) % self._stride == 0
         if frame.pts is None:
             self.refuse("the decoder delivers a frame without a time stamp")
         expected = self._expected[self._taken]
@@ -271,18 +307,21 @@ class _Stack:
             return True
         if frame.pts > expected:
             self.refuse(f"is missing: the decoder delivers time stamp {frame.pts} where {expected} should come")
-        if self._taken:
+        if self._taken and not self._is_passed_over(frame.pts):
             self.refuse(
                 f"the decoder delivers time stamp {frame.pts}, which the index does not have, before {expected}"
             )
         return False
 
+    def _is_passed_over(self, pts: int) -> bool:
+        """Whether a frame that presents before the next one to take is one that the stride leaves out."""
+        return self._stride > 1 and bool(np.any(self.index.pts == pts))
+
     def _copy(self, frame: VideoFrame) -> None:
-        if self._raw is None:
+        if not self._parts:
             self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
-            self._stored = self._orientation.stored_window(self._window, self.index.height_px, self.index.width_px)
-            self._raw = np.empty((len(self._expected), *self._stored[2:]), np.uint8)
+            self._parts = [self._part(cut) for cut in self._cuts]
         if (frame.height, frame.width) != self._size:
             height, width = self._orientation.size(frame.height, frame.width)
             self.refuse(
@@ -290,7 +329,14 @@ class _Stack:
             )
         if not self._luma.describes(frame):
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
-        copy_luma(frame, self._luma, self._stored, self._raw[self._taken])
+        for stored, raw in self._parts:
+            if self._taken < len(raw):
+                copy_luma(frame, self._luma, stored, raw[self._taken])
+
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+        window = _checked(cut.window, self.index)
+        stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
+        return stored, np.empty((cut.count, *stored[2:]), np.uint8)
 
     def close(self, codec: str) -> None:
         """The end of the pass: make sure that every asked frame came."""
@@ -304,13 +350,12 @@ class _Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.path, self.start + self._taken, why)
+        raise VideoError(self.path, self.start + self._taken * self._stride, why)
 
-    def grey(self) -> npt.NDArray[np.uint8]:
-        """[count, h, w] uint8: the collected frames, upright, in full range."""
-        if self._raw is None:
-            raise RuntimeError("grey() before a finished pass")
-        if self._luma.bits == 8 and not self._luma.full_range:
-            rows = self._raw.reshape(-1, self._raw.shape[-1])
-            cv2.LUT(rows, range_table(8, False), dst=rows)
-        return self._orientation.upright(self._raw)
+    def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
+        """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
+        for _, raw in self._parts:
+            if self._luma.bits == 8 and not self._luma.full_range:
+                rows = raw.reshape(-1, raw.shape[-1])
+                cv2.LUT(rows, range_table(8, False), dst=rows)
+            yield self._orientation.upright(raw)

@@ -1,12 +1,18 @@
-"""A function applied to many jobs in processes of their own, where a crash costs the one job that caused it."""
+"""A function applied to many jobs in processes of their own, where a crash costs the one job that caused it.
+
+Spawned processes and pipes, nothing else: no lock, queue or shared memory, all of which need a writable ``/dev/shm``,
+and containers exist that have none.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
@@ -16,6 +22,7 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 _EXIT_SECONDS = 5.0
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,22 +30,38 @@ class Died:
     """Stands for the result of a job whose process died.
 
     Attributes:
-        how: "signal SIGSEGV", "exit status 1".
+        exitcode: as ``multiprocessing`` gives it: the exit status, or minus the number of a signal.
     """
 
-    how: str
+    exitcode: int
+
+    @property
+    def how(self) -> str:
+        """``signal SIGSEGV``, ``exit status 1``."""
+        if self.exitcode >= 0:
+            return f"exit status {self.exitcode}"
+        number = -self.exitcode
+        return f"signal {signal.Signals(number).name if number in set(signal.Signals) else number}"
+
+    @property
+    def from_outside(self) -> bool:
+        """Whether it was killed by somebody, or by a kernel short of memory, so that the job is not to blame."""
+        return -self.exitcode in _FROM_OUTSIDE
 
 
 def run_isolated(function: Callable[[J], R], jobs: Iterable[J], processes: int) -> Iterator[tuple[J, R | Died]]:
     """(job, result) for every job, in order of completion.
 
     A process takes one job after another; the one that dies is replaced. All are ended with the iterator, and die with
-    this process, however that ends.
+    this process, however that ends. Ctrl-C reaches only this process.
 
     Args:
         function: must be picklable, and return rather than raise: an exception counts as its process's death.
         jobs: picklable; drawn as processes become free.
         processes: how many, spawned; 0 runs the jobs in this process, unprotected.
+
+    Raises:
+        OSError: no process can be started.
     """
     if processes == 0:
         yield from ((job, function(job)) for job in jobs)
@@ -55,18 +78,18 @@ def run_isolated(function: Callable[[J], R], jobs: Iterable[J], processes: int) 
         while lanes:
             wait(list(lanes))
             for ready in [connection for connection in lanes if connection.poll()]:
-                lane = lanes.pop(ready)
-                job, result = lane.finish()
-                following = next(left, None)
-                if following is None:
-                    lane.end()
-                else:
-                    if isinstance(result, Died):
-                        lane.end()
+                lane = lanes[ready]
+                finished = lane.finish()
+                for following in left:
+                    if isinstance(finished[1], Died):
                         lane = _Lane(function)
-                    lanes[lane.connection] = lane
+                        lanes.pop(ready).end()
+                        lanes[lane.connection] = lane
                     lane.begin(following)
-                yield job, result
+                    break
+                else:
+                    lanes.pop(ready).end()
+                yield finished
     finally:
         for lane in lanes.values():
             lane.end()
@@ -79,8 +102,16 @@ class _Lane(Generic[J, R]):
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, function, os.getpid()), daemon=True)
-        self._process.start()
-        other.close()
+        # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
+        resource_tracker.ensure_running()
+        try:
+            with _interrupt_held_back():
+                self._process.start()
+        except BaseException:
+            self.connection.close()
+            raise
+        finally:
+            other.close()
 
     def begin(self, job: J) -> None:
         self._job = job
@@ -94,8 +125,7 @@ class _Lane(Generic[J, R]):
             return self._job, self.connection.recv()
         except (EOFError, OSError):
             self._process.join()
-            code = self._process.exitcode or 0
-            return self._job, Died(f"signal {signal.Signals(-code).name}" if code < 0 else f"exit status {code}")
+            return self._job, Died(self._process.exitcode or 0)
 
     def end(self) -> None:
         self.connection.close()
@@ -105,6 +135,17 @@ class _Lane(Generic[J, R]):
             self._process.kill()
             self._process.join()
         self._process.close()
+
+
+@contextlib.contextmanager
+def _interrupt_held_back() -> Iterator[None]:
+    """A process started inside inherits that SIGINT waits: Ctrl-C in a terminal, which sends it to all, must not strike
+    before :func:`_serve` can ignore it. In this process it strikes at the end."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int) -> None:

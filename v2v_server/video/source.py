@@ -16,14 +16,19 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 
+_SKIP = {"skip-unreferenced": "noref", "skip": "all"}
 _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened(path: str | os.PathLike[str], loop_filter: str = "exact") -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
     The track is the first whose pictures are no cover art; its decoder runs in the calling thread only.
+
+    Args:
+        path: the file.
+        loop_filter: one of ``v2v_protocol.spec.LOOP_FILTERS``.
 
     Raises:
         VideoError: the file cannot be opened, or has no video track.
@@ -44,6 +49,8 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
+        if loop_filter != "exact":
+            stream.codec_context.options = {"skip_loop_filter": _SKIP[loop_filter]}
         yield container, stream
     finally:
         container.close()

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterable
+from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.isolate import Died, run_isolated
 from v2v_server.video.probe import probe
 from v2v_server.video.store import Record
-
-_BATCH = 16
 
 Examine = Callable[[str, str], Record]
 """(root, id) -> what is known of that file; see :func:`examine`."""
@@ -57,8 +53,11 @@ def examine(root: str, id: str) -> Record:
     )
 
 
-def survey(root: Path, ids: Sequence[str], processes: int, examine: Examine = examine) -> Iterator[Record]:
+def survey(root: Path, ids: Iterable[str], processes: int, examine: Examine = examine) -> Generator[Record, None, None]:
     """A record for each id, in any order.
+
+    A file at which a process died is examined once more when all others are done, alone: the process may have been
+    killed from outside, or the memory may not have sufficed for it and its neighbours.
 
     Args:
         root: the folder that ids are relative to.
@@ -67,55 +66,24 @@ def survey(root: Path, ids: Sequence[str], processes: int, examine: Examine = ex
             decoder takes the caller along.
         examine: what is done with each file; must be picklable.
     """
-    if processes == 0:
-        yield from (examine(os.fspath(root), id) for id in ids)
-        return
-    batches = deque(ids[at : at + _BATCH] for at in range(0, len(ids), _BATCH))
+    look = partial(examine, os.fspath(root))
     suspects: list[str] = []
-    with _pool(processes) as pool:
-        waiting: dict[Future[list[Record]], Sequence[str]] = {}
-        while batches or waiting:
-            while batches and len(waiting) < 2 * processes:
-                batch = batches.popleft()
-                try:
-                    waiting[pool.submit(_examine_all, examine, os.fspath(root), batch)] = batch
-                except BrokenProcessPool:
-                    suspects.extend(batch)
-            for done in wait(waiting, return_when=FIRST_COMPLETED).done if waiting else ():
-                batch = waiting.pop(done)
-                try:
-                    yield from done.result()
-                except BrokenProcessPool:
-                    suspects.extend(batch)
-    yield from _one_by_one(root, suspects, examine)
+    for id, found in run_isolated(look, ids, processes):
+        if isinstance(found, Died):
+            suspects.append(id)
+        else:
+            yield found
+    for id, found in run_isolated(look, suspects, 1):
+        yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 
-def _one_by_one(root: Path, ids: Sequence[str], examine: Examine) -> Iterator[Record]:
-    """The same with a single process that has one file at a time: whoever dies, dies of that file."""
-    left = deque(ids)
-    while left:
-        with _pool(1) as pool:
-            while left:
-                id = left.popleft()
-                try:
-                    yield pool.submit(examine, os.fspath(root), id).result()
-                except BrokenProcessPool:
-                    yield _culprit(root, id)
-                    break
-
-
-def _culprit(root: Path, id: str) -> Record:
-    why = "crashes the decoder: the process that probed it died"
+def _culprit(root: Path, id: str, death: Died) -> Record:
+    if death.from_outside:
+        why = f"could not be probed: the process was ended from outside or for want of memory ({death.how}), twice"
+        return Record(id, -1, 0, problem=f"{why}; the next start tries again")
+    why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
         status = Path(root, id).stat()
     except OSError:
         return Record(id, -1, 0, problem=why)  # gone meanwhile; should it come back, it is looked at again
     return Record(id, status.st_size, status.st_mtime_ns, problem=why)
-
-
-def _pool(processes: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
-
-
-def _examine_all(examine: Examine, root: str, ids: Sequence[str]) -> list[Record]:
-    return [examine(root, id) for id in ids]

@@ -37,15 +37,15 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
-    from v2v_server import produce, worker
+    from v2v_server import clips, produce, worker
 
     at = {"video": ""}
-    make_sample, decode_luma, simulate_clip = worker.make_sample, produce.decode_luma, produce.simulate_clip
+    decode_for, decode_cuts, simulate_clip = clips.decode_for, produce.decode_cuts, produce.simulate_clip
     encode_sample = worker.encode_sample
 
-    def making(lease, *rest):
+    def decoding(lease, *rest):
         at["video"] = lease.video
-        return make_sample(lease, *rest)
+        return decode_for(lease, *rest)
 
     def before(stage, function):
         def call(*arguments, **named):
@@ -55,8 +55,8 @@ def _install(fault: dict) -> None:
 
         return call
 
-    worker.make_sample = making
-    produce.decode_luma = before("decode", decode_luma)
+    clips.decode_for = decoding
+    produce.decode_cuts = before("decode", decode_cuts)
     produce.simulate_clip = before("simulate", simulate_clip)
     worker.encode_sample = before("send", encode_sample)
 

@@ -1,0 +1,64 @@
+"""``v2v-bench NAME ...``: one command for everything that measures.
+
+NAME is a module of this package with a ``main``; it is imported only when asked for, so that one benchmark does not
+need the packages of another. ``v2v-bench NAME --help`` shows its flags. Exit status: 0 success, 1 a stated bar of the
+benchmark missed, 2 wrong usage or input.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import benchmarks
+
+_LINE_WIDTH = 104
+
+
+def names() -> dict[str, str]:
+    """What can be run: name and beginning of its docstring, read from the source without importing anything.
+
+    Modules with an underscore in their name are parts of others.
+    """
+    found = {}
+    for module in pkgutil.iter_modules(benchmarks.__path__):
+        if "_" in module.name or module.name == "cli":
+            continue
+        tree = ast.parse(Path(benchmarks.__path__[0], f"{module.name}.py").read_text(encoding="utf-8"))
+        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
+            paragraph = (ast.get_docstring(tree) or "").split("\n\n")[0]
+            found[module.name] = textwrap.shorten(paragraph, _LINE_WIDTH, placeholder=" ...")
+    return found
+
+
+def usage() -> str:
+    """The list of benchmarks."""
+    lines = [f"  {name:12s} {line}" for name, line in names().items()]
+    return "\n".join(["usage: v2v-bench NAME [flags]     v2v-bench NAME --help", "", *lines])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return 0
+    if name not in names():
+        print(f"v2v-bench: no benchmark {name!r}; known: {', '.join(names())}", file=sys.stderr)
+        return 2
+    # Each main reads the command line itself, the way it does as a module of its own.
+    before, sys.argv = sys.argv, [f"v2v-bench {name}", *rest]
+    try:
+        status = importlib.import_module(f"benchmarks.{name}").main()
+    finally:
+        sys.argv = before
+    return int(status)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

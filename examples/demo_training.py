@@ -1,0 +1,63 @@
+"""What the training of the demo came to: against the best grey picture, and to look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from trainer.config_file import load_config
+from trainer.models import NETWORKS
+from trainer.preview import films, write_png
+from trainer.resume import LAST
+from trainer.weights import load_into
+from v2v_client import Batch, V2VStreamDataset
+
+_SAMPLES = 16
+_SEED = 1
+_SIDE_PX = 128
+_COLUMNS, _ROWS = 2, 5
+_FIRST_SHOWN = 4
+"""Before this step of a clip little has moved yet, and the network cannot know the scene."""
+
+
+def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
+    """Compare the trained network with a constant, on virtual cameras that it was not trained on.
+
+    The constant is the mean of the very frames it is judged on, which no predictor would know beforehand. Both errors
+    are mean absolute differences, the loss of the training.
+
+    Args:
+        address: of the server.
+        configuration: that the run was trained with.
+        run: folder of the run.
+        picture: where to draw voxels, targets and reconstructions.
+
+    Returns:
+        the network is the better one.
+    """
+    config = load_config(configuration)
+    torch.set_num_threads(config.compute.threads)
+    recipe = config.stream.resolved_recipe.replace(crop_height_px=_SIDE_PX, crop_width_px=_SIDE_PX)
+    network = NETWORKS[config.network.name](bins=recipe.bins, **config.network.options)
+    load_into(network, run / LAST, ema=True)
+    dataset = V2VStreamDataset(address, batch_size=2, recipe=recipe, seed=_SEED)
+    batches: list[Batch] = []
+    while len(batches) * 2 < _SAMPLES:
+        batches += dataset
+    target = torch.cat([batch.arrays["frames"] for batch in batches]) / 255.0
+    voxels = torch.cat([batch.arrays["voxels"] for batch in batches])
+    with torch.no_grad():
+        prediction = torch.cat([network.forward_sequence(piece) for piece in torch.split(voxels, 2)])
+    loss = float((prediction - target).abs().mean())
+    constant = float((target.mean() - target).abs().mean())
+    print(
+        f"trained network: mean absolute error {loss:.4f}; constant-mean predictor: {constant:.4f} "
+        f"({loss / constant:.0%} of it) on {len(target)} new samples of {_SIDE_PX} x {_SIDE_PX}"
+    )
+    shown = [film for batch in batches[:_COLUMNS] for film in films(network, batch, torch.device("cpu"))][:_COLUMNS]
+    picks = np.linspace(_FIRST_SHOWN, len(shown[0]) - 1, _ROWS).round().astype(int)
+    write_png(picture, np.concatenate([np.concatenate(list(film[picks]), axis=0) for film in shown], axis=1))
+    print(f"picture: {picture} (events, target, reconstruction; time runs down)")
+    return loss < constant

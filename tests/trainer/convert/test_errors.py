@@ -1,0 +1,200 @@
+"""Damaged, incomplete and mistaken sources: one clear message, and no file."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.trainer.convert import raw_forms
+from tests.trainer.convert.aedat4_file import write_aedat4
+from tests.trainer.convert.scene import scene
+from trainer.convert import cli, convert, text_events
+from trainer.convert.items import EventChunk, Options, SensorSize
+from trainer.convert.text_events import read_text_events
+from v2v_protocol.errors import UsageError
+
+
+def ijrr(path: Path, **changes: bytes | None) -> Path:
+    members = raw_forms.ijrr_members(scene())
+    for name, content in changes.items():
+        member = {"events": "slow/events.txt", "images": "slow/images.txt", "frame": "slow/images/frame_00000002.png"}[
+            name
+        ]
+        if content is None:
+            del members[member]
+        else:
+            members[member] = content
+    raw_forms.write_zip(path / "slow.zip", members)
+    return path / "slow.zip"
+
+
+def evaid(path: Path, **changes: bytes) -> Path:
+    members = raw_forms.evaid_members(scene())
+    raw_forms.write_zip(path / "ball.zip", members | {f"{name}.txt": text for name, text in changes.items()})
+    return path / "ball.zip"
+
+
+def mvsec(path: Path, **datasets: np.ndarray) -> Path:
+    raw_forms.write_mvsec(path / "fly_data.hdf5", scene())
+    with h5py.File(path / "fly_data.hdf5", "a") as file:
+        for name, values in datasets.items():
+            del file[f"davis/left/{name}"]
+            file[f"davis/left/{name}"] = values
+    return path / "fly_data.hdf5"
+
+
+def written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def cut_short(path: Path, share: float) -> Path:
+    return written(path, path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def short_bag(path: Path) -> Path:
+    raw_forms.write_bag(path / "a.bag", scene())
+    return cut_short(path / "a.bag", 0.7)
+
+
+def short_aedat4(path: Path) -> Path:
+    write_aedat4(path / "a.aedat4", scene())
+    return cut_short(path / "a.aedat4", 0.03)
+
+
+def evt2_without_size(path: Path) -> Path:
+    raw_forms.write_evt2(path / "a.raw", scene(), geometry=False)
+    return path / "a.raw"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: path / "absent.zip", "no file or folder"),
+        (lambda path: written(path / "a.bin", b"nothing"), "is no recording that can be read.*--form"),
+        (lambda path: written(path / "a.zip", b"nothing"), "neither a folder nor a whole zip"),
+        (lambda path: cut_short(ijrr(path), 0.6), "neither a folder nor a whole zip"),
+        (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2\n"), r"line 2: '0.2 1 2' is not `t x y p`"),
+        (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2 2\n"), r"line 2: '0.2 1 2 2' is not `t x y p`"),
+        (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 x 0\n"), r"line 2: '0.2 1 x 0' is not"),
+        (lambda path: ijrr(path, events=b"0.1 1 2 1\nnan 1 2 0\n"), r"line 2: 'nan 1 2 0' is not"),
+        (lambda path: ijrr(path, events=b"a b\n0.2 1 2 1\n"), r"the first line is b'a b'"),
+        (lambda path: ijrr(path, events=b""), "holds no events"),
+        (lambda path: ijrr(path, frame=None), r"line 3 names images/frame_00000002.png, which is not there"),
+        (lambda path: ijrr(path, frame=b"no picture"), r"frame_00000002.png is no picture"),
+        (lambda path: ijrr(path, images=b"one two three\n"), r"line 1: 'one two three' is not `seconds path`"),
+        (lambda path: evaid(path, timestamps=b"1 2 3"), r"5 pictures in gt/, but 3 times"),
+        (lambda path: evaid(path, timestamps=b"1 2 x"), r"something else than numbers"),
+        (lambda path: evaid(path, shape=b"24"), r"shape.txt holds \[24\]"),
+        (lambda path: evaid(path, shape=b"20 18"), r"the sensor is SensorSize\(width=20"),
+        (lambda path: mvsec(path, events=np.zeros((4, 3))), r"is \[4, 3\], not \[N, 4\]"),
+        (lambda path: mvsec(path, image_raw_ts=np.zeros(2)), "5 pictures, but 2 times"),
+        (lambda path: mvsec(path, image_raw=np.zeros((5, 18, 24))), "not uint8"),
+        (short_bag, "the bag cannot be read"),
+        (short_aedat4, "cannot be decoded"),
+        (evt2_without_size, "give --size WIDTHxHEIGHT"),
+    ],
+)
+def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: str) -> None:
+    source = make(tmp_path)  # type: ignore[operator]
+    with pytest.raises(UsageError, match=message):
+        convert(source, tmp_path / "out" / "a.h5")
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_size_given_where_the_file_has_none(tmp_path: Path) -> None:
+    done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=Options(size=SensorSize(30, 20)))
+    assert done.written.size == SensorSize(30, 20)
+
+
+def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> None:
+    raw_forms.write_bag(tmp_path / "a.bag", scene())
+    for options, message in (
+        (Options(events_topic="/none"), r"0 topics of events; .*/dvs/events \(dvs_msgs/msg/EventArray\)"),
+        (Options(images_topic="/none"), r"no pictures on /none; they are on /dvs/image_raw"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            convert(tmp_path / "a.bag", tmp_path / "a.h5", options=options)
+    raw_forms.write_bag(tmp_path / "b.bag", scene(), image_encoding="16UC1")
+    with pytest.raises(UsageError, match="a picture is '16UC1'"):
+        convert(tmp_path / "b.bag", tmp_path / "b.h5")
+
+
+def test_source_and_destination_are_kept_apart(tmp_path: Path) -> None:
+    folder = tmp_path / "slow"
+    raw_forms.write_folder(folder, raw_forms.ijrr_members(scene()))
+    with pytest.raises(UsageError, match="lies in the source folder"):
+        convert(folder, folder / "a.h5")
+    source = mvsec(tmp_path)
+    with pytest.raises(UsageError, match="is the source itself"):
+        convert(source, source, overwrite=True)
+    convert(source, tmp_path / "a.h5")
+    with pytest.raises(UsageError, match="--overwrite"):
+        convert(source, tmp_path / "a.h5")
+    convert(source, tmp_path / "a.h5", overwrite=True)
+
+
+@pytest.mark.parametrize("block", [1, 7, 64, 1000])
+def test_blocks_may_end_anywhere(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    monkeypatch.setattr(text_events, "BLOCK_BYTES", block)
+    content = b"24 18\n" + b"".join(b"%d %d %d %d\n" % (t, t % 24, t % 18, t % 2) for t in range(100))
+    items = list(read_text_events(io.BytesIO(content), "a.txt"))
+    assert items[0] == SensorSize(24, 18)
+    chunks = [item for item in items[1:] if isinstance(item, EventChunk)]
+    assert np.concatenate([chunk.t_ns for chunk in chunks]).tolist() == [1000 * t for t in range(100)]
+    broken = content.replace(b"\n77 5 5 1\n", b"\n77 5 5\n")
+    with pytest.raises(UsageError, match=r"line 79: '77 5 5'"):
+        list(read_text_events(io.BytesIO(broken), "a.txt"))
+
+
+@pytest.mark.parametrize("package", ["faery", "rosbags"])
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    source = tmp_path / ("a.raw" if package == "faery" else "a.bag")
+    (raw_forms.write_evt3 if package == "faery" else raw_forms.write_bag)(source, scene())
+    for module in ("faery", "rosbags", "rosbags.rosbag1"):
+        if module.startswith(package):
+            monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=rf"{package} package: pip install 'v2v-stream\[convert\]'"):
+        convert(source, tmp_path / "a.h5")
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = mvsec(tmp_path)
+    raw_forms.write_evt3(tmp_path / "own.raw", scene())
+    cli.main(
+        [str(source), str(tmp_path / "own.raw"), "--out", str(tmp_path / "h5"), "--json", str(tmp_path / "a.json")]
+    )
+    assert sorted(path.name for path in (tmp_path / "h5").iterdir()) == ["fly.h5", "own.h5"]
+    printed = capsys.readouterr().out
+    assert "28 events in 0.039 s, 5 images, 24 x 18 (mvsec)" in printed
+    assert "no images" in printed
+    records = json.loads((tmp_path / "a.json").read_text())
+    assert [(record["form"], record["events"], record["width_px"]) for record in records] == [
+        ("mvsec", 28, 24),
+        ("prophesee", 28, 24),
+    ]
+    cli.main([str(source), "--out", str(tmp_path / "one.h5")])
+    assert (tmp_path / "one.h5").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["absent", "--out", "x"], "no file or folder absent"),
+        (["a", "b", "--out", "x.h5"], "--out x.h5 is one file, and there are 2"),
+        (["a", "--out", "x", "--size", "24"], "give WIDTHxHEIGHT"),
+    ],
+)
+def test_command_line_refuses(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

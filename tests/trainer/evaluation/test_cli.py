@@ -1,0 +1,179 @@
+"""The command from end to end: raw forms, conversion, reconstruction, scores, tables, records, pictures, video."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.trainer.conftest import WEIGHTS
+from tests.trainer.convert import raw_forms
+from tests.trainer.convert.scene import expected_voxels, scene
+from tests.trainer.evaluation.h5_file import random_recording
+from tests.trainer.evaluation.test_metrics import slow_ssim
+from trainer.convert import cli as convert_cli
+from trainer.evaluation import cli
+from trainer.models import FireNet
+
+DAVIS = WEIGHTS.parent / "events" / "davis346_aestream.aedat4"
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    torch.save(FireNet(base_channels=4).state_dict(), tmp_path / "weights.pth")
+    return tmp_path / "weights.pth"
+
+
+def evaluate(*arguments: object) -> list[dict[str, Any]]:
+    """Runs the command and gives its records."""
+    out = Path(str(arguments[arguments.index("--weights") + 1])).with_name("records.json")
+    cli.main([str(argument) for argument in (*arguments, "--json", out)])
+    records: list[dict[str, Any]] = json.loads(out.read_text())
+    return records
+
+
+def test_scores_of_a_converted_bag_equal_those_computed_by_hand(tmp_path: Path, weights: Path) -> None:
+    """From the known voxel grids, the network in one pass, and the formulas in float64."""
+    original = scene()
+    raw_forms.write_bag(tmp_path / "desk.bag", original)
+    convert_cli.main([str(tmp_path / "desk.bag"), "--out", str(tmp_path / "h5")])
+    sequence, mean = evaluate("--weights", weights, "--data", tmp_path / "h5")
+    network = FireNet(base_channels=4)
+    network.load_state_dict(torch.load(weights))
+    grids = np.stack([expected_voxels(window, "discrete") for window in range(4)]).astype(np.float32)
+    with torch.no_grad():
+        predictions = network.forward_sequence(torch.from_numpy(grids)[None])[0, :, 0].double().clamp(0, 1).numpy()
+    targets = original.pictures[1:] / 255
+    pairs = list(zip(predictions, targets, strict=True))
+    assert sequence["mse"] == pytest.approx(np.mean([(a - b) ** 2 for a, b in pairs]), abs=1e-6)
+    assert sequence["ssim"] == pytest.approx(np.mean([slow_ssim(a, b, 1.0) for a, b in pairs]), abs=1e-5)
+    assert sequence["ssim_range2"] == pytest.approx(np.mean([slow_ssim(a, b, 2.0) for a, b in pairs]), abs=1e-5)
+    assert (sequence["sequence"], sequence["frames"], sequence["events"]) == ("desk", 4, 28)
+    assert (mean["sequence"], mean["mse"], mean["voxels"]) == (None, sequence["mse"], "discrete")
+
+
+def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path) -> None:
+    raw_forms.write_bag(tmp_path / "desk.bag", scene())
+    convert_cli.main([str(tmp_path / "desk.bag"), "--out", str(tmp_path / "h5")])
+    ours = evaluate("--weights", weights, "--data", tmp_path / "h5")
+    published = evaluate("--weights", weights, "--data", tmp_path / "h5", "--as-published")
+    # Every picture, the first apart, is paired with the event before: the last window does not gain what it loses.
+    assert (ours[0]["events"], published[0]["events"]) == (28, 27)
+    assert ours[0]["mse"] != published[0]["mse"]
+    assert published[0]["as_published"] is True
+
+
+def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two sequences of IJRR, cut; one of HQF, whole; the mean over sequences; the paper's rows beside."""
+    data = tmp_path / "data"
+    random_recording(data / "ijrr" / "slider_depth.h5", images=41, period=0.1, events=3000, seed=1)
+    random_recording(data / "ijrr" / "office_zigzag.h5", images=131, period=0.1, events=3000, seed=2)
+    random_recording(data / "hqf" / "desk.h5", images=5, seed=3)
+    records = evaluate(
+        "paper-discrete",
+        "--weights",
+        weights,
+        "--data",
+        data,
+        "--metrics",
+        "mse,ssim_range2",
+        "--out",
+        tmp_path / "out",
+    )
+    frames = {(record["data_set"], record["sequence"]): record["frames"] for record in records}
+    # The clock starts at 1 s: multiples of 0.1 are inexact, cuts take both ends.
+    assert frames == {
+        ("HQF", "desk"): 4,
+        ("HQF", None): 4,
+        ("IJRR", "office_zigzag"): pytest.approx(70, abs=1),
+        ("IJRR", "slider_depth"): pytest.approx(15, abs=1),
+        ("IJRR", None): frames["IJRR", "office_zigzag"] + frames["IJRR", "slider_depth"],
+    }
+    scores = {record["sequence"]: record["mse"] for record in records if record["data_set"] == "IJRR"}
+    assert scores[None] == pytest.approx((scores["office_zigzag"] + scores["slider_depth"]) / 2, rel=1e-12)
+    printed = capsys.readouterr().out
+    assert "mean of 2 of 7" in printed
+    assert "paper: E2VID WebVid10K" in printed
+    assert "0.562" in printed
+    assert "EVAID: none of its 11 sequences is there" in printed
+    assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")) == [
+        "HQF/desk.png",
+        "IJRR/office_zigzag.png",
+        "IJRR/slider_depth.png",
+    ]
+
+
+def test_pictures_and_video(tmp_path: Path, weights: Path) -> None:
+    random_recording(tmp_path / "own" / "a.h5", size=(36, 41), images=6)
+    evaluate("--weights", weights, "--data", tmp_path / "own", "--out", tmp_path / "out", "--rows", 2, "--video")
+    picture = cv2.imread(str(tmp_path / "out" / "own" / "a.png"))
+    assert picture.shape == (2 * (36 + 18), 3 * (41 + 4), 3)
+    video = cv2.VideoCapture(str(tmp_path / "out" / "own" / "a.mp4"))
+    frames = []
+    while (read := video.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 5
+    assert frames[0].shape == (36 + 18, 136, 3)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(50, rel=0.01)
+    video.release()
+    # The last row of the picture is the last frame of the video, up to its compression.
+    difference = picture[54:, :135].astype(int) - frames[-1][:, :135]
+    assert np.abs(difference).mean() < 20
+
+
+def test_without_pictures_only_at_a_given_rate(tmp_path: Path, weights: Path) -> None:
+    raw_forms.write_evt3(tmp_path / "own.raw", scene())
+    convert_cli.main([str(tmp_path / "own.raw"), "--out", str(tmp_path / "h5")])
+    arguments = ("--fps", 100, "--rows", 1, "--out", tmp_path)
+    (record, _) = evaluate("--weights", weights, "--data", tmp_path / "h5" / "own.h5", *arguments)
+    assert cv2.imread(str(tmp_path / "own" / "own.png")).shape[1] == 2 * (24 + 4)
+    assert (record["frames"], record["reconstruction_hz"]) == (3, 100)
+    assert "mse" not in record
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data", "absent"], "--data absent: no such folder"),
+        (["absent.yaml", "--data", "{data}"], "no file absent.yaml"),
+        (["paper-discrete", "--data", "{data}"], "--lpips alex BACKBONE HEADS"),
+        (["paper-discrete", "--data", "{data}", "--metrics", "mse"], "holds no sequence of hqf/*.h5 (HQF), evaid"),
+        (["--data", "{data}", "--model", "e2vid"], "the weights do not fit"),
+        (["--data", "{data}", "--fps", "10", "--metrics", "mse"], "--fps scores nothing"),
+        (["--data", "{data}", "--rows", "0", "--out", "x"], "0 rows"),
+        (["--data", "{data}", "--video"], "a video needs --out"),
+        (["--data", "{data}/a.h5", "--json", "{data}/none/a.json"], "cannot be written"),
+    ],
+)
+def test_mistakes_end_with_status_2(
+    tmp_path: Path, weights: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random_recording(tmp_path / "own" / "a.h5", images=3)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--weights", str(weights), *(a.replace("{data}", str(tmp_path / "own")) for a in arguments)])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_published_firenet_shows_the_scene_of_a_real_recording(tmp_path: Path, published: Path) -> None:
+    """A dark panel on a bright peg board, and two lamps: their order of brightness in the reconstruction."""
+    if not DAVIS.is_file():
+        pytest.skip(f"no file {DAVIS}: set V2V_TEST_WEIGHTS to the folder beside `events`")
+    convert_cli.main([str(DAVIS), "--out", str(tmp_path)])
+    (tmp_path / "weights.pth").write_bytes((published / "firenet_evreal.pth").read_bytes())
+    evaluate(
+        "--weights", tmp_path / "weights.pth", "--normalize-voxels", "--voxels", "interpolated",
+        "--data", tmp_path / "davis346_aestream.h5", "--out", tmp_path / "out", "--rows", 1,
+    )  # fmt: skip
+    drawn = cv2.imread(str(tmp_path / "out/davis346_aestream/davis346_aestream.png"), cv2.IMREAD_GRAYSCALE)
+    reconstruction, camera = drawn[:260, 350:696].astype(float), drawn[:260, 700:1046].astype(float)
+    panel, board = (slice(40, 125), slice(85, 170)), (slice(40, 125), slice(200, 290))
+    lamps = camera > 250
+    for picture in (reconstruction, camera):
+        assert picture[panel].mean() + 20 < picture[board].mean() < picture[lamps].mean()

@@ -1,0 +1,96 @@
+"""Metrics against float64 numpy that follows the formulas, window by window."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.trainer import numpy_networks
+from tests.trainer.test_lpips import heads_file, random_metric, torchvision_like
+from trainer.evaluation.metrics import METRICS, make_metrics, mse, ssim
+from trainer.evaluation.score import SequenceScore, mean_over_sequences
+from v2v_protocol.errors import UsageError
+
+
+def pair(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    target = rng.random((height, width))
+    return np.clip(0.7 * target + 0.3 * rng.random((height, width)), 0, 1), target
+
+
+def slow_ssim(a: np.ndarray, b: np.ndarray, data_range: float) -> float:
+    """Every 7 x 7 window on its own; variances divided by 48."""
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    values = []
+    for top in range(a.shape[0] - 6):
+        for left in range(a.shape[1] - 6):
+            one, other = (picture[top : top + 7, left : left + 7].ravel() for picture in (a, b))
+            covariance = np.cov(one, other, ddof=1)
+            luminance = (2 * one.mean() * other.mean() + c1) / (one.mean() ** 2 + other.mean() ** 2 + c1)
+            structure = (2 * covariance[0, 1] + c2) / (covariance[0, 0] + covariance[1, 1] + c2)
+            values.append(luminance * structure)
+    return float(np.mean(values))
+
+
+@settings(max_examples=30)
+@given(st.integers(7, 14), st.integers(7, 14), st.integers(0, 100), st.sampled_from((1.0, 2.0)))
+def test_ssim(height: int, width: int, seed: int, data_range: float) -> None:
+    prediction, target = pair(height, width, seed)
+    assert ssim(prediction, target, data_range=data_range) == pytest.approx(
+        slow_ssim(prediction, target, data_range), abs=1e-10
+    )
+
+
+def test_the_wider_range_flatters() -> None:
+    """Range 2 doubles both constants' roots, which pulls every window towards 1."""
+    prediction, target = pair(20, 20, 0)
+    assert ssim(prediction, target, data_range=1.0) < ssim(prediction, target, data_range=2.0) < 1
+
+
+def test_mse() -> None:
+    prediction, target = pair(9, 11, 1)
+    assert mse(prediction, target) == pytest.approx(sum((prediction - target).ravel() ** 2) / 99, rel=1e-12)
+    assert mse(np.zeros((2, 2)), np.full((2, 2), 0.5)) == 0.25
+
+
+def test_equal_pictures() -> None:
+    _, target = pair(16, 16, 2)
+    metrics = make_metrics(["mse", "ssim", "ssim_range2"], {})
+    assert {name: metric(target, target) for name, metric in metrics.items()} == pytest.approx(
+        {"mse": 0, "ssim": 1, "ssim_range2": 1}, abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("net", ["alex", "squeeze"])
+def test_lpips_from_files(tmp_path: Path, net: str) -> None:
+    network, backbone, heads = random_metric(net)
+    torch.save(torchvision_like(network.float()), tmp_path / "backbone.pth")
+    torch.save(heads_file(network), tmp_path / "heads.pth")
+    files = {net: (tmp_path / "backbone.pth", tmp_path / "heads.pth")}
+    prediction, target = pair(33, 36, 3)
+    expected = numpy_networks.lpips(net, prediction[None], target[None], backbone, heads)
+    assert make_metrics([f"lpips_{net}"], files)[f"lpips_{net}"](prediction, target) == pytest.approx(
+        expected, rel=1e-3
+    )
+
+
+def test_what_cannot_be_computed_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--lpips alex BACKBONE HEADS .*alexnet.*--metrics"):
+        make_metrics(["lpips_alex"], {"squeeze": ("a", "b")})
+    with pytest.raises(UsageError, match=f"give some of {', '.join(METRICS)}"):
+        make_metrics(["psnr"], {})
+    with pytest.raises(UsageError, match="at least 7 x 7"):
+        ssim(np.zeros((6, 9)), np.zeros((6, 9)), data_range=1)
+
+
+def test_means_over_sequences_have_no_weights() -> None:
+    def score(frames: int, **means: float) -> SequenceScore:
+        return SequenceScore("a", "b", frames, 0, 0, 0, means)
+
+    assert mean_over_sequences([score(1, mse=0.2, ssim=0.1), score(1000, mse=0.4)]) == {"mse": pytest.approx(0.3)}
+    assert mean_over_sequences([]) == {}

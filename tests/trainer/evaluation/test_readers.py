@@ -1,0 +1,192 @@
+"""Recordings in the layout of each data set, with the faults that published files have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.trainer.evaluation.h5_file import random_recording, write_h5
+from trainer.evaluation import readers
+from trainer.evaluation.readers import Recording
+from v2v_protocol.errors import UsageError
+
+PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
+T = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
+
+
+def recording(path: Path, attributes: list[dict[str, Any]], **options: Any) -> Path:
+    """Six events at 1.0, 1.1 ... 1.5 s, x = their number modulo 4."""
+    numbers = np.arange(len(T))
+    pictures = [(PIXELS + number, given) for number, given in enumerate(attributes)]
+    return write_h5(path / "a.h5", T, numbers % 4, numbers % 3, numbers % 2, pictures, **options)
+
+
+def stamped(*times: float, shift: int = 0) -> list[dict[str, Any]]:
+    return [{"timestamp": time, "event_idx": max(0, int(np.searchsorted(T, time)) + shift)} for time in times]
+
+
+@pytest.mark.parametrize(
+    ("data_set", "options"),
+    [
+        ("HQF", {"ts_dtype": "f8", "ps_dtype": "?"}),
+        ("IJRR, MVSEC", {"ts_dtype": "f8", "ps_dtype": "u1"}),
+        ("EVAID", {"ts_dtype": "f4", "ps_dtype": "u1"}),
+        ("polarities of -1 and 1", {"ps_dtype": "i1"}),
+    ],
+)
+def test_layouts(tmp_path: Path, data_set: str, options: dict[str, Any]) -> None:
+    path = recording(tmp_path, stamped(1.05, 1.25, 1.45), **options)
+    if data_set.startswith("polarities"):
+        numbers = np.arange(6)
+        write_h5(path, T, numbers % 4, numbers % 3, numbers % 2 * 2 - 1,
+                 [(PIXELS + i, a) for i, a in enumerate(stamped(1.05, 1.25, 1.45))], **options)  # fmt: skip
+    with Recording(path) as opened:
+        assert (opened.name, opened.size, len(opened)) == ("a", (3, 4), 6)
+        first, second = opened.windows()
+        events = opened.events(first)
+        assert events.x.tolist() == [1, 2]
+        assert events.p.tolist() == [1, -1]
+        np.testing.assert_allclose(events.t, [1.1, 1.2], rtol=0, atol=1e-6)
+        assert opened.events(second).x.tolist() == [3, 0]
+        assert second.target is not None
+        np.testing.assert_array_equal(opened.image(second.target), PIXELS + 2)
+
+
+def test_an_event_at_the_time_of_a_picture_belongs_to_the_window_after_it(tmp_path: Path) -> None:
+    with Recording(recording(tmp_path, stamped(1.0, 1.2, 1.4))) as opened:
+        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.0, 1.1], [1.2, 1.3]]
+
+
+def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path) -> None:
+    path = recording(tmp_path, stamped(1.05, 1.25, 1.45, shift=-1))
+    with Recording(path) as opened:
+        assert [len(opened.events(window)) for window in opened.windows()] == [2, 2]
+        assert opened.events(opened.windows()[0]).t.tolist() == [1.1, 1.2]
+    with Recording(path, as_published=True) as opened:
+        assert opened.events(opened.windows()[0]).t.tolist() == [1.0, 1.1]
+
+
+def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Path) -> None:
+    """Pictures at 1.05, 1.25, [1.15], 1.45: the third is moved to 1.35. Published: an empty window, then 3 events."""
+    path = recording(tmp_path, stamped(1.05, 1.25, 1.15, 1.45))
+    with Recording(path) as opened:
+        assert opened.repaired_images == 1
+        assert [image.time for image in opened.images] == pytest.approx([1.05, 1.25, 1.35, 1.45])
+        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.1, 1.2], [1.3], [1.4]]
+    with Recording(path, as_published=True) as opened:
+        assert opened.repaired_images == 0
+        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.1, 1.2], [], [1.2, 1.3, 1.4]]
+    with Recording(recording(tmp_path, stamped(1.05, 1.25, 1.15))) as opened:
+        assert opened.images[-1].time == pytest.approx(1.35)
+
+
+def test_clocks_that_do_not_fit_are_refused_or_taken_as_published(tmp_path: Path) -> None:
+    """The released aedat4 script searches microseconds in seconds: every event_idx is the number of events."""
+    attributes = [{"timestamp": 1.6e15 + step, "event_idx": 6} for step in range(2)]
+    path = recording(tmp_path, attributes)
+    with pytest.raises(UsageError, match=r"not one clock.*v2v-convert.*--as-published"):
+        Recording(path)
+    with Recording(path, as_published=True) as opened:
+        assert [len(opened.events(window)) for window in opened.windows()] == [0]
+
+
+def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
+    with Recording(recording(tmp_path, [{"event_idx": 1}, {"event_idx": 4}])) as opened:
+        assert [window.start for window in opened.windows()] == [1]
+        assert opened.windows()[0].stop == 4
+        assert [image.time for image in opened.images] == [1.1, 1.4]
+
+
+def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
+    path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
+    with Recording(path) as opened:
+        windows = opened.windows((1.0, 3.0))
+        assert len(windows) == 20
+        assert windows[0].begin == pytest.approx(2.0)
+        assert windows[-1].end == pytest.approx(4.0)
+        assert len(opened.windows((0.0, 60.0))) == 50
+        with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the cut is from 5 to 20 s.*--cuts none"):
+            opened.windows((5.0, 20.0))
+        with pytest.raises(UsageError, match="two or more"):
+            opened.windows((4.96, 5.5))
+
+
+@settings(max_examples=30)
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=40), st.integers(1, 9))
+def test_search_in_blocks_equals_search_in_memory(
+    tmp_path_factory: pytest.TempPathFactory, times: list[int], block: int
+) -> None:
+    t = np.sort(np.array(times, np.float64))
+    stamps = np.arange(-0.5, 51.0, 3.5)
+    near = [stamp for stamp in stamps if t[0] - 1 <= stamp <= t[-1] + 1] or [float(t[0])]
+    path = tmp_path_factory.mktemp("blocks") / "a.h5"
+    zeros = np.zeros(len(t))
+    write_h5(path, t, zeros, zeros, zeros, [(PIXELS, {"timestamp": stamp, "event_idx": 0}) for stamp in near])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(readers, "BLOCK_EVENTS", block)
+        patch.setattr(readers, "CACHED_BLOCKS", 2)
+        with Recording(path) as opened:
+            assert [image.event_index for image in opened.images] == np.searchsorted(t, near).tolist()
+
+
+def test_regular_windows(tmp_path: Path) -> None:
+    with Recording(recording(tmp_path, [], sensor_resolution=(3, 4))) as opened:
+        windows = opened.regular_windows(5)
+        assert [opened.events(window).t.tolist() for window in windows] == [[1.0, 1.1], [1.2, 1.3]]
+        assert all(window.target is None for window in windows)
+        for fps, message in ((0, "more than 0"), (float("nan"), "more than 0"), (1.9, "less than one window")):
+            with pytest.raises(UsageError, match=message):
+                opened.regular_windows(fps)
+
+
+def broken(path: Path, kind: str) -> Path:
+    file = path / "a.h5"
+    if kind == "text":
+        file.write_text("no HDF5")
+    elif kind == "columns":
+        write_h5(file, T, T[:2], T, T, [])
+    elif kind == "no images or size":
+        write_h5(file, T, T, T, T, [])
+    elif kind == "no index":
+        write_h5(file, T, T, T, T, [(PIXELS, {"timestamp": 1.0})])
+    elif kind == "colour":
+        write_h5(file, T, T, T, T, [(np.zeros((3, 4, 3), np.uint8), {"timestamp": 1.0, "event_idx": 0})])
+    elif kind == "twice back":
+        recording(path, stamped(1.3, 1.2, 1.1))
+    elif kind == "raw":
+        import h5py
+
+        with h5py.File(file, "w") as raw:
+            raw["davis/left/events"] = np.zeros((2, 4))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("absent", "no file"),
+        ("text", "cannot be read as HDF5"),
+        ("columns", r"columns of events have \[2, 6\]"),
+        ("raw", r"no events/ts.*v2v-convert"),
+        ("no images or size", "size is unknown"),
+        ("no index", "without the attribute event_idx"),
+        ("colour", r"is \[3, 4, 3\], not \[H, W\]"),
+        ("twice back", "only single ones can be mended"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(tmp_path: Path, kind: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Recording(broken(tmp_path, kind))
+
+
+def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    first, second = stamped(1.05, 1.25)
+    write_h5(path, T, T, T, T, [(PIXELS, first), (PIXELS[:2], second)])
+    with Recording(path) as opened, pytest.raises(UsageError, match=r"\[2, 4\], not uint8 \[3, 4\]"):
+        opened.image(opened.images[1])

@@ -1,0 +1,113 @@
+"""Running a network over a recording: memory, padding, windows without pictures; and which network a file is of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.trainer.evaluation.h5_file import random_recording
+from trainer.checkpoint import Checkpoint, capture_rng, save_checkpoint
+from trainer.evaluation.network import load_network
+from trainer.evaluation.readers import Recording
+from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, reconstruct
+from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.models import E2VID, FireNet, ReconstructionNetwork
+from v2v_protocol.errors import UsageError
+
+
+def small_e2vid(**options: object) -> E2VID:
+    torch.manual_seed(0)
+    return E2VID(base_channels=4, encoders=2, residual_blocks=1, **options).eval()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("network", [small_e2vid(), FireNet(base_channels=4)], ids=["e2vid", "firenet"])
+def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: ReconstructionNetwork) -> None:
+    """More windows than one call takes, and a size that the network has to pad (37 x 43)."""
+    count = 2 * WINDOWS_PER_CALL + 3
+    path = random_recording(tmp_path / "a.h5", size=(37, 43), images=count + 1, events=4000)
+    with Recording(path) as recording:
+        windows = recording.windows()
+        steps = list(reconstruct(recording, windows, network, VoxelSettings()))
+        grids = [voxel_grid(recording.events(w), recording.size, VoxelSettings(), (w.begin, w.end)) for w in windows]
+        assert [step.events for step in steps] == [len(recording.events(window)) for window in windows]
+        for step in steps:
+            assert step.window.target is not None
+            np.testing.assert_array_equal(step.camera, recording.image(step.window.target))
+    with torch.no_grad():
+        whole = network.forward_sequence(torch.from_numpy(np.stack(grids))[None])[0, :, 0].clamp(0, 1).numpy()
+    assert whole.shape == (count, 37, 43)
+    np.testing.assert_allclose(np.stack([step.prediction for step in steps]), whole, rtol=0, atol=1e-6)
+
+
+def test_the_memory_is_new_for_every_sequence(tmp_path: Path) -> None:
+    network = small_e2vid()
+    first = random_recording(tmp_path / "a.h5", seed=1)
+    second = random_recording(tmp_path / "b.h5", seed=2)
+
+    def predictions(path: Path) -> np.ndarray:
+        with Recording(path) as recording:
+            return np.stack(
+                [s.prediction for s in reconstruct(recording, recording.windows(), network, VoxelSettings())]
+            )
+
+    alone = predictions(second)
+    predictions(first)
+    np.testing.assert_array_equal(predictions(second), alone)
+
+
+def test_windows_without_a_picture_show_the_latest(tmp_path: Path) -> None:
+    path = random_recording(tmp_path / "a.h5", images=4, period=0.1, events=500)
+    with Recording(path) as recording:
+        steps = list(reconstruct(recording, recording.regular_windows(20), FireNet(base_channels=2), VoxelSettings()))
+        for step in steps:
+            assert step.window.target is None
+            assert step.camera_time is not None
+            assert step.camera_time <= step.window.end < step.camera_time + 0.1 + 1e-9
+
+
+def test_what_the_network_cannot_take_or_gives_is_refused(tmp_path: Path) -> None:
+    path = random_recording(tmp_path / "a.h5")
+    network = FireNet(base_channels=2)
+    with Recording(path) as recording:
+        with pytest.raises(UsageError, match="voxels of 4 bins, and the network takes 5"):
+            next(reconstruct(recording, recording.windows(), network, VoxelSettings(bins=4)))
+        with torch.no_grad():
+            network.net.pred.conv2d.bias.fill_(float("nan"))  # type: ignore[union-attr]
+        with pytest.raises(UsageError, match="not finite in windows 0 to 4"):
+            next(reconstruct(recording, recording.windows(), network, VoxelSettings()))
+
+
+def test_networks_are_recognised(tmp_path: Path) -> None:
+    for network, name in ((small_e2vid(norm="batch"), "e2vid"), (FireNet(bins=3, base_channels=4), "firenet")):
+        torch.save(network.state_dict(), tmp_path / "weights.pth")
+        loaded, found = load_network(tmp_path / "weights.pth")
+        assert (found, loaded.bins, loaded.training) == (name, network.bins, False)
+        for key, tensor in network.state_dict().items():
+            assert torch.equal(loaded.state_dict()[key], tensor)
+
+
+def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
+    network = FireNet(base_channels=4, normalize_voxels=True)
+    config = {"network": {"name": "firenet", "options": {"base_channels": 4, "normalize_voxels": True}, "weights": ""}}
+    save_checkpoint(
+        tmp_path / "last.pt",
+        Checkpoint(0, 0, network.state_dict(), {}, None, None, capture_rng(), None, config),
+    )
+    loaded, name = load_network(tmp_path / "last.pt")
+    assert (name, loaded.normalizes) == ("firenet", True)
+    assert not load_network(tmp_path / "last.pt", options={"normalize_voxels": False})[0].normalizes
+
+
+def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
+    torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
+    with pytest.raises(UsageError, match="neither an E2VID nor a FireNet; --model"):
+        load_network(tmp_path / "a.pth")
+    with pytest.raises(UsageError, match="model 'unet': give one of"):
+        load_network(tmp_path / "a.pth", name="unet")
+    with pytest.raises(UsageError, match="do not fit FireNet"):
+        load_network(tmp_path / "a.pth", name="firenet")
+    with pytest.raises(UsageError, match=r"options of firenet: .*colour"):
+        load_network(tmp_path / "a.pth", name="firenet", options={"colour": 1})

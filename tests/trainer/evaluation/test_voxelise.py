@@ -1,0 +1,138 @@
+"""Voxel grids: a slow oracle in exact fractions, conservation, time reversal, the two kinds of span."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import floor
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from trainer.evaluation.voxelise import Events, VoxelSettings, voxel_grid
+from v2v_protocol.errors import UsageError
+
+SIZE = (3, 4)
+
+recorded = st.lists(
+    st.tuples(st.integers(0, 40_000), st.integers(0, 3), st.integers(0, 2), st.sampled_from((-1, 1))),
+    min_size=1,
+    max_size=60,
+).map(sorted)
+
+
+def events(rows: list[tuple[int, int, int, int]], start: float = 100.0) -> Events:
+    t, x, y, p = (np.array(column) for column in zip(*rows, strict=True))
+    return Events(start + t / 1e6, x, y, p.astype(np.float32))
+
+
+def grid(rows: list[tuple[int, int, int, int]], kind: str, bins: int = 5, **options: object) -> np.ndarray:
+    settings = VoxelSettings(kind=kind, bins=bins, **options)  # type: ignore[arg-type]
+    return voxel_grid(events(rows), SIZE, settings, (100.0, 100.04))
+
+
+def oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> np.ndarray:
+    """The module's formulas, event by event, in exact fractions."""
+    result = [[[Fraction(0)] * SIZE[1] for _ in range(SIZE[0])] for _ in range(bins)]
+    delta = Fraction(1, 1000 if kind == "discrete" else 10_000)
+    for t, x, y, p in rows:
+        u = Fraction(t - rows[0][0]) / (rows[-1][0] - rows[0][0] + delta)
+        for b in range(bins):
+            if kind == "discrete":
+                result[b][y][x] += p * (floor(bins * u) == b)
+            else:
+                result[b][y][x] += p * max(Fraction(0), 1 - abs((bins - 1) * u - b))
+    return np.array(result, np.float64)
+
+
+@given(recorded, st.sampled_from(("discrete", "interpolated")), st.integers(1, 7))
+def test_equals_the_oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> None:
+    np.testing.assert_allclose(grid(rows, kind, bins), oracle(rows, kind, bins), rtol=0, atol=1e-5)
+
+
+@given(recorded, st.sampled_from(("discrete", "interpolated")), st.sampled_from(("events", "window")))
+def test_every_event_counts_once(rows: list[tuple[int, int, int, int]], kind: str, span: str) -> None:
+    """Summed over the bins, a pixel holds the sum of its polarities: exactly, or to rounding where shares are split."""
+    result = grid(rows, kind, span=span).astype(np.float64)
+    expected = np.zeros(SIZE)
+    for _, x, y, p in rows:
+        expected[y, x] += p
+    tolerance = 0 if kind == "discrete" else 1e-5
+    np.testing.assert_allclose(result.sum(axis=0), expected, rtol=0, atol=tolerance)
+    if kind == "discrete":
+        assert (result == np.rint(result)).all()
+
+
+@given(recorded)
+def test_reversed_time_reverses_interpolated_bins(rows: list[tuple[int, int, int, int]]) -> None:
+    last = rows[-1][0]
+    # Events at one time are all in the first bin, whichever way time runs.
+    assume(rows[0][0] < last)
+    backwards = [(last - t, x, y, p) for t, x, y, p in reversed(rows)]
+    # Up to the 1e-4 us that published code adds to the span: 4e-4 of a bin for spans of a microsecond.
+    np.testing.assert_allclose(grid(backwards, "interpolated"), grid(rows, "interpolated")[::-1], rtol=0, atol=0.03)
+    long = [(t * 1000, x, y, p) for t, x, y, p in rows]
+    backwards = [(last * 1000 - t, x, y, p) for t, x, y, p in reversed(long)]
+    np.testing.assert_allclose(grid(backwards, "interpolated"), grid(long, "interpolated")[::-1], rtol=0, atol=3e-5)
+
+
+@given(st.lists(st.integers(0, 999), min_size=1, max_size=40), st.integers(1, 7))
+def test_reversed_time_reverses_discrete_bins(steps: list[int], bins: int) -> None:
+    """With the events inside the bins: at an edge an event belongs to the later bin, in either direction."""
+    # Odd multiples of 1 us in a span of bins * 2000 us are never on an edge; 0 and the end fix the span.
+    times = [0, *sorted(2 * bins * step + 1 for step in steps), 2000 * bins]
+    inside = [t for t in times if t % 2000 or t in (0, 2000 * bins)]
+    rows = [(t, index % 4, index % 3, 1 if index % 2 else -1) for index, t in enumerate(inside)]
+    backwards = [(2000 * bins - t, x, y, p) for t, x, y, p in reversed(rows)]
+    np.testing.assert_array_equal(grid(backwards, "discrete", bins), grid(rows, "discrete", bins)[::-1])
+
+
+def test_span_of_the_window_or_of_the_events() -> None:
+    """Three events in the last fifth of a window of 40 ms."""
+    rows = [(32_000, 0, 0, 1), (35_000, 1, 0, 1), (39_999, 2, 0, -1)]
+    assert np.argwhere(grid(rows, "discrete")).tolist() == [[0, 0, 0], [1, 0, 1], [4, 0, 2]]
+    assert np.argwhere(grid(rows, "discrete", span="window")).tolist() == [[4, 0, 0], [4, 0, 1], [4, 0, 2]]
+
+
+def test_the_end_of_the_window_belongs_to_its_last_bin() -> None:
+    assert np.argwhere(grid([(0, 0, 0, 1), (40_000, 1, 1, 1)], "discrete", span="window")).tolist() == [
+        [0, 0, 0],
+        [4, 1, 1],
+    ]
+
+
+@pytest.mark.parametrize(("truncate", "expected"), [(False, 1), (True, 0)])
+def test_truncation_moves_an_event_that_is_just_below_its_microsecond(truncate: bool, expected: int) -> None:
+    """3 of 14 us are in the second fifth, 2 in the first; 3 us after 0.25 s are just below 3 us in binary."""
+    t = 0.25 + np.array([0, 3, 14]) / 1e6
+    assert 2.9 < (t[1] - t[0]) * 1e6 < 3
+    numbers = np.arange(3)
+    found = Events(t, numbers, np.zeros(3, int), np.ones(3, np.float32))
+    result = voxel_grid(found, SIZE, VoxelSettings(truncate=truncate), (0, 0))
+    assert np.argwhere(result[:, 0, 1]).tolist() == [[expected]]
+
+
+@pytest.mark.parametrize("kind", ["discrete", "interpolated"])
+@pytest.mark.parametrize("span", ["events", "window"])
+def test_no_event_and_events_at_one_time(kind: str, span: str) -> None:
+    nothing = Events(np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
+    settings = VoxelSettings(kind=kind, span=span)  # type: ignore[arg-type]
+    assert not voxel_grid(nothing, SIZE, settings, (0, 1)).any()
+    together = grid([(0, 1, 1, 1), (0, 1, 1, 1), (0, 2, 1, -1)], kind, span=span)
+    assert (together[0, 1, 1], together[0, 1, 2]) == (2, -1)
+    assert not together[1:].any()
+
+
+@pytest.mark.parametrize(("x", "y"), [(4, 0), (-1, 0), (0, 3), (0, -1)])
+def test_events_outside_are_refused(x: int, y: int) -> None:
+    with pytest.raises(
+        UsageError, match=f"1 of 2 events lie outside the sensor of 4 x 3, the first at x = {x}, y = {y}"
+    ):
+        grid([(0, 0, 0, 1), (1, x, y, 1)], "discrete")
+
+
+@pytest.mark.parametrize("options", [{"kind": "square"}, {"span": "all"}, {"bins": 0}, {"bins": 2.5}])
+def test_settings_are_checked(options: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="give"):
+        VoxelSettings(**options)  # type: ignore[arg-type]

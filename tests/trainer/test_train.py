@@ -1,0 +1,237 @@
+"""The training loop, on a server that sends random samples over the real wire."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from torch import Tensor
+
+from tests.client.fake_server import FakeServer
+from tests.trainer.training import arguments, losses, trained
+from trainer.checkpoint import load_checkpoint, save_checkpoint
+from trainer.models import FireNet
+from trainer.reporting import METRICS
+from trainer.resume import LAST
+from trainer.train import main
+from trainer.weights import load_into
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[FakeServer]:
+    with FakeServer(sequences=23) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def whole(server: FakeServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run of 12 steps: two epochs of 5 and a part of the third."""
+    return trained(tmp_path_factory.mktemp("whole"), server.address, "run", run__steps=12)
+
+
+def same(left: object, right: object) -> bool:
+    """Equal to the last bit, tensors included."""
+    if isinstance(left, Tensor) and isinstance(right, Tensor):
+        return torch.equal(left, right)
+    if isinstance(left, dict) and isinstance(right, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, list | tuple) and isinstance(right, list | tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    return left == right
+
+
+def test_it_trains(whole: Path) -> None:
+    readings = losses(whole)
+    assert [record["step"] for record in readings] == list(range(1, 13))
+    assert [record["epoch"] for record in readings] == [0] * 5 + [1] * 5 + [2] * 2
+    # The rate halves at the end of an epoch; a reading says what the next step will use.
+    assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] * 5 + [0.0025] * 3
+    assert readings[-1]["total"] < 0.9 * readings[0]["total"]
+    last = load_checkpoint(whole / LAST)
+    assert (last.step, last.epoch) == (12, 2)
+    assert (last.stream["epoch"], last.stream["position"]) == (2, 8)
+    assert not same(last.model, last.ema)
+    network = FireNet(bins=2, base_channels=2)
+    load_into(network, whole / LAST)
+    load_into(network, whole / LAST, ema=True)
+
+
+@pytest.mark.parametrize("first", [3, 5, 7], ids=["within an epoch", "between two epochs", "in the second epoch"])
+def test_a_resumed_run_is_the_uninterrupted_one(
+    server: FakeServer, whole: Path, tmp_path: Path, first: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Equal losses, weights, averages, optimiser, scheduler and stream position, to the last bit."""
+    trained(tmp_path, server.address, "run", run__steps=first)
+    resumed = trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12)
+    assert "run.steps: " in capsys.readouterr().err
+    assert losses(resumed) == losses(whole)
+    mine, theirs = load_checkpoint(resumed / LAST), load_checkpoint(whole / LAST)
+    for part in ("step", "epoch", "model", "optimizer", "scheduler", "ema", "rng", "stream"):
+        assert same(getattr(mine, part), getattr(theirs, part)), part
+
+
+def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    """As after a crash: the last checkpoint is older than the last reading."""
+    run = trained(tmp_path, server.address, "run", run__steps=7, run__save_every=4)
+    early = trained(tmp_path, server.address, "early", run__steps=4)
+    shutil.copy(early / LAST, run / LAST)
+    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12)
+    assert losses(run) == losses(whole)
+
+
+def test_a_finished_run_has_nothing_left(server: FakeServer, tmp_path: Path) -> None:
+    run = trained(tmp_path, server.address, "run", run__epochs=1)
+    before = load_checkpoint(run / LAST)
+    assert (before.step, before.epoch) == (5, 1)
+    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__epochs=1)
+    assert same(load_checkpoint(run / LAST).model, before.model)
+    assert len(losses(run)) == 5
+
+
+def test_readings_are_means_over_the_steps_since_the_last(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=10, run__log_every=4)
+    single, coarse = losses(whole), losses(run)
+    assert [record["step"] for record in coarse] == [4, 8, 10]
+    for record, steps in zip(coarse, (single[:4], single[4:8], single[8:10]), strict=True):
+        assert record["total"] == pytest.approx(sum(step["total"] for step in steps) / len(steps), rel=1e-5)
+
+
+def test_checkpoints_of_epochs_and_previews(server: FakeServer, tmp_path: Path) -> None:
+    run = trained(
+        tmp_path, server.address, "run", run__epochs=2, run__keep_epochs=True, run__preview_every=6,
+        run__preview_samples=1,
+    )  # fmt: skip
+    assert load_checkpoint(run / "epoch-0000.pt").step == 5
+    assert load_checkpoint(run / "epoch-0001.pt").step == 10
+    pictures = sorted(path.name for path in (run / "previews").iterdir())
+    assert pictures == [f"step-00000{step}-0.{kind}" for step in ("06", "10") for kind in ("mp4", "png")]
+    sheet = cv2.imread(str(run / "previews" / "step-0000010-0.png"))
+    assert sheet.shape == (3 * (8 * 16 + 4), 3 * (8 * 20 + 4), 3)
+    video = cv2.VideoCapture(str(run / "previews" / "step-0000010-0.mp4"))
+    assert sum(1 for _ in iter(lambda: video.read()[0], False)) == 3
+
+
+def test_a_preview_does_not_change_the_training(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=4, run__preview_every=2)
+    assert losses(run) == losses(whole)[:4]
+
+
+def test_loader_workers_change_nothing(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=7, stream__loader_workers=1)
+    assert losses(run) == losses(whole)[:7]
+    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12, stream__loader_workers=1)
+    assert losses(run) == losses(whole)
+
+
+def test_temporal_consistency_takes_backward_flow_of_the_stream(server: FakeServer, tmp_path: Path) -> None:
+    run = trained(
+        tmp_path, server.address, "run", run__steps=2,
+        loss__temporal_weight=1.0, loss__temporal_first_step=1, loss__flow="stream",
+    )  # fmt: skip
+    hello = server.hellos[-1]
+    assert hello.arrays == ("voxels", "frames", "flow")
+    assert (hello.spec["flow_direction"], hello.spec["flow_from"]) == ("backward", 1)
+    for record in losses(run):
+        assert record["total"] == pytest.approx(record["l1"] + record["temporal"])
+        assert record["temporal"] > 0
+
+
+def test_bfloat16_channels_last_is_close(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    run = trained(
+        tmp_path, server.address, "run", run__steps=2, compute__precision="bfloat16", compute__channels_last=True
+    )
+    for mine, theirs in zip(losses(run), losses(whole)[:2], strict=True):
+        assert mine["total"] == pytest.approx(theirs["total"], rel=2e-2)
+        assert mine["total"] != theirs["total"]
+
+
+def refused(folder: Path, address: str, capsys: pytest.CaptureFixture[str], **settings: object) -> str:
+    assert main(arguments(folder, address, "run", **settings)) == 2  # type: ignore[arg-type]
+    return capsys.readouterr().err
+
+
+def test_a_folder_with_a_run_is_not_written_over(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained(tmp_path, server.address, "run", run__steps=1)
+    assert "holds a run: go on with --resume" in refused(tmp_path, server.address, capsys)
+
+
+def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trained(tmp_path, server.address, "run", run__steps=1)
+    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", optimizer__learning_rate=0.5)
+    assert "optimizer.learning_rate: 0.01 -> 0.5" in message
+    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", stream__seed=9)
+    assert "stream.seed: 0 -> 9" in message
+
+
+def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeServer(sequences=23) as server:
+        trained(tmp_path, server.address, "run", run__steps=1)
+        server.restart(catalogue="catalogue-2")
+        message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}")
+    assert "catalogue_digest" in message
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"loss__lpips_weight": 1.0}, "loss.lpips_backbone is missing.*download.pytorch.org/models/vgg16"),
+        (
+            {"loss__lpips_weight": 1.0, "loss__lpips_backbone": "no.pth", "loss__lpips_heads": "no.pth"},
+            "no file no.pth",
+        ),
+        (
+            {"loss__temporal_weight": 1.0, "loss__temporal_first_step": 1},
+            "loss.raft_weights is missing.*raft_small_C_T_V2",
+        ),
+        ({"network__options": {"chanels": 3}}, "network.options.chanels: firenet knows base_channels"),
+        ({"network__weights": "no.pt"}, "no file no.pt"),
+    ],
+)
+def test_what_is_missing_is_said_before_anything_is_asked_of_the_server(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, object], message: str
+) -> None:
+    before = len(server.hellos)
+    assert re.search(message, refused(tmp_path, server.address, capsys, **settings))
+    assert len(server.hellos) == before
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_videos_or_address_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--videos DIR, or --connect ADDRESS" in refused(tmp_path, "", capsys)
+
+
+def test_a_diverged_run_keeps_the_checkpoint_before(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=1)
+    good = load_checkpoint(run / LAST)
+    spoilt = {name: tensor * torch.nan for name, tensor in good.model.items()}
+    save_checkpoint(tmp_path / "spoilt.pt", dataclasses.replace(good, model=spoilt))
+    assert main(arguments(tmp_path, server.address, "run", resume="spoilt.pt", run__steps=3, run__save_every=1)) == 1
+    assert "step 2: loss nan" in capsys.readouterr().err
+    assert same(load_checkpoint(run / LAST).model, good.model)
+
+
+def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeServer(sequences=23) as server:
+        sent = []
+
+        def silent_from_the_third_batch(frames: list[object]) -> list[object]:
+            sent.append(frames)
+            if len(sent) == 12:
+                server.mute = True
+            return frames
+
+        server.alter = silent_from_the_third_batch
+        message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=0.5)
+    assert "nothing heard" in message
+    assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
+    assert (tmp_path / "run" / METRICS).is_file()

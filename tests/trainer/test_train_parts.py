@@ -1,0 +1,249 @@
+"""The parts around the training loop, each by itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trainer.distributed import Ranks, ranks
+from trainer.ema import AveragedNetwork, decay_at
+from trainer.interruption import StopRequest
+from trainer.models import FireNet
+from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
+from trainer.reporting import Meter, read_metrics
+from v2v_protocol.errors import ServerLost, UsageError
+
+ALONE = Ranks(0, 1, torch.device("cpu"))
+
+
+# --- the averaged network ---------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(-10, 10, width=32), min_size=1, max_size=30), st.floats(0, 0.999))
+def test_the_average_is_the_recurrence_of_its_docstring(values: list[float], decay: float) -> None:
+    network = FireNet(bins=1, base_channels=1)
+    bias = network.net.pred.conv2d.bias
+    assert bias is not None
+    expected = float(bias.detach())
+    average = AveragedNetwork(network, decay)
+    for update, value in enumerate(values, start=1):
+        with torch.no_grad():
+            bias.fill_(value)
+        average.update(network, update)
+        expected += (1 - min(decay, (1 + update) / (10 + update))) * (value - expected)
+    assert float(average.state_dict()["net.pred.conv2d.bias"]) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_the_average_of_a_constant_is_the_constant_and_shares_no_memory() -> None:
+    network = FireNet(bins=1, base_channels=2)
+    average = AveragedNetwork(network, 0.9)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    average.update(network, 1)
+    for name, tensor in average.state_dict().items():
+        assert torch.equal(tensor, before[name])
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(1)
+    for name, tensor in average.state_dict().items():
+        assert torch.equal(tensor, before[name])
+    assert not any(parameter.requires_grad for parameter in average.network.parameters())
+
+
+def test_the_ramp_reaches_the_decay_and_stays() -> None:
+    shares = [decay_at(update, 0.99) for update in range(1, 2000)]
+    assert shares == sorted(shares)
+    assert shares[0] == 2 / 11
+    assert shares[-1] == 0.99
+
+
+@pytest.mark.parametrize("decay", [-0.1, 1.0])
+def test_a_decay_outside_its_range_is_refused(decay: float) -> None:
+    with pytest.raises(UsageError, match="ema_decay"):
+        AveragedNetwork(FireNet(), decay)
+
+
+# --- a clean end ------------------------------------------------------------------------------------------------------
+
+
+def signalling(at: int, *, number: int = signal.SIGINT, then_wait: bool) -> Iterator[int]:
+    """0, 1, 2 ...; before item ``at`` a signal comes, and then, if asked, nothing ever."""
+    for item in range(100):
+        if item == at:
+            os.kill(os.getpid(), number)
+            while then_wait:
+                signal.pause()
+        yield item
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_wait_for_data(number: int) -> None:
+    with StopRequest() as stop:
+        taken = list(stop.until(signalling(3, number=number, then_wait=True)))
+    assert taken == [0, 1, 2]
+    assert stop.signal == number
+
+
+def test_a_signal_within_a_step_lets_it_finish() -> None:
+    finished = []
+    with StopRequest() as stop:
+        for item in stop.until(range(10)):
+            if item == 4:
+                os.kill(os.getpid(), signal.SIGINT)
+            finished.append(item)
+    assert finished == [0, 1, 2, 3, 4]
+
+
+def test_without_a_signal_everything_comes_and_the_handlers_are_put_back() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with StopRequest() as stop:
+        assert list(stop.until(range(5))) == [0, 1, 2, 3, 4]
+        assert not stop.wanted
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_the_third_signal_is_not_held_back() -> None:
+    def steps() -> None:
+        with StopRequest() as stop:
+            for _ in stop.until(range(10)):
+                for _ in range(3):
+                    os.kill(os.getpid(), signal.SIGINT)
+
+    # Its default action would end this process, so Python's own stands in for it.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(signal, "SIG_DFL", signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            steps()
+
+
+def test_any_rank_ends_all_of_them_before_the_next_step() -> None:
+    votes = iter([False, False, True])
+    with StopRequest(agree=lambda mine: next(votes) or mine) as stop:
+        assert list(stop.until(range(10))) == [0, 1]
+    assert not stop.wanted
+
+
+def test_every_round_is_voted_on_also_the_last() -> None:
+    """Ranks that end and ranks that stop meet in the same vote, or one would wait for ever."""
+    votes: list[bool] = []
+
+    def agree(mine: bool) -> bool:
+        votes.append(mine)
+        return mine
+
+    with StopRequest(agree=agree) as stop:
+        list(stop.until(range(3)))
+    assert votes == [False] * 4
+    votes.clear()
+    with StopRequest(agree=agree) as stop:
+        list(stop.until(signalling(1, then_wait=True)))
+    assert votes == [False, True]
+
+
+def test_a_time_limit_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    taken = []
+    with StopRequest(seconds=5) as stop:
+        for item in stop.until(range(100)):
+            taken.append(item)
+            now[0] += 2
+    assert taken == [0, 1, 2]
+    assert stop.signal == 0
+
+
+def test_a_lost_server_is_kept_for_later() -> None:
+    def items() -> Iterator[int]:
+        yield 0
+        raise ServerLost("gone")
+
+    with StopRequest() as stop:
+        assert list(stop.until(items())) == [0]
+    assert isinstance(stop.failure, ServerLost)
+
+
+# --- readings ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_meter_gives_means_and_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [10.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    meter = Meter(ALONE)
+    assert meter.read(0.0) == {}
+    for value in (1.0, 2.0, 6.0):
+        meter.add({"total": torch.tensor(value), "l1": torch.tensor(-value)})
+    now[0] = 16.0
+    reading = meter.read(1.5)
+    assert reading == {
+        "total": 3.0, "l1": -3.0, "steps_per_second": 0.5, "data_wait_seconds": 0.5, "compute_seconds": 1.5,
+    }  # fmt: skip
+    meter.add({"total": torch.tensor(4.0)})
+    now[0] = 17.0
+    assert meter.read(2.5) == {
+        "total": 4.0, "steps_per_second": 1.0, "data_wait_seconds": 1.0, "compute_seconds": 0.0,
+    }  # fmt: skip
+
+
+def test_metrics_are_lines_of_json(tmp_path: Path) -> None:
+    path = tmp_path / "m.jsonl"
+    path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps({"step": 2}) + "\n")
+    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
+
+
+def test_one_process_is_a_rank_by_itself() -> None:
+    with ranks("cpu") as mine:
+        assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
+        assert mine.any(True)
+        assert not mine.any(False)
+        assert mine.from_first("address") == "address"
+        assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_said() -> None:
+    with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda"):
+        pass
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def test_events_are_red_blue_and_white() -> None:
+    voxels = np.zeros((1, 2, 2, 3), np.int8)
+    voxels[0, :, 0, 0] = 3
+    voxels[0, :, 1, 2] = -3
+    drawn = draw_events(voxels)
+    assert drawn.shape == (1, 2, 3, 3)
+    assert tuple(drawn[0, 0, 0]) == ON
+    assert tuple(drawn[0, 1, 2]) == OFF
+    assert (drawn[0, 0, 1:] == 255).all()
+    assert (draw_events(np.zeros((1, 2, 2, 3), np.int8)) == 255).all()
+
+
+def test_pictures_are_clipped() -> None:
+    drawn = draw_pictures(np.array([-1.0, 0.0, 0.5, 1.0, 2.0]).reshape(1, 1, 1, 5))
+    assert drawn[0, 0, :, 0].tolist() == [0, 0, 128, 255, 255]
+
+
+def test_a_film_is_large_enough_to_see() -> None:
+    steps, height, width = 7, 20, 30
+    pictures = np.zeros((steps, 1, height, width), np.float32)
+    film = side_by_side(np.zeros((steps, 5, height, width), np.int8), pictures, pictures)
+    factor = 7  # 7 x 20 px is the first multiple that is not below 128 px
+    assert film.shape == (steps, factor * height + GAP_PX, 3 * (factor * width + GAP_PX), 3)
+    assert contact_sheet(film, steps=3).shape == (3 * film.shape[1], film.shape[2], 3)
+    assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
+
+
+def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file"):
+        write_png(tmp_path / "file" / "a.png", np.zeros((2, 2, 3), np.uint8))

@@ -1,0 +1,86 @@
+"""Configuration files: YAML in which ``extends`` names another file to start from, changed by ``--set KEY=VALUE``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from trainer.config import TrainConfig
+from v2v_protocol.errors import UsageError
+
+EXTENDS = "extends"
+
+
+def shipped() -> list[str]:
+    """Names of the configurations that come with the package."""
+    folder = resources.files("trainer") / "configs"
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
+    """The configuration in a file.
+
+    Args:
+        file: YAML, or the name of a shipped configuration. ``extends: other.yaml`` (beside the file, or the name of a
+            shipped one) starts from that one, so that the file holds only what differs.
+        settings: "key=value" texts, the keys with their section, the values in YAML; they win.
+
+    Raises:
+        UsageError: a file cannot be read, a setting is none, or see :class:`trainer.config.TrainConfig`.
+    """
+    values = _read(file)
+    for setting in settings:
+        _set(values, setting)
+    return TrainConfig.from_dict(values)
+
+
+def _read(file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    path = Path(file)
+    if not path.is_file() and file in shipped():
+        path = Path(str(resources.files("trainer") / "configs" / f"{file}.yaml"))
+    if str(path.resolve()) in seen:
+        raise UsageError(f"{file}: extends itself")
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{file}: {error.strerror}; shipped configurations: {', '.join(shipped())}") from error
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that does not exist
+        raise UsageError(f"{file}: not YAML: {' '.join(str(error).split())[:200]}") from error
+    values = {} if values is None else values
+    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        raise UsageError(f"{file}: expected sections of keys and values, found {type(values).__name__}")
+    base = values.pop(EXTENDS, None)
+    if base is None:
+        return values
+    beside = path.parent / str(base)
+    return _merged(_read(str(beside) if beside.is_file() else str(base), (*seen, str(path.resolve()))), values)
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        old = merged.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        merged[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+def _set(values: dict[str, Any], setting: str) -> None:
+    name, equals, text = setting.partition("=")
+    *groups, key = name.strip().split(".")
+    if not equals or not groups or not all((*groups, key)):
+        raise UsageError(f"--set {setting}: write SECTION.KEY=VALUE, for instance --set optimizer.learning_rate=1e-4")
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise UsageError(f"--set {setting}: {text!r} is not a value in YAML") from error
+    place = values
+    for group in groups:
+        place = place.setdefault(group, {})
+        if not isinstance(place, dict):
+            raise UsageError(f"--set {setting}: {group} is {place!r} in the file, not a group of keys")
+    place[key] = "" if value is None else value

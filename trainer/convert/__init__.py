@@ -1,0 +1,6 @@
+"""Raw recordings of event cameras -> the h5 layout that evaluation reads (``trainer.evaluation.layout``)."""
+
+from trainer.convert.conversion import Converted, convert
+from trainer.convert.items import EventChunk, Item, Picture, SensorSize
+
+__all__ = ["Converted", "EventChunk", "Item", "Picture", "SensorSize", "convert"]

@@ -1,0 +1,195 @@
+"""ROS 1 bags: ``dvs_msgs/EventArray`` (HQF, IJRR, MVSEC) or ``event_camera_msgs/EventPacket``; ``sensor_msgs/Image``.
+
+Messages are parsed here, from their serialised bytes: an EventArray is an array of 13-byte records, which numpy reads
+at once.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from trainer.convert.faery_reader import read_prophesee
+from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize
+from v2v_protocol.errors import UsageError
+
+EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"
+IMAGE = "sensor_msgs/msg/Image"
+RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("secs", "<u4"), ("nsecs", "<u4"), ("polarity", "u1")])
+EVT_HEADERS = {"evt2": "% evt 2.0", "evt21": "% evt 2.1", "evt3": "% evt 3.0"}
+COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
+
+
+def recognises(path: Path) -> bool:
+    """By the first bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(9) == b"#ROSBAG V"
+
+
+def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """Events and pictures of a bag.
+
+    Times of EventPackets count from the stamp of the first packet, with the sensor's clock between the events.
+
+    Raises:
+        UsageError: damaged, no or several topics of events, or an encoding that is not read here.
+    """
+    try:
+        from rosbags.rosbag1 import Reader, ReaderError
+    except ImportError as error:
+        raise UsageError("bags need the rosbags package: pip install 'v2v-stream[convert]'") from error
+    try:
+        with Reader(path) as bag:
+            connections = list(bag.connections)
+            events = _events_topic(connections, options.events_topic, path)
+            images = _images_topic(connections, events, options.images_topic, path)
+            if any(connection.topic == events and connection.msgtype == EVENT_PACKETS for connection in connections):
+                yield from _read_packets(bag, events, images, path, progress)
+            else:
+                yield from _read_arrays(bag, events, images, path, progress)
+    except (ReaderError, struct.error, OSError) as error:
+        raise UsageError(f"{path}: the bag cannot be read: {error}") from error
+
+
+def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
+    size = None
+    for number, connection, raw in _messages(bag, (events, images), progress):
+        del number
+        if connection.topic == images:
+            yield _picture(raw, path)
+            continue
+        message = _Message(raw)
+        message.skip_header()
+        height, width, count = message.unpack("<III")
+        # Some drivers leave these 0.
+        if size is None and height and width:
+            size = SensorSize(width, height)
+            yield size
+        records = message.array(RECORD, count)
+        t_ns = records["secs"].astype(np.int64) * 1_000_000_000 + records["nsecs"]
+        yield EventChunk(t_ns, records["x"], records["y"], records["polarity"] > 0)
+
+
+def _read_packets(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
+    """The packets of a sensor are one stream of words, decoded as one: strung together in a temporary file."""
+    first_stamp_ns: int | None = None
+    encoding = ""
+    with tempfile.TemporaryDirectory() as folder:
+        raw_file = Path(folder) / "packets.raw"
+        with raw_file.open("wb") as stream:
+            for _, _, raw in _messages(bag, (events,), progress):
+                message = _Message(raw)
+                stamp_ns = message.skip_header()
+                height, width, _, _ = message.unpack("<IIQQ")
+                this_encoding = message.text()
+                _, count = message.unpack("<BI")
+                if first_stamp_ns is None:
+                    first_stamp_ns, encoding = stamp_ns, this_encoding
+                    if encoding not in EVT_HEADERS:
+                        raise UsageError(
+                            f"{path}: packets on {events} are in encoding {encoding!r}; those read are "
+                            f"{', '.join(EVT_HEADERS)}"
+                        )
+                    stream.write(f"{EVT_HEADERS[encoding]}\n% geometry {width}x{height}\n% end\n".encode())
+                elif this_encoding != encoding:
+                    raise UsageError(f"{path}: packets on {events} change from {encoding} to {this_encoding}")
+                stream.write(message.array(np.dtype("u1"), count).tobytes())
+        offset_ns: int | None = None
+        for item in read_prophesee(raw_file, Options(), lambda _done, _total: None):
+            if isinstance(item, EventChunk) and len(item):
+                if offset_ns is None:
+                    offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])
+                yield EventChunk(item.t_ns + offset_ns, item.x, item.y, item.p)
+            elif isinstance(item, SensorSize):
+                yield item
+    if images is not None:
+        for _, _, raw in _messages(bag, (images,), progress):
+            yield _picture(raw, path)
+
+
+def _messages(bag: Any, topics: tuple[str | None, ...], progress: Progress) -> Iterator[tuple[int, Any, bytes]]:
+    wanted = [connection for connection in bag.connections if connection.topic in topics]
+    total = sum(connection.msgcount for connection in wanted)
+    for number, (connection, _, raw) in enumerate(bag.messages(connections=wanted)):
+        yield number, connection, bytes(raw)
+        progress(number + 1, total)
+
+
+class _Message:
+    """Reads a ROS 1 message from its start: little endian, nothing aligned, lengths in front."""
+
+    def __init__(self, raw: bytes) -> None:
+        self._raw, self._at = raw, 0
+
+    def unpack(self, form: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(form, self._raw, self._at)
+        self._at += struct.calcsize(form)
+        return values
+
+    def text(self) -> str:
+        (length,) = self.unpack("<I")
+        return self.array(np.dtype("u1"), length).tobytes().decode("utf-8", "replace")
+
+    def skip_header(self) -> int:
+        """std_msgs/Header; returns its stamp in ns."""
+        _, seconds, nanoseconds = self.unpack("<III")
+        self.text()
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+    def array(self, dtype: np.dtype[Any], count: int) -> npt.NDArray[Any]:
+        end = self._at + count * dtype.itemsize
+        if end > len(self._raw):
+            raise struct.error(f"a message ends {end - len(self._raw)} bytes early")
+        values = np.frombuffer(self._raw, dtype, count, self._at)
+        self._at = end
+        return values
+
+
+def _picture(raw: bytes, path: Path) -> Picture:
+    message = _Message(raw)
+    t_ns = message.skip_header()
+    height, width = message.unpack("<II")
+    encoding = message.text()
+    _, step, count = message.unpack("<BII")
+    channels = 3 if encoding in COLOURS else 1
+    if encoding not in ("mono8", "8UC1", *COLOURS) or step < width * channels or count < height * step:
+        raise UsageError(f"{path}: a picture is {encoding!r}, {width} x {height}; mono8, 8UC1, bgr8, rgb8 are read")
+    rows = message.array(np.dtype("u1"), height * step).reshape(height, step)[:, : width * channels]
+    if encoding in COLOURS:
+        rows = cv2.cvtColor(np.ascontiguousarray(rows).reshape(height, width, 3), COLOURS[encoding])
+    return Picture(t_ns, np.array(rows, np.uint8))
+
+
+def _events_topic(connections: list[Any], wanted: str | None, path: Path) -> str:
+    topics = {connection.topic for connection in connections if connection.msgtype in (*EVENT_ARRAYS, EVENT_PACKETS)}
+    if wanted is not None:
+        topics &= {wanted}
+    if len(topics) != 1:
+        present = ", ".join(sorted(f"{connection.topic} ({connection.msgtype})" for connection in connections))
+        raise UsageError(f"{path}: {len(topics)} topics of events; choose one with --events-topic. It has {present}")
+    return str(topics.pop())
+
+
+def _images_topic(connections: list[Any], events: str, wanted: str | None, path: Path) -> str | None:
+    """The one asked for; else ``image_raw`` beside the events; else the only one."""
+    topics = {connection.topic for connection in connections if connection.msgtype == IMAGE}
+    if wanted is not None:
+        if wanted not in topics:
+            raise UsageError(f"{path}: no pictures on {wanted}; they are on {', '.join(sorted(topics)) or 'no topic'}")
+        return wanted
+    beside = f"{events.rpartition('/')[0]}/image_raw"
+    if beside in topics:
+        return beside
+    if len(topics) > 1:
+        raise UsageError(f"{path}: pictures on {', '.join(sorted(topics))}; choose one with --images-topic")
+    return str(topics.pop()) if topics else None

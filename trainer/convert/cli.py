@@ -1,0 +1,139 @@
+"""The command line of `v2v-convert`.
+
+Exit status: 0 everything was converted, 2 wrong usage or input (what was converted before stays), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from trainer.convert import items
+from trainer.convert.conversion import FORMS, Converted, convert, default_name
+from trainer.convert.text_events import NS_PER_UNIT
+from trainer.evaluation import layout
+from v2v_protocol.errors import UsageError, V2VError
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-convert`."""
+    parser = argparse.ArgumentParser(
+        prog="v2v-convert",
+        description="Convert recordings of event cameras into the h5 layout that v2v-eval reads.",
+        epilog="Forms: " + "; ".join(f"{name} = {form.title}" for name, form in FORMS.items()),
+    )
+    parser.add_argument("sources", nargs="+", metavar="SRC", help="recording: a file or a folder; never written to")
+    parser.add_argument(
+        "--out", required=True, metavar="PATH", help="folder for the new files, or (one SRC) a file ending in .h5"
+    )
+    parser.add_argument("--form", choices=tuple(FORMS), help="what the recordings are (default: look)")
+    parser.add_argument("--size", metavar="WxH", help="size of the sensor, where a recording does not state it")
+    parser.add_argument(
+        "--time-unit", choices=tuple(NS_PER_UNIT),
+        help="of times in text files (default: seconds if there is a point in them, else us)",
+    )  # fmt: skip
+    parser.add_argument("--camera", choices=("left", "right"), default="left", help="of a stereo recording (MVSEC)")
+    parser.add_argument("--events-topic", metavar="TOPIC", help="of a bag with several")
+    parser.add_argument("--images-topic", metavar="TOPIC", help="of a bag with several")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    parser.add_argument("--json", metavar="FILE", help="also write a record of each recording")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+    try:
+        _run(arguments)
+    except KeyboardInterrupt:
+        print("v2v-convert: interrupted; no incomplete file is left", file=sys.stderr)
+        sys.exit(130)
+    except V2VError as error:
+        if arguments.debug:
+            raise
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    options = items.Options(
+        size=None if arguments.size is None else items.SensorSize.parse(arguments.size),
+        time_unit=arguments.time_unit,
+        camera=arguments.camera,
+        events_topic=arguments.events_topic,
+        images_topic=arguments.images_topic,
+    )
+    out = Path(arguments.out)
+    to_file = out.suffix in layout.SUFFIXES
+    if to_file and len(arguments.sources) > 1:
+        raise UsageError(f"--out {out} is one file, and there are {len(arguments.sources)} recordings: give a folder")
+    records = []
+    for source in map(Path, arguments.sources):
+        destination = out if to_file else out / default_name(source)
+        with _progress(source.name) as progress:
+            done = convert(
+                source,
+                destination,
+                form=arguments.form,
+                options=options,
+                overwrite=arguments.overwrite,
+                progress=progress,
+            )
+        print(summary(done))
+        records.append(_record(done))
+    if arguments.json is not None:
+        try:
+            Path(arguments.json).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"--json {arguments.json}: cannot be written: {error.strerror or error}") from error
+
+
+def summary(done: Converted) -> str:
+    """What became of one recording, in a line or two."""
+    written = done.written
+    text = (
+        f"{done.destination}: {written.events} events in {written.seconds:.3f} s, {written.images} images, "
+        f"{written.size.width} x {written.size.height} ({done.form})"
+    )
+    if written.reordered_events:
+        text += f"\n  {written.reordered_events} times an event was earlier than the one before it; sorted"
+    if written.backward_images:
+        text += f"\n  {written.backward_images} images are not later than the one before; v2v-eval repairs their times"
+    if not written.images:
+        text += "\n  no images: v2v-eval can reconstruct it (--fps), but not score it"
+    return text
+
+
+def _record(done: Converted) -> dict[str, str | int | float]:
+    written = done.written
+    return {
+        "source": str(done.source),
+        "destination": str(done.destination),
+        "form": done.form,
+        "events": written.events,
+        "images": written.images,
+        "duration_seconds": written.seconds,
+        "reordered_events": written.reordered_events,
+        "backward_images": written.backward_images,
+        "width_px": written.size.width,
+        "height_px": written.size.height,
+    }
+
+
+@contextlib.contextmanager
+def _progress(name: str) -> Iterator[items.Progress]:
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(file=sys.stderr)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

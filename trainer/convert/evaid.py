@@ -1,0 +1,80 @@
+"""EVAID-R: ``event/*.txt`` (``t x y p``, us), ``gt/*.png``, ``timestamps.txt`` (us), ``shape.txt`` (``W H``)."""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Iterator
+from pathlib import Path
+
+from trainer.convert.archive import Archive
+from trainer.convert.items import Item, Options, Picture, Progress, SensorSize
+from trainer.convert.text_events import NS_PER_UNIT, read_text_events
+from v2v_protocol.errors import UsageError
+
+TIMES = "timestamps.txt"
+SHAPE = "shape.txt"
+PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def recognises(path: Path) -> bool:
+    """An archive with ``timestamps.txt`` and a folder ``event``."""
+    if not (path.is_dir() or path.suffix == ".zip"):
+        return False
+    with Archive(path) as archive:
+        return archive.find(TIMES) is not None and bool(_members(archive, "event", (".txt",)))
+
+
+def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """The items of one recording; the event files follow each other in the order of their names.
+
+    Raises:
+        UsageError: a part is missing or not what it should be.
+    """
+    with Archive(path) as archive:
+        events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
+        times_us = _integers(archive, TIMES)
+        if len(times_us) != len(pictures):
+            raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {TIMES}")
+        if archive.find(SHAPE) is not None:
+            shape = _integers(archive, SHAPE)
+            if len(shape) != 2:
+                raise UsageError(f"{path}: {SHAPE} holds {shape}, not `width height`")
+            yield SensorSize(*shape)
+        total = sum(archive.bytes_of[member] for member in events + pictures)
+        done = 0
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            progress(done, total)
+
+        for member in events:
+            with archive.open(member) as stream:
+                yield from read_text_events(
+                    stream, f"{path}: {member}", time_unit=options.time_unit or "us", advance=advance
+                )
+        for time_us, member in zip(times_us, pictures, strict=True):
+            yield Picture(round(time_us * NS_PER_UNIT["us"]), archive.picture(member))
+            advance(archive.bytes_of[member])
+
+
+def _members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[str]:
+    """Files of the folder of this name, in order: 2.txt before 10.txt."""
+    found = [
+        member
+        for member in archive.bytes_of
+        if posixpath.basename(posixpath.dirname(member)) == folder and member.lower().endswith(suffixes)
+    ]
+    return sorted(found, key=lambda member: (len(member), member))
+
+
+def _integers(archive: Archive, name: str) -> list[int]:
+    member = archive.find(name)
+    if member is None:
+        raise UsageError(f"{archive.path} has no {name}")
+    with archive.open(member) as stream:
+        words = stream.read().decode("utf-8", "replace").split()
+    try:
+        return [round(float(word)) for word in words]
+    except ValueError as error:
+        raise UsageError(f"{archive.path}: {member} holds something else than numbers: {error}") from None

@@ -1,0 +1,121 @@
+"""Files that the faery package decodes: aedat4 of DAVIS cameras; Prophesee's EVT 2, 2.1 and 3 (.raw) and DAT."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize
+from v2v_protocol.errors import UsageError
+
+AEDAT4_MAGIC = b"#!AER-DAT4"
+GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
+
+
+def recognises_aedat4(path: Path) -> bool:
+    """By the first bytes."""
+    return _head(path).startswith(AEDAT4_MAGIC)
+
+
+def recognises_prophesee(path: Path) -> bool:
+    """A ``.raw`` or ``.dat`` whose header lines begin with %."""
+    return path.suffix in (".raw", ".dat") and _head(path).startswith(b"%")
+
+
+def read_aedat4(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """Events and frames of the first camera of a file; a frame's time is the middle of its exposure.
+
+    Raises:
+        UsageError: damaged, without events, or frames that are not 8 bits or not of the whole sensor.
+    """
+    with _errors_of_faery(path), _faery().aedat.Decoder(path) as decoder:
+        tracks = decoder.tracks()
+        events = next((track for track in tracks if track.data_type == "events"), None)
+        frames = next((track for track in tracks if track.data_type == "frame"), None)
+        if events is None:
+            raise UsageError(f"{path} has no stream of events")
+        chosen = {track.id for track in (events, frames) if track is not None}
+        size = SensorSize(*events.dimensions)
+        yield size
+        parts = decoder.file_data_definitions()
+        total, done = sum(part.size for part in parts) or None, 0
+        for packet_number, (track, packet) in enumerate(decoder):
+            if packet_number < len(parts):
+                done += parts[packet_number].size
+            if track.id in chosen:
+                yield _events(packet) if track.data_type == "events" else _frame(packet, size, path)
+            progress(done, total)
+
+
+def read_prophesee(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """Events of a file; the sensor's size is in its header or in ``options``.
+
+    Raises:
+        UsageError: damaged, or of no stated size.
+    """
+    faery = _faery()
+    fallback = None if options.size is None else (options.size.width, options.size.height)
+    module = faery.dat if path.suffix == ".dat" else faery.evt
+    with _errors_of_faery(path), module.Decoder(path, fallback, None) as decoder:
+        if decoder.dimensions is None:
+            raise UsageError(f"{path}: its header states no size of the sensor; give --size")
+        yield SensorSize(*decoder.dimensions)
+        for packet in decoder:
+            progress(0, None)
+            if isinstance(packet, dict):
+                if "events" in packet:
+                    yield _events(packet["events"])
+            else:
+                yield _events(packet)
+
+
+def _events(packet: npt.NDArray[Any]) -> EventChunk:
+    polarity = "payload" if "payload" in (packet.dtype.names or ()) else "p"
+    if polarity == "p" and "p" not in (packet.dtype.names or ()):
+        polarity = "on"
+    return EventChunk(packet["t"].astype(np.int64) * 1000, packet["x"], packet["y"], packet[polarity] > 0)
+
+
+def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
+    pixels = frame.pixels
+    if frame.format in GREY:
+        pixels = cv2.cvtColor(pixels, GREY[frame.format])
+    if pixels.dtype != np.uint8 or pixels.shape != (size.height, size.width):
+        raise UsageError(
+            f"{path}: a frame is {frame.format} {list(pixels.shape)} at ({frame.offset_x}, {frame.offset_y}); only "
+            f"8-bit frames of the whole sensor, {size.width} x {size.height}, can be converted"
+        )
+    return Picture(int(frame.t) * 1000, pixels)
+
+
+def _head(path: Path) -> bytes:
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(len(AEDAT4_MAGIC))
+
+
+def _faery() -> ModuleType:
+    try:
+        import faery
+    except ImportError as error:
+        raise UsageError("this form needs the faery package: pip install 'v2v-stream[convert]'") from error
+    module: ModuleType = faery
+    return module
+
+
+@contextlib.contextmanager
+def _errors_of_faery(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, OSError, ValueError, IndexError) as error:
+        text = str(error)
+        hint = "; give --size WIDTHxHEIGHT" if "size" in text else ""
+        raise UsageError(f"{path} cannot be decoded: {text}{hint}") from error

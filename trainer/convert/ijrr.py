@@ -1,0 +1,96 @@
+"""IJRR (Mueggler et al. 2017), the text form: ``events.txt``, ``images.txt`` (``t path``), PNGs; in a zip or a folder.
+
+A single text file of events is read as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from trainer.convert.archive import Archive
+from trainer.convert.items import Item, Options, Picture, Progress, seconds_to_ns
+from trainer.convert.text_events import read_text_events
+from v2v_protocol.errors import UsageError
+
+EVENTS = "events.txt"
+IMAGES = "images.txt"
+
+
+def recognises(path: Path) -> bool:
+    """A text file, or an archive with ``events.txt``."""
+    if path.is_file() and path.suffix == ".txt":
+        return True
+    if not (path.is_dir() or path.suffix == ".zip"):
+        return False
+    with Archive(path) as archive:
+        return archive.find(EVENTS) is not None
+
+
+def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """The items of one recording.
+
+    Raises:
+        UsageError: a part is missing or not what it should be.
+    """
+    if path.is_file() and path.suffix == ".txt":
+        total, done = path.stat().st_size, 0
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            progress(done, total)
+
+        with path.open("rb") as stream:
+            yield from read_text_events(stream, str(path), time_unit=options.time_unit, advance=advance)
+        return
+    with Archive(path) as archive:
+        yield from _read_archive(archive, options, progress)
+
+
+def _read_archive(archive: Archive, options: Options, progress: Progress) -> Iterator[Item]:
+    events = archive.find(EVENTS)
+    if events is None:
+        raise UsageError(f"{archive.path} has no {EVENTS}")
+    pictures = _listed_pictures(archive)
+    total = archive.bytes_of[events] + sum(archive.bytes_of[member] for _, member in pictures)
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, total)
+
+    with archive.open(events) as stream:
+        yield from read_text_events(stream, f"{archive.path}: {events}", time_unit=options.time_unit, advance=advance)
+    for t_ns, member in pictures:
+        yield Picture(t_ns, archive.picture(member))
+        advance(archive.bytes_of[member])
+
+
+def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
+    """Time and member of every line of ``images.txt``; none without such a file."""
+    listing = archive.find(IMAGES)
+    if listing is None:
+        return []
+    with archive.open(listing) as stream:
+        lines = stream.read().decode("utf-8", "replace").splitlines()
+    folder = listing.removesuffix(IMAGES)
+    pictures = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        parts = line.split(maxsplit=1)
+        try:
+            seconds = float(parts[0])
+        except ValueError:
+            seconds = np.nan
+        if len(parts) != 2 or not np.isfinite(seconds):
+            raise UsageError(f"{archive.path}: {listing}, line {number}: {line!r} is not `seconds path`")
+        member = folder + parts[1].strip()
+        if member not in archive.bytes_of:
+            raise UsageError(f"{archive.path}: {listing}, line {number} names {parts[1].strip()}, which is not there")
+        pictures.append((int(seconds_to_ns(np.float64(seconds))), member))  # type: ignore[arg-type]
+    return pictures

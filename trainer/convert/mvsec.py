@@ -1,0 +1,75 @@
+"""MVSEC (Zhu et al. 2018): ``*_data.hdf5``, one of its two DAVIS cameras.
+
+| path | content |
+|---|---|
+| ``davis/left/events`` | float64 [N, 4]: x, y, t in s, p in {-1, 1} |
+| ``davis/left/image_raw`` | uint8 [M, H, W] |
+| ``davis/left/image_raw_ts`` | float64 [M], s |
+| ``davis/left/image_raw_event_inds`` | int64 [M], the event nearest to each picture |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize, seconds_to_ns
+from v2v_protocol.errors import UsageError
+
+READ_EVENTS = 1 << 18
+
+
+def recognises(path: Path) -> bool:
+    """An HDF5 file with a group ``davis``."""
+    if path.suffix not in (".hdf5", ".h5") or not h5py.is_hdf5(path):
+        return False
+    with h5py.File(path, "r") as file:
+        return "davis" in file
+
+
+def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+    """The items of one camera of a recording.
+
+    Raises:
+        UsageError: a part is missing, damaged or of another shape.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            yield from _read(file, path, options.camera, progress)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read as HDF5: {error}") from error
+
+
+def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Iterator[Item]:
+    group = file.get(f"davis/{camera}")
+    if group is None or "events" not in group:
+        raise UsageError(f"{path} has no davis/{camera}/events; cameras there: {', '.join(file.get('davis', ()))}")
+    events, pictures = group["events"], group.get("image_raw")
+    if events.ndim != 2 or events.shape[1] != 4:
+        raise UsageError(f"{path}: davis/{camera}/events is {list(events.shape)}, not [N, 4]")
+    total = events.size * events.dtype.itemsize + (0 if pictures is None else pictures.size)
+    if pictures is not None:
+        if pictures.ndim != 3 or pictures.dtype != np.uint8:
+            raise UsageError(f"{path}: image_raw is {pictures.dtype} {list(pictures.shape)}, not uint8 [M, H, W]")
+        yield SensorSize(pictures.shape[2], pictures.shape[1])
+    done = 0
+    for start in range(0, len(events), READ_EVENTS):
+        rows = events[start : start + READ_EVENTS]
+        yield EventChunk(
+            seconds_to_ns(rows[:, 2]), rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 3] > 0
+        )
+        done += rows.nbytes
+        progress(done, total)
+    if pictures is None:
+        return
+    times, nearest = group["image_raw_ts"][:], group.get("image_raw_event_inds")
+    if len(times) != len(pictures) or (nearest is not None and len(nearest) != len(pictures)):
+        raise UsageError(f"{path}: {len(pictures)} pictures, but {len(times)} times in image_raw_ts")
+    for index, t_ns in enumerate(seconds_to_ns(times)):
+        pixels = pictures[index]
+        yield Picture(int(t_ns), pixels, None if nearest is None else max(0, int(nearest[index])))
+        done += pixels.nbytes
+        progress(done, total)

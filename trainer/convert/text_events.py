@@ -1,0 +1,113 @@
+"""Text files of events: one ``t x y p`` a line, p in {0, 1} or {-1, 1}; a first line ``width height`` is allowed."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from typing import IO
+
+import numpy as np
+import numpy.typing as npt
+
+from trainer.convert.items import EventChunk, SensorSize
+from v2v_protocol.errors import UsageError
+
+BLOCK_BYTES = 1 << 22
+NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
+
+
+def read_text_events(
+    stream: IO[bytes],
+    name: str,
+    *,
+    time_unit: str | None = None,
+    advance: Callable[[int], None] = lambda _bytes: None,
+) -> Iterator[SensorSize | EventChunk]:
+    """
+    Args:
+        stream: of the file's bytes; read in blocks of 4 MiB.
+        name: of the file, for messages.
+        time_unit: "s", "us" or "ns"; None takes seconds where the first time has a point or an exponent, else us.
+        advance: called with the bytes of each block.
+
+    Raises:
+        UsageError: a line that is not four numbers; the message gives its number and text.
+    """
+    if time_unit is not None and time_unit not in NS_PER_UNIT:
+        raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
+    lines_before, rest, started = 0, b"", False
+    while block := stream.read(BLOCK_BYTES):
+        advance(len(block))
+        whole, newline, rest = (rest + block).rpartition(b"\n")
+        block = whole + newline
+        if not started and block:
+            first, _, after = block.partition(b"\n")
+            started = True
+            if len(first.split()) == 2:
+                yield _sensor_size(first, name)
+                block, lines_before = after, 1
+        if time_unit is None:
+            time_unit = _time_unit(block)
+        yield from _chunk(block, name, lines_before, time_unit)
+        lines_before += block.count(b"\n")
+    yield from _chunk(rest, name, lines_before, time_unit or _time_unit(rest) or "us")
+
+
+def _sensor_size(line: bytes, name: str) -> SensorSize:
+    try:
+        width, height = map(int, line.split())
+    except ValueError:
+        raise UsageError(f"{name}: the first line is {line!r}, neither `t x y p` nor `width height`") from None
+    return SensorSize(width, height)
+
+
+def _time_unit(block: bytes) -> str | None:
+    """Of the first event in a block; None where there is none."""
+    first = block.split(None, 1)[:1]
+    if not first:
+        return None
+    return "s" if set(first[0].lower()) & set(b".e") else "us"
+
+
+def _chunk(block: bytes, name: str, lines_before: int, time_unit: str | None) -> Iterator[EventChunk]:
+    if not block.strip():
+        return
+    values = _numbers(block)
+    if values is None:
+        raise UsageError(_first_bad_line(block, name, lines_before))
+    t, x, y, p = values.T
+    yield EventChunk(
+        np.rint(t * NS_PER_UNIT[time_unit or "us"]).astype(np.int64), x.astype(np.int32), y.astype(np.int32), p > 0
+    )
+
+
+def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
+    """[N, 4], or None where the block is not N lines of four finite numbers, the coordinates whole."""
+    with warnings.catch_warnings():
+        # What cannot be parsed to its end is a warning in some releases of numpy, an error in others.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values = np.fromstring(block, np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            return None
+    lines = block.count(b"\n") + (not block.endswith(b"\n"))
+    if len(values) != 4 * lines or not np.isfinite(values).all():
+        # Blank lines are no fault.
+        kept = [line for line in block.splitlines() if line.strip()]
+        if len(values) != 4 * len(kept) or not all(len(line.split()) == 4 for line in kept):
+            return None
+        if not np.isfinite(values).all():
+            return None
+    table: npt.NDArray[np.float64] = values.reshape(-1, 4)
+    coordinates = table[:, 1:3]
+    if (coordinates != np.rint(coordinates)).any() or not np.isin(table[:, 3], (-1, 0, 1)).all():
+        return None
+    return table
+
+
+def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
+    for number, line in enumerate(block.splitlines(), start=lines_before + 1):
+        if line.strip() and (len(line.split()) != 4 or _numbers(line) is None):
+            shown = line[:60].decode("ascii", "replace")
+            return f"{name}, line {number}: {shown!r} is not `t x y p` with whole x and y and p of -1, 0 or 1"
+    return f"{name}: the lines after {lines_before} are not `t x y p`"

@@ -1,0 +1,243 @@
+"""Writes the h5 layout, in one pass and bounded memory.
+
+Events pass through a buffer of FLUSH_EVENTS + REORDER_EVENTS, in which those that come somewhat late are put in order.
+Of the pictures only the times are kept; which event each belongs to is found at the end, in one pass over the times of
+the events on disk, so pictures may come before or after their events.
+
+    event_idx = number of events earlier than the picture     (events[event_idx] is the first one at its time or later)
+
+The file has another name until it is complete.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from trainer.convert.items import EventChunk, Item, Picture, SensorSize
+from trainer.evaluation import layout
+from v2v_protocol.errors import UsageError
+
+FLUSH_EVENTS = 1 << 19
+REORDER_EVENTS = 1 << 17
+H5_CHUNK = 1 << 16
+COLUMNS = {"ts": np.float64, "xs": np.uint16, "ys": np.uint16, "ps": np.bool_}
+
+
+@dataclass(frozen=True)
+class Written:
+    """What went into the file.
+
+    Attributes:
+        events, images: how many.
+        seconds: from the first to the last event.
+        reordered_events: events that came earlier in time than their predecessor.
+        backward_images: pictures whose time is not later than their predecessor's; kept as they are.
+        size: of the sensor.
+    """
+
+    events: int
+    images: int
+    seconds: float
+    reordered_events: int
+    backward_images: int
+    size: SensorSize
+
+
+class RecordingWriter:
+    """A context manager; leaving it without an exception completes the file, with one it removes what there is.
+
+    Args:
+        path: of the file to make.
+        source: what the root attribute ``data_source`` shall say.
+        size: of the sensor; None takes what the recording states, or the pictures', or the smallest that holds all
+            events.
+        published_shift: where the published conversion of this raw form pairs a picture with an earlier event than
+            ``event_idx`` says, by how many; its choice is then written beside ours (``event_idx_published``).
+
+    Raises:
+        UsageError: the folder cannot be written to.
+    """
+
+    def __init__(self, path: Path, *, source: str, size: SensorSize | None = None, published_shift: int = 0) -> None:
+        self._path = path
+        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self._source, self._size, self._published_shift = source, size, published_shift
+        self._pending: list[EventChunk] = []
+        self._pending_events = 0
+        self._origin_ns: int | None = None
+        self._last_ns: int | None = None
+        self._largest = SensorSize(0, 0)
+        self._picture_size: SensorSize | None = None
+        self._picture_times: list[int] = []
+        self._events = self._reordered = 0
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = h5py.File(self._partial, "w")
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        for name, dtype in COLUMNS.items():
+            self._file.create_dataset(
+                f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), compression="gzip",
+                compression_opts=1, shuffle=True,
+            )  # fmt: skip
+        self._file.create_group("images")
+        self.written: Written | None = None
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self.written = self._finish()
+                self._file.close()
+                with self._partial.open("rb") as file:
+                    os.fsync(file.fileno())
+                self._partial.replace(self._path)
+        finally:
+            try:
+                self._file.close()
+            finally:
+                self._partial.unlink(missing_ok=True)
+
+    def add(self, item: Item) -> None:
+        """Take the next item of the recording.
+
+        Raises:
+            UsageError: events further out of order than the buffer reaches, or outside the sensor; pictures of
+                different sizes; a stated size that the user contradicts.
+        """
+        if isinstance(item, SensorSize):
+            if self._size is not None and self._size != item:
+                raise UsageError(
+                    f"{self._source} states a sensor of {item.width} x {item.height}, not "
+                    f"{self._size.width} x {self._size.height}"
+                )
+            self._size = item
+        elif isinstance(item, Picture):
+            self._add_picture(item)
+        elif len(item):
+            self._set_origin(int(item.t_ns[0]))
+            self._pending.append(item)
+            self._pending_events += len(item)
+            if self._pending_events >= FLUSH_EVENTS + REORDER_EVENTS:
+                self._flush(keep=REORDER_EVENTS)
+
+    def _add_picture(self, picture: Picture) -> None:
+        height, width = picture.pixels.shape
+        size = SensorSize(width, height)
+        if self._picture_size not in (None, size):
+            raise UsageError(f"{self._source}: pictures of different sizes, {self._picture_size} and {size}")
+        self._picture_size = size
+        origin_ns = self._set_origin(picture.t_ns)
+        dataset = self._file.create_dataset(
+            layout.image_key(len(self._picture_times)), data=picture.pixels, compression="gzip", compression_opts=1
+        )
+        dataset.attrs["timestamp"] = (picture.t_ns - origin_ns) * 1e-9
+        if picture.published_event_index is not None:
+            dataset.attrs["event_idx_published"] = picture.published_event_index
+        self._picture_times.append(picture.t_ns)
+
+    def _set_origin(self, t_ns: int) -> int:
+        """The time that becomes 0: that of the first item, whichever it is."""
+        if self._origin_ns is None:
+            self._origin_ns = t_ns
+        return self._origin_ns
+
+    def _flush(self, keep: int) -> None:
+        """Write all pending events but the last ``keep``."""
+        t_ns, x, y, p = (
+            np.concatenate([getattr(chunk, name) for chunk in self._pending]) for name in ("t_ns", "x", "y", "p")
+        )
+        backward = int(np.count_nonzero(np.diff(t_ns) < 0))
+        if backward:
+            order = np.argsort(t_ns, kind="stable")
+            t_ns, x, y, p = t_ns[order], x[order], y[order], p[order]
+        if self._last_ns is not None and t_ns[0] < self._last_ns:
+            seconds = (self._last_ns - t_ns[0]) * 1e-9
+            raise UsageError(
+                f"{self._source}: near event {self._events} the time goes back by {seconds:.6f} s over more than "
+                f"{REORDER_EVENTS} events; sort the recording, or cut it there"
+            )
+        self._reordered += backward
+        count = len(t_ns) - keep
+        self._append(t_ns[:count], x[:count], y[:count], p[:count])
+        # Copies: a view would keep the whole buffer alive.
+        rest = EventChunk(t_ns[count:].copy(), x[count:].copy(), y[count:].copy(), p[count:].copy())
+        self._pending, self._pending_events = [rest], keep
+
+    def _append(
+        self,
+        t_ns: npt.NDArray[np.int64],
+        x: npt.NDArray[np.integer],
+        y: npt.NDArray[np.integer],
+        p: npt.NDArray[np.bool_],
+    ) -> None:
+        if not len(t_ns):
+            return
+        if min(x.min(), y.min()) < 0 or max(x.max(), y.max()) > np.iinfo(np.uint16).max:
+            raise UsageError(f"{self._source}: events at x {x.min()} .. {x.max()}, y {y.min()} .. {y.max()}")
+        self._largest = SensorSize(
+            max(self._largest.width, int(x.max()) + 1), max(self._largest.height, int(y.max()) + 1)
+        )
+        columns: dict[str, npt.NDArray[Any]] = {"ts": (t_ns - (self._origin_ns or 0)) * 1e-9, "xs": x, "ys": y, "ps": p}
+        for name, values in columns.items():
+            dataset = self._file[f"events/{name}"]
+            dataset.resize(self._events + len(t_ns), axis=0)
+            dataset[self._events :] = values
+        self._events += len(t_ns)
+        self._last_ns = int(t_ns[-1])
+
+    def _finish(self) -> Written:
+        if self._pending:
+            self._flush(keep=0)
+        if not self._events or self._origin_ns is None or self._last_ns is None:
+            raise UsageError(f"{self._source} holds no events")
+        size = self._size or self._picture_size or self._largest
+        if self._picture_size not in (None, size):
+            raise UsageError(f"{self._source}: pictures are {self._picture_size}, the sensor is {size}")
+        if self._largest.width > size.width or self._largest.height > size.height:
+            raise UsageError(
+                f"{self._source}: events reach x = {self._largest.width - 1}, y = {self._largest.height - 1}, outside "
+                f"of the sensor of {size.width} x {size.height}"
+            )
+        self._pair_pictures()
+        ts = self._file["events/ts"]
+        seconds = float(ts[-1] - ts[0])
+        self._file.attrs.update(
+            sensor_resolution=(size.height, size.width),
+            num_events=self._events,
+            num_imgs=len(self._picture_times),
+            data_source=self._source,
+            start_ns=self._origin_ns,
+        )
+        return Written(
+            events=self._events,
+            images=len(self._picture_times),
+            seconds=seconds,
+            reordered_events=self._reordered,
+            backward_images=int(np.count_nonzero(np.diff(self._picture_times) <= 0)),
+            size=size,
+        )
+
+    def _pair_pictures(self) -> None:
+        ts = self._file["events/ts"]
+        times = np.array([self._file[layout.image_key(i)].attrs["timestamp"] for i in range(len(self._picture_times))])
+        earlier = np.zeros(len(times), np.int64)
+        for start in range(0, self._events, FLUSH_EVENTS):
+            earlier += np.searchsorted(ts[start : start + FLUSH_EVENTS], times, side="left")
+        for index, count in enumerate(earlier):
+            attributes = self._file[layout.image_key(index)].attrs
+            attributes["event_idx"] = count
+            if self._published_shift:
+                attributes["event_idx_published"] = max(0, count - self._published_shift)

@@ -1,0 +1,95 @@
+"""Ranks of one training run: started by torchrun, or one alone.
+
+A process group of two backends: NCCL moves gradients between GPUs, gloo moves the small words that only the CPU knows
+(does any rank want to stop?), so that agreeing never waits for a GPU.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, distributed
+
+from v2v_protocol.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """This process among its siblings.
+
+    Attributes:
+        rank, world_size: which of how many.
+        device: what this rank computes on.
+        hosts: on how many machines they run.
+    """
+
+    rank: int
+    world_size: int
+    device: torch.device
+    hosts: int = 1
+
+    @property
+    def first(self) -> bool:
+        """The rank that writes files and speaks."""
+        return self.rank == 0
+
+    def any(self, wish: bool) -> bool:
+        """Whether any rank wishes it; all must ask."""
+        if self.world_size == 1:
+            return wish
+        votes = torch.tensor([int(wish)])
+        distributed.all_reduce(votes, distributed.ReduceOp.MAX)
+        return bool(votes.item())
+
+    def mean(self, values: Tensor) -> Tensor:
+        """The mean over the ranks; all must ask."""
+        if self.world_size == 1:
+            return values
+        values = values.clone()
+        distributed.all_reduce(values)
+        return values / self.world_size
+
+    def from_first(self, value: Any) -> Any:
+        """What the first rank gave (a plain value); all must ask."""
+        if self.world_size == 1:
+            return value
+        carrier = [value]
+        distributed.broadcast_object_list(carrier, src=0, device=torch.device("cpu"))
+        return carrier[0]
+
+
+@contextmanager
+def ranks(device: str) -> Iterator[Ranks]:
+    """This process's place, from the variables that torchrun sets.
+
+    Args:
+        device: "auto", "cpu" or "cuda".
+
+    Raises:
+        UsageError: "cuda" without a GPU, or more ranks on this host than GPUs.
+    """
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device == "cuda" and not gpus:
+        raise UsageError("compute.device = cuda: PyTorch sees no GPU here; give cpu or auto")
+    on_gpu = device != "cpu" and gpus > 0
+    world_size = int(os.environ.get("WORLD_SIZE", "1"))
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", str(world_size)))
+    if on_gpu and here > gpus:
+        raise UsageError(f"{here} ranks on this host, but {gpus} GPUs: start one rank per GPU, or compute.device=cpu")
+    mine = torch.device("cuda", local_rank) if on_gpu else torch.device("cpu")
+    if on_gpu:
+        torch.cuda.set_device(mine)
+    if world_size == 1:
+        yield Ranks(0, 1, mine)
+        return
+    distributed.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo")
+    try:
+        yield Ranks(distributed.get_rank(), world_size, mine, hosts=-(-world_size // here))
+    finally:
+        distributed.destroy_process_group()

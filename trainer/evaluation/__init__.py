@@ -1,0 +1,1 @@
+"""How well a network reconstructs real recordings: readers, voxel grids, metrics, tables, pictures."""

@@ -1,0 +1,193 @@
+"""The command line of `v2v-eval`.
+
+Exit status: 0 everything that is there was evaluated, 2 wrong usage or input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
+from trainer.evaluation.evaluate import Advance, Drawing, Run, evaluate_data_set
+from trainer.evaluation.metrics import METRICS, make_metrics
+from trainer.evaluation.network import load_network
+from trainer.evaluation.score import SequenceScore
+from trainer.evaluation.tables import records, table
+from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
+from trainer.models import NETWORKS
+from v2v_protocol.errors import UsageError, V2VError
+
+LEAST_WIDTH = 110
+"""Of tables that do not go to a terminal."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-eval`."""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    try:
+        _run(arguments)
+    except KeyboardInterrupt:
+        print("v2v-eval: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except V2VError as error:
+        if arguments.debug:
+            raise
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="v2v-eval",
+        description="Reconstruct recordings of event cameras, and score that against the cameras' pictures.",
+    )
+    parser.add_argument(
+        "config", nargs="?", metavar="CONFIG",
+        help=f"YAML file, or one of {', '.join(sorted(shipped()))}; without it, all recordings of --data",
+    )  # fmt: skip
+    parser.add_argument("--weights", required=True, metavar="FILE", help="of the network; nothing in it is executed")
+    parser.add_argument(
+        "--data", required=True, metavar="DIR",
+        help="with CONFIG: the folder with one folder a data set; without: a folder of .h5 files, or one of them",
+    )  # fmt: skip
+    parser.add_argument("--ema", action="store_true", help="the averaged weights of an own checkpoint")
+    parser.add_argument("--model", choices=tuple(NETWORKS), help="what the weights are (default: look)")
+    parser.add_argument(
+        "--normalize-voxels", action="store_true", help="normalise every voxel grid, as published FireNet wants"
+    )
+    parser.add_argument("--voxels", choices=get_args(Kind), help="default: CONFIG's, or discrete")
+    parser.add_argument(
+        "--span", choices=get_args(Span),
+        help="what the bins divide: first to last event of a window (published, default), or the time of the window",
+    )  # fmt: skip
+    parser.add_argument("--metrics", metavar="A,B", help=f"of {', '.join(METRICS)}; default: CONFIG's")
+    parser.add_argument(
+        "--lpips", nargs=3, action="append", default=[], metavar=("NET", "BACKBONE", "HEADS"),
+        help="weights of LPIPS for alex, squeeze or vgg; may be given several times",
+    )  # fmt: skip
+    parser.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
+    parser.add_argument(
+        "--as-published", action="store_true",
+        help="event_idx as stored, times cut to us: as the released code does, faults included",
+    )  # fmt: skip
+    parser.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
+    parser.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
+    parser.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
+    parser.add_argument("--rows", type=int, default=6, metavar="N", help="rows of a picture (default 6)")
+    parser.add_argument("--video", action="store_true", help="also a video of each sequence, side by side")
+    parser.add_argument("--json", metavar="FILE", help="also write flat records")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    data = Path(arguments.data)
+    if not data.exists():
+        raise UsageError(f"--data {data}: no such folder or file")
+    config = folder_config(data) if arguments.config is None else read_config(arguments.config)
+    run, model = _prepare(arguments, config)
+    scores: dict[str, list[SequenceScore]] = {}
+    with _progress() as advance:
+        for data_set in config.data_sets:
+            found = evaluate_data_set(run, data, data_set, advance)
+            if found:
+                scores[data_set.name] = found
+    if not scores:
+        wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
+        raise UsageError(f"--data {data} holds no sequence of {wanted}; v2v-convert makes the files")
+    _print(config, scores)
+    if arguments.json is not None:
+        settings = {
+            "model": model,
+            "weights": str(arguments.weights),
+            "voxels": run.voxels.kind,
+            "span": run.voxels.span,
+            "as_published": run.as_published,
+            "cuts": arguments.cuts,
+            "reconstruction_hz": run.fps,
+        }
+        _write_json(Path(arguments.json), records(scores, settings))
+
+
+def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[Run, str]:
+    options: dict[str, Any] = dict(config.model_options)
+    if arguments.normalize_voxels:
+        options["normalize_voxels"] = True
+    network, model = load_network(
+        arguments.weights, name=arguments.model or config.model, options=options, ema=arguments.ema
+    )
+    voxels = config.voxels or VoxelSettings(bins=network.bins)
+    changed = {"kind": arguments.voxels, "span": arguments.span, "truncate": arguments.as_published or None}
+    voxels = dataclasses.replace(voxels, **{name: value for name, value in changed.items() if value is not None})
+    lpips_files = {net: (backbone, heads) for net, backbone, heads in arguments.lpips}
+    device = arguments.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    names: Sequence[str] = config.metrics
+    if arguments.metrics is not None:
+        names = [name.strip() for name in arguments.metrics.split(",")]
+    elif arguments.fps is not None:
+        names = ()
+    else:
+        # Files that were given are to be used.
+        names = list(dict.fromkeys([*names, *(f"lpips_{net}" for net in lpips_files)]))
+    if arguments.fps is not None and names:
+        raise UsageError("--fps scores nothing, so it goes without --metrics")
+    run = Run(
+        network=network,
+        voxels=voxels,
+        metrics=make_metrics(names, lpips_files, device),
+        device=device,
+        as_published=arguments.as_published,
+        use_cuts=arguments.cuts == "paper",
+        fps=arguments.fps,
+        drawing=Drawing(None if arguments.out is None else Path(arguments.out), arguments.rows, arguments.video),
+    )
+    return run, model
+
+
+def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=LEAST_WIDTH)
+    for data_set in config.data_sets:
+        if data_set.name not in scores:
+            console.print(f"{data_set.name}: none of its {len(data_set.cuts)} sequences is there")
+            continue
+        console.print(table(data_set, scores[data_set.name], config.paper))
+        for score in scores[data_set.name]:
+            if score.repaired_images or score.empty_windows:
+                console.print(
+                    f"{score.sequence}: {score.repaired_images} time stamps of pictures mended, "
+                    f"{score.empty_windows} windows without events"
+                )
+
+
+def _write_json(path: Path, made: list[dict[str, Any]]) -> None:
+    try:
+        path.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--json {path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Advance]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(file=sys.stderr)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda sequence, done, total: bar.update(task, description=sequence, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""The configuration of an evaluation: a YAML file, or one that ships with the project, by name.
+
+Its keys:
+
+    model: {name: e2vid, options: {final_activation: none}}    # both optional: the weights tell
+    voxels: {kind: discrete, bins: 5, span: events}
+    metrics: [mse, ssim_range2, ssim, lpips_alex]
+    data:
+      - HQF                                                    # of the paper, with its cuts
+      - {name: mine, folder: recordings, sequences: {corridor: [0, 10], desk: null}}
+    paper: [E2VID WebVid10K]                                   # rows to show beside
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from trainer.evaluation import paper
+from trainer.evaluation.cuts import DATA_SETS, Cut, DataSet
+from trainer.evaluation.layout import SUFFIXES
+from trainer.evaluation.metrics import METRICS
+from trainer.evaluation.voxelise import VoxelSettings
+from v2v_protocol.errors import UsageError
+
+KEYS = ("model", "voxels", "metrics", "data", "paper")
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What to evaluate.
+
+    Attributes:
+        data_sets: in this order.
+        model: key of ``trainer.models.NETWORKS``; None recognises it.
+        model_options: its arguments, where the weights do not tell them.
+        voxels: how windows become voxel grids; None means discrete with as many bins as the network takes.
+        metrics: names of ``trainer.evaluation.metrics.METRICS``.
+        paper: methods of ``trainer.evaluation.paper.RESULTS`` to show beside.
+    """
+
+    data_sets: tuple[DataSet, ...]
+    model: str | None = None
+    model_options: Mapping[str, Any] = field(default_factory=dict)
+    voxels: VoxelSettings | None = None
+    metrics: tuple[str, ...] = ("mse", "ssim_range2", "ssim")
+    paper: tuple[str, ...] = ()
+
+
+def shipped() -> dict[str, Path]:
+    """Configurations of the project by name."""
+    folder = resources.files("trainer.evaluation") / "configs"
+    return {Path(file.name).stem: Path(str(file)) for file in folder.iterdir() if file.name.endswith(".yaml")}
+
+
+def read_config(name: str) -> EvaluationConfig:
+    """
+    Args:
+        name: path of a YAML file, or name of a shipped configuration.
+
+    Raises:
+        UsageError: no such file, or something in it that is not understood; the message names the key.
+    """
+    path = Path(name)
+    if not path.is_file():
+        known = shipped()
+        if name not in known:
+            raise UsageError(f"no file {name}; configurations that ship with the project: {', '.join(sorted(known))}")
+        path = known[name]
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    return parse_config(content, str(path))
+
+
+def parse_config(content: Any, where: str) -> EvaluationConfig:
+    """As :func:`read_config`, of the parsed YAML; ``where`` is for messages."""
+    top = _mapping(content, where, KEYS)
+    model = _mapping(top.get("model", {}), f"{where}: model", ("name", "options"))
+    voxels = _mapping(top.get("voxels", {}), f"{where}: voxels", ("kind", "bins", "span"))
+    return EvaluationConfig(
+        data_sets=tuple(_data_set(entry, f"{where}: data") for entry in _list(top.get("data"), f"{where}: data")),
+        model=model.get("name"),
+        model_options=dict(model.get("options") or {}),
+        voxels=VoxelSettings(**voxels) if voxels else None,
+        metrics=_known(top.get("metrics", ["mse", "ssim_range2", "ssim"]), METRICS, f"{where}: metrics"),
+        paper=_known(top.get("paper", []), tuple(paper.RESULTS), f"{where}: paper"),
+    )
+
+
+def folder_config(path: Path) -> EvaluationConfig:
+    """All recordings of a folder, or a single file, as one data set without cuts."""
+    files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
+    if not files:
+        raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); v2v-convert makes them from raw ones")
+    return EvaluationConfig((DataSet(path.stem, ".", dict.fromkeys(file.stem for file in files)),))
+
+
+def _data_set(entry: Any, where: str) -> DataSet:
+    if isinstance(entry, str):
+        if entry not in DATA_SETS:
+            raise UsageError(f"{where}: {entry!r} is none of the paper's: {', '.join(DATA_SETS)}. Others are given as "
+                             "{name, folder, sequences}")  # fmt: skip
+        return DATA_SETS[entry]
+    given = _mapping(entry, where, ("name", "folder", "sequences"))
+    if "name" not in given or not given.get("sequences"):
+        raise UsageError(f"{where}: a data set has a name and sequences")
+    sequences = given["sequences"]
+    if isinstance(sequences, list):
+        sequences = dict.fromkeys(map(str, sequences))
+    if not isinstance(sequences, Mapping):
+        raise UsageError(f"{where}: sequences are a list, or first and last second by name")
+    cuts = {str(name): _cut(cut, f"{where}: {name}") for name, cut in sequences.items()}
+    return DataSet(str(given["name"]), str(given.get("folder", given["name"])), cuts)
+
+
+def _cut(value: Any, where: str) -> Cut | None:
+    if value is None:
+        return None
+    if not (isinstance(value, list) and len(value) == 2 and all(isinstance(edge, (int, float)) for edge in value)):
+        raise UsageError(f"{where}: {value!r} is not [first second, last second]")
+    start, end = float(value[0]), float(value[1])
+    if not 0 <= start < end:
+        raise UsageError(f"{where}: a cut from {start:g} to {end:g} s")
+    return start, end
+
+
+def _mapping(value: Any, where: str, keys: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UsageError(f"{where}: {value!r} should have the keys {', '.join(keys)}")
+    unknown = [str(key) for key in value if key not in keys]
+    if unknown:
+        raise UsageError(f"{where}: unknown key {unknown[0]!r}; there are {', '.join(keys)}")
+    return dict(value)
+
+
+def _list(value: Any, where: str) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise UsageError(f"{where}: {value!r} should be a list")
+    return value
+
+
+def _known(value: Any, names: tuple[str, ...], where: str) -> tuple[str, ...]:
+    unknown = [entry for entry in (value if isinstance(value, list) else [value]) if entry not in names]
+    if unknown:
+        raise UsageError(f"{where}: {unknown[0]!r} is none of {', '.join(names)}")
+    return tuple(value)

@@ -1,0 +1,131 @@
+"""Evaluates data sets: finds their recordings, reconstructs and scores each, draws what is asked for."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from trainer.evaluation import layout, pictures
+from trainer.evaluation.cuts import Cut, DataSet
+from trainer.evaluation.metrics import Metric
+from trainer.evaluation.readers import Recording, Window
+from trainer.evaluation.reconstruct import reconstruct
+from trainer.evaluation.score import SequenceScore, SequenceScorer
+from trainer.evaluation.voxelise import VoxelSettings
+from trainer.models import ReconstructionNetwork
+from v2v_protocol.errors import UsageError
+
+Advance = Callable[[str, int, int], None]
+"""Called with the sequence, the windows done, and the windows in all."""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What to draw.
+
+    Attributes:
+        folder: where to; None draws nothing.
+        rows: steps in the picture of a sequence.
+        video: also write a video of each sequence.
+    """
+
+    folder: Path | None = None
+    rows: int = 6
+    video: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rows < 1:
+            raise UsageError(f"pictures with {self.rows} rows: give at least 1")
+        if self.video and self.folder is None:
+            raise UsageError("a video needs --out, the folder to write it to")
+
+
+@dataclass(frozen=True)
+class Run:
+    """How to evaluate.
+
+    Attributes:
+        network: in evaluation mode.
+        voxels: as the network wants them.
+        metrics: by name.
+        device: of PyTorch.
+        as_published: see :mod:`trainer.evaluation.readers`.
+        use_cuts: False scores all of each recording.
+        fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
+        drawing: pictures and videos.
+    """
+
+    network: ReconstructionNetwork
+    voxels: VoxelSettings
+    metrics: Mapping[str, Metric]
+    device: str = "cpu"
+    as_published: bool = False
+    use_cuts: bool = True
+    fps: float | None = None
+    drawing: Drawing = field(default_factory=Drawing)
+
+
+def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
+    """Files of the sequences of a data set that are there, by sequence, in the data set's order."""
+    folder = data if data.is_dir() else data.parent
+    found = {}
+    for sequence in data_set.cuts:
+        candidates = [folder / data_set.folder / f"{sequence}{suffix}" for suffix in layout.SUFFIXES]
+        existing = next((path for path in candidates if path.is_file()), None)
+        if existing is not None:
+            found[sequence] = existing
+    return found
+
+
+def evaluate_data_set(
+    run: Run, data: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
+) -> list[SequenceScore]:
+    """Scores of the sequences that are there.
+
+    Raises:
+        UsageError: see :class:`Recording` and :func:`reconstruct`.
+    """
+    return [
+        evaluate_sequence(run, path, data_set.name, data_set.cuts[sequence], advance)
+        for sequence, path in find_recordings(data, data_set).items()
+    ]
+
+
+def evaluate_sequence(
+    run: Run, path: Path, data_set: str, cut: Cut | None, advance: Advance = lambda _sequence, _done, _total: None
+) -> SequenceScore:
+    """Score, and draw, one recording."""
+    with Recording(path, as_published=run.as_published) as recording:
+        if run.fps is None:
+            windows = recording.windows(cut if run.use_cuts else None)
+        else:
+            windows = recording.regular_windows(run.fps)
+        scorer = SequenceScorer(run.metrics)
+        rows = []
+        shown = pictures.chosen_steps(len(windows), run.drawing.rows)
+        with _video(run.drawing, data_set, recording.name, windows) as video:
+            steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device)
+            for number, step in enumerate(steps):
+                scorer.add(step)
+                if video is not None or (run.drawing.folder is not None and number in shown):
+                    image = pictures.draw_step(step, windows[0].begin, with_camera=bool(recording.images))
+                    if number in shown:
+                        rows.append(image)
+                    if video is not None:
+                        video.add(image)
+                advance(recording.name, number + 1, len(windows))
+        if run.drawing.folder is not None:
+            pictures.write_png(run.drawing.folder / data_set / f"{recording.name}.png", rows)
+        return scorer.score(data_set, recording.name, recording.repaired_images)
+
+
+@contextlib.contextmanager
+def _video(drawing: Drawing, data_set: str, sequence: str, windows: list[Window]) -> Iterator[pictures.Video | None]:
+    if not drawing.video or drawing.folder is None:
+        yield None
+        return
+    fps = max(1.0, len(windows) / (windows[-1].end - windows[0].begin))
+    with pictures.Video(drawing.folder / data_set / f"{sequence}.mp4", fps) as video:
+        yield video

@@ -1,0 +1,103 @@
+"""Distances between a reconstruction and the picture of the sensor.
+
+| name | definition |
+|---|---|
+| ``mse`` | mean squared difference, grey values in 0 .. 1 |
+| ``ssim_range2`` | SSIM as the paper computes it: 7x7 uniform window, sample covariance, data range 2 |
+| ``ssim`` | the same with data range 1, which is the range of the values; lower |
+| ``lpips_alex``, ``lpips_squeeze``, ``lpips_vgg`` | LPIPS v0.1 |
+
+Reconstructions are clamped to 0 .. 1 first, not rounded to 8 bits. The paper's tables hold ``mse``, ``ssim_range2`` and
+``lpips_alex``.
+
+SSIM (Wang et al. 2004), as ``skimage.metrics.structural_similarity`` defines it, with means mu, (co)variances s of the
+sample kind (N - 1) over each window that lies wholly in the picture, and C1 = (0.01 R)^2, C2 = (0.03 R)^2 for range R:
+
+    mean of  (2 mu_a mu_b + C1) (2 s_ab + C2) / ((mu_a^2 + mu_b^2 + C1) (s_aa + s_bb + C2))
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from skimage.metrics import structural_similarity
+
+from trainer.backbones import BACKBONES
+from trainer.lpips import LPIPS
+from v2v_protocol.errors import UsageError
+
+GreyImage = npt.NDArray[np.float64]
+Metric = Callable[[GreyImage, GreyImage], float]
+
+SSIM_WINDOW_PX = 7
+LPIPS_METRICS = {f"lpips_{net}": net for net in BACKBONES}
+METRICS = ("mse", "ssim_range2", "ssim", *LPIPS_METRICS)
+
+
+def mse(prediction: GreyImage, target: GreyImage) -> float:
+    """Mean squared difference."""
+    return float(np.mean((prediction - target) ** 2))
+
+
+def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> float:
+    """See the module.
+
+    Raises:
+        UsageError: pictures smaller than the window.
+    """
+    if min(target.shape) < SSIM_WINDOW_PX:
+        raise UsageError(f"SSIM of a picture of {target.shape[0]} x {target.shape[1]}: give at least 7 x 7")
+    similarity: float = structural_similarity(  # type: ignore[no-untyped-call]
+        prediction, target, win_size=SSIM_WINDOW_PX, data_range=data_range
+    )
+    return float(similarity)
+
+
+def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str = "cpu") -> Metric:
+    """LPIPS with weights from files, see :meth:`trainer.lpips.LPIPS.from_files`."""
+    network = LPIPS.from_files(net, backbone, heads).to(device)
+
+    def distance(prediction: GreyImage, target: GreyImage) -> float:
+        pair = [torch.from_numpy(picture.astype(np.float32))[None].to(device) for picture in (prediction, target)]
+        with torch.no_grad():
+            return float(network(*pair))
+
+    return distance
+
+
+def make_metrics(
+    names: Sequence[str], lpips_files: Mapping[str, tuple[str | Path, str | Path]], device: str = "cpu"
+) -> dict[str, Metric]:
+    """Metrics by name.
+
+    Args:
+        names: of METRICS.
+        lpips_files: backbone and heads by network ("alex", "squeeze", "vgg").
+        device: where LPIPS runs.
+
+    Raises:
+        UsageError: an unknown name, or LPIPS without its files.
+    """
+    made: dict[str, Metric] = {}
+    for name in names:
+        if name not in METRICS:
+            raise UsageError(f"metric {name!r}: give some of {', '.join(METRICS)}")
+        if name == "mse":
+            made[name] = mse
+        elif name in LPIPS_METRICS:
+            net = LPIPS_METRICS[name]
+            if net not in lpips_files:
+                raise UsageError(
+                    f"{name} needs weights that are not part of this project: give --lpips {net} BACKBONE HEADS "
+                    f"(backbone: {BACKBONES[net].weights_from}, heads: {net}.pth of LPIPS v0.1), or leave it out with "
+                    "--metrics"
+                )
+            made[name] = lpips_metric(net, *lpips_files[net], device)
+        else:
+            made[name] = functools.partial(ssim, data_range=2.0 if name == "ssim_range2" else 1.0)
+    return made

@@ -1,0 +1,256 @@
+"""Reads recordings in the h5 layout (IJRR, MVSEC, HQF, EVAID, own ones), window by window, in bounded memory.
+
+A window is what lies between two consecutive pictures: its voxel grid is to become the later one. Window i holds the
+events with t_i <= t < t_(i+1), found by the pictures' time stamps. Two known faults of published files are mended so:
+``event_idx`` one event early (HQF), and a picture whose time stamp goes back (HQF ``engineering_posters``, picture
+528), which gets the mean of its neighbours. ``as_published=True`` takes ``event_idx`` as it is stored; a window that
+ends before it begins is empty then.
+"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from trainer.evaluation import layout
+from trainer.evaluation.voxelise import Events
+from v2v_protocol.errors import UsageError
+
+BLOCK_EVENTS = 1 << 16
+CACHED_BLOCKS = 64
+CLOCK_SLACK_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture of a recording: its key in the file, its time (s), and the index of the first event that follows it."""
+
+    key: str
+    time: float
+    event_index: int
+
+
+@dataclass(frozen=True)
+class Window:
+    """Events ``start:stop``, from ``begin`` to ``end`` seconds; ``target`` is the picture at the end, or None."""
+
+    start: int
+    stop: int
+    begin: float
+    end: float
+    target: Image | None
+
+
+class _Times(Sequence[float]):
+    """``events/ts`` as a sequence that bisection can search: reads blocks, keeps the last ones."""
+
+    def __init__(self, dataset: h5py.Dataset) -> None:
+        self._dataset = dataset
+        self._block = functools.lru_cache(CACHED_BLOCKS)(self._read)
+
+    def _read(self, block: int) -> npt.NDArray[np.float64]:
+        values: npt.NDArray[np.float64] = self._dataset[block * BLOCK_EVENTS : (block + 1) * BLOCK_EVENTS]
+        return values.astype(np.float64)
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def __getitem__(self, index: int) -> float:  # type: ignore[override]
+        return float(self._block(index // BLOCK_EVENTS)[index % BLOCK_EVENTS])
+
+
+class Recording:
+    """One h5 file. A context manager.
+
+    Args:
+        path: of the file; opened for reading.
+        as_published: see the module.
+
+    Attributes:
+        name: of the sequence, the file's name without its ending.
+        size: height and width of the sensor.
+        images: in order; may be empty.
+        repaired_images: how many time stamps were mended.
+
+    Raises:
+        UsageError: no such file, not of this layout, or its clocks do not fit together.
+    """
+
+    def __init__(self, path: str | Path, *, as_published: bool = False) -> None:
+        self.path = Path(path)
+        self.name = self.path.stem
+        if not self.path.is_file():
+            raise UsageError(f"no file {self.path}")
+        try:
+            self._file = h5py.File(self.path, "r")
+        except OSError as error:
+            raise UsageError(f"{self.path} cannot be read as HDF5: {error}") from error
+        try:
+            self._columns = self._checked_columns()
+            self._times = _Times(self._columns["ts"])
+            self.repaired_images = 0
+            self.images = self._listed_images(as_published)
+            self.size = self._sensor_size()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        """Number of events."""
+        return len(self._times)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Times of the first and the last event, seconds."""
+        return self._times[0], self._times[len(self._times) - 1]
+
+    def _checked_columns(self) -> dict[str, h5py.Dataset]:
+        columns = {name: self._file.get(f"events/{name}") for name in layout.EVENT_COLUMNS}
+        missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
+        if missing:
+            raise UsageError(
+                f"{self.path} has no events/{missing[0]}: it is not in the layout of v2v-eval. v2v-convert makes that "
+                "from raw recordings"
+            )
+        lengths = {len(column) for column in columns.values()}
+        if lengths == {0} or len(lengths) > 1:
+            raise UsageError(f"{self.path}: columns of events have {sorted(lengths)} entries")
+        return columns
+
+    def _listed_images(self, as_published: bool) -> tuple[Image, ...]:
+        group = self._file.get("images", {})
+        keys = sorted(group)
+        if not keys:
+            return ()
+        attributes = [group[key].attrs for key in keys]
+        if any("event_idx" not in attribute for attribute in attributes):
+            raise UsageError(f"{self.path}: pictures without the attribute event_idx")
+        name = "event_idx_published" if as_published else "event_idx"
+        stored = [int(attribute.get(name, attribute["event_idx"])) for attribute in attributes]
+        if not all("timestamp" in attribute for attribute in attributes):
+            times = [self._times[min(index, len(self) - 1)] for index in stored]
+            return self._paired(keys, times, stored)
+        times = [float(attribute["timestamp"]) for attribute in attributes]
+        if as_published:
+            return self._paired(keys, times, stored)
+        first, last = self.span
+        if times[-1] < first - CLOCK_SLACK_SECONDS or times[0] > last + CLOCK_SLACK_SECONDS:
+            raise UsageError(
+                f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
+                f"{last:.3f} s: not one clock. Convert the recording again with v2v-convert, or trust its event_idx "
+                "with --as-published"
+            )
+        times = self._increasing(times)
+        return self._paired(keys, times, [bisect.bisect_left(self._times, time) for time in times])
+
+    def _paired(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
+        return tuple(Image(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True))
+
+    def _increasing(self, times: Sequence[float]) -> list[float]:
+        """Each time that is not later than the one before becomes the mean of its neighbours."""
+        mended = list(times)
+        for index in range(1, len(mended)):
+            if mended[index] > mended[index - 1]:
+                continue
+            after = mended[index + 1] if index + 1 < len(mended) else 2 * mended[index - 1] - mended[max(0, index - 2)]
+            if after <= mended[index - 1]:
+                raise UsageError(
+                    f"{self.path}: the times of pictures {index} and {index + 1} are not later than that of picture "
+                    f"{index - 1}, {mended[index - 1]:.6f} s; only single ones can be mended"
+                )
+            mended[index] = (mended[index - 1] + after) / 2
+            self.repaired_images += 1
+        return mended
+
+    def _sensor_size(self) -> tuple[int, int]:
+        if self.images:
+            shape = self._file[self.images[0].key].shape
+            if len(shape) != 2:
+                raise UsageError(f"{self.path}: {self.images[0].key} is {list(shape)}, not [H, W]")
+            return int(shape[0]), int(shape[1])
+        stated = self._file.attrs.get("sensor_resolution", self._file.get("sensor_resolution"))
+        if stated is None or len(stated) != 2:
+            raise UsageError(f"{self.path} has neither pictures nor sensor_resolution: the sensor's size is unknown")
+        return int(stated[0]), int(stated[1])
+
+    def windows(self, cut: tuple[float, float] | None = None) -> list[Window]:
+        """Windows between consecutive pictures.
+
+        Args:
+            cut: first and last second, counted from the first picture of the recording; None takes all pictures.
+
+        Raises:
+            UsageError: fewer than two pictures in the cut, or the recording ends before the cut does.
+        """
+        if not self.images:
+            raise UsageError(f"{self.path} has no pictures to compare with; --fps reconstructs without")
+        images = list(self.images)
+        if cut is not None:
+            start, end = cut
+            zero, last = images[0].time, images[-1].time - images[0].time
+            # A recording that was cut before would be cut twice. One that begins at 0 cannot be mistaken.
+            if start > 0 and last < end - CLOCK_SLACK_SECONDS:
+                raise UsageError(
+                    f"{self.path} lasts {last:.2f} s, and the cut is from {start:g} to {end:g} s: if it is already "
+                    "cut, give --cuts none"
+                )
+            images = [image for image in images if start <= image.time - zero <= end]
+        if len(images) < 2:
+            raise UsageError(f"{self.path}: {len(images)} pictures in the cut {cut}; two or more make a window")
+        return [
+            Window(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
+            for one, other in itertools.pairwise(images)
+        ]
+
+    def regular_windows(self, fps: float) -> list[Window]:
+        """Windows of equal length from the first event to the last; without targets.
+
+        Raises:
+            UsageError: ``fps`` not above 0, or the recording is shorter than one window.
+        """
+        if not fps > 0:
+            raise UsageError(f"{fps:g} windows a second: give more than 0")
+        first, last = self.span
+        count = int((last - first) * fps + 1e-9)
+        if count < 1:
+            raise UsageError(f"{self.path} lasts {last - first:.3f} s, less than one window at {fps:g} a second")
+        edges = [first + step / fps for step in range(count + 1)]
+        indices = [bisect.bisect_left(self._times, edge) for edge in edges]
+        return [Window(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
+
+    def events(self, window: Window) -> Events:
+        """The events of a window."""
+        part = slice(window.start, window.stop)
+        return Events(
+            self._columns["ts"][part].astype(np.float64),
+            self._columns["xs"][part],
+            self._columns["ys"][part],
+            np.where(self._columns["ps"][part] > 0, np.float32(1), np.float32(-1)),
+        )
+
+    def image(self, image: Image) -> npt.NDArray[np.uint8]:
+        """Its pixels, uint8 [H, W].
+
+        Raises:
+            UsageError: another dtype or size than the first picture's.
+        """
+        pixels = self._file[image.key][:]
+        if pixels.dtype != np.uint8 or pixels.shape != self.size:
+            raise UsageError(
+                f"{self.path}: {image.key} is {pixels.dtype} {list(pixels.shape)}, not uint8 {list(self.size)}"
+            )
+        return np.asarray(pixels)

@@ -1,0 +1,95 @@
+"""Runs a network over the windows of a recording.
+
+The memory of the network starts at zero with the first window and is carried to the last, as the published test code
+does; nothing is run before the first window to warm it up.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from trainer.evaluation.readers import Image, Recording, Window
+from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.models import ReconstructionNetwork
+from v2v_protocol.errors import UsageError
+
+WINDOWS_PER_CALL = 8
+"""Bounds the memory of activations; the result does not depend on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One window, reconstructed.
+
+    Attributes:
+        window: which.
+        events: how many it has.
+        voxels: float32 [bins, H, W].
+        prediction: float32 [H, W], clamped to 0 .. 1.
+        camera: uint8 [H, W], the picture at the end of the window; where the window has none, the latest before it, or
+            None.
+        camera_time: of that picture, seconds.
+    """
+
+    window: Window
+    events: int
+    voxels: npt.NDArray[np.float32]
+    prediction: npt.NDArray[np.float32]
+    camera: npt.NDArray[np.uint8] | None
+    camera_time: float | None
+
+
+def reconstruct(
+    recording: Recording,
+    windows: Sequence[Window],
+    network: ReconstructionNetwork,
+    settings: VoxelSettings,
+    *,
+    device: str = "cpu",
+) -> Iterator[Step]:
+    """One step for each window, in order.
+
+    Raises:
+        UsageError: the network has another number of bins, events lie outside the sensor, or the output is not finite.
+    """
+    if network.bins != settings.bins:
+        raise UsageError(f"voxels of {settings.bins} bins, and the network takes {network.bins}")
+    network = network.to(device).eval()
+    state = None
+    for first in range(0, len(windows), WINDOWS_PER_CALL):
+        piece = windows[first : first + WINDOWS_PER_CALL]
+        counts, grids = [], []
+        for window in piece:
+            events = recording.events(window)
+            counts.append(len(events))
+            grids.append(voxel_grid(events, recording.size, settings, (window.begin, window.end)))
+        with torch.inference_mode():
+            pictures, state = network(torch.from_numpy(np.stack(grids))[None].to(device), state)
+        predictions = pictures[0, :, 0].float().cpu().numpy()
+        if not np.isfinite(predictions).all():
+            raise UsageError(
+                f"{recording.path}: the network gives values that are not finite in windows {first} to "
+                f"{first + len(piece) - 1}; are these its weights, and is its input normalised as in training?"
+            )
+        for window, count, grid, prediction in zip(piece, counts, grids, predictions.clip(0, 1), strict=True):
+            shown = window.target or _latest(recording.images, window.end)
+            yield Step(
+                window,
+                count,
+                grid,
+                prediction,
+                None if shown is None else recording.image(shown),
+                None if shown is None else shown.time,
+            )
+
+
+def _latest(images: Sequence[Image], time: float) -> Image | None:
+    """The last picture that is not later than ``time``."""
+    position = bisect.bisect_right(images, time, key=lambda image: image.time)
+    return images[position - 1] if position else None

@@ -1,0 +1,92 @@
+"""Scores as tables beside the paper's, and as flat records for ``--json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+
+from trainer.evaluation import paper
+from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.score import SequenceScore, mean_over_sequences
+
+TITLES = {
+    "mse": "MSE",
+    "ssim_range2": "SSIM (range 2)",
+    "ssim": "SSIM",
+    "lpips_alex": "LPIPS alex",
+    "lpips_squeeze": "LPIPS squeeze",
+    "lpips_vgg": "LPIPS vgg",
+}
+
+
+def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence[str]) -> Table:
+    """
+    Args:
+        data_set: the one whose scores these are.
+        scores: of its sequences.
+        compared: methods of :data:`trainer.evaluation.paper.RESULTS` to show below; shown where it has the data set.
+    """
+    means = mean_over_sequences(scores)
+    names = list(dict.fromkeys(name for score in scores for name in score.means))
+    made = Table(title=data_set.name, title_justify="left")
+    made.add_column("sequence", no_wrap=True)
+    made.add_column("frames", justify="right")
+    for name in names:
+        made.add_column(TITLES[name], justify="right")
+    for score in scores:
+        made.add_row(score.sequence, str(score.frames), *(_number(score.means, name) for name in names))
+    if not names:
+        return made
+    made.add_section()
+    whole = "" if len(scores) == len(data_set.cuts) else f" of {len(scores)} of {len(data_set.cuts)}"
+    made.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
+    for method in compared:
+        published = paper.RESULTS[method].get(data_set.name)
+        if published is not None:
+            made.add_row(f"paper: {method}", "", *(_number(published, name) for name in names), style="dim")
+    return made
+
+
+def _number(values: Mapping[str, float], name: str) -> str:
+    return f"{values[name]:.3f}" if name in values else "-"
+
+
+def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One flat record a sequence, and one a data set (``sequence`` null) with the mean over its sequences.
+
+    Args:
+        scores_by_set: scores by name of the data set.
+        settings: of the run; repeated in every record.
+    """
+    made: list[dict[str, Any]] = []
+    for name, scores in scores_by_set.items():
+        for score in scores:
+            made.append(
+                {
+                    "data_set": name,
+                    "sequence": score.sequence,
+                    "sequences": 1,
+                    "frames": score.frames,
+                    "events": score.events,
+                    "empty_windows": score.empty_windows,
+                    "repaired_images": score.repaired_images,
+                    **score.means,
+                    **settings,
+                }
+            )
+        made.append(
+            {
+                "data_set": name,
+                "sequence": None,
+                "sequences": len(scores),
+                "frames": sum(score.frames for score in scores),
+                "events": sum(score.events for score in scores),
+                "empty_windows": sum(score.empty_windows for score in scores),
+                "repaired_images": sum(score.repaired_images for score in scores),
+                **mean_over_sequences(scores),
+                **settings,
+            }
+        )
+    return made

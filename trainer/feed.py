@@ -1,0 +1,119 @@
+"""From the stream to the device: batches in order, moved while the device still works on the one before.
+
+On a GPU the copy runs on a stream of its own, from page-locked memory. Nothing has to be fetched ahead for that: the
+training loop only queues work, so it is here, with the next batch in its hands, long before the GPU is done.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterable, Iterator
+from itertools import islice
+
+import torch
+from torch.utils.data import DataLoader
+
+from trainer.config import TrainConfig
+from v2v_client import Batch, V2VStreamDataset
+from v2v_protocol.sample import LARGEST_SEED
+
+PREVIEW_SEED = 1 << 32
+"""Added to the seed: previews show the same virtual cameras throughout a run, and others than it trains on."""
+
+
+def stream(config: TrainConfig, address: str) -> V2VStreamDataset:
+    """What the run trains on.
+
+    Raises:
+        UsageError: a setting that no server could meet.
+    """
+    settings, loss = config.stream, config.loss
+    wants_flow = loss.temporal_weight > 0 and loss.flow == "stream"
+    return V2VStreamDataset(
+        address,
+        batch_size=settings.batch_size,
+        arrays=("voxels", "frames", "flow") if wants_flow else ("voxels", "frames"),
+        recipe=settings.resolved_recipe,
+        seed=settings.seed,
+        # The loss wants to know where each pixel was; the released code takes negated forward flow for that.
+        flow_direction="forward" if loss.temporal_as_published or not wants_flow else "backward",
+        flow_from=loss.temporal_first_step if wants_flow else 0,
+        timeout_seconds=settings.timeout_seconds,
+        **settings.spec,
+    )
+
+
+def preview_batch(config: TrainConfig, address: str) -> Iterator[Batch]:
+    """Yields the batch that previews show, on the CPU: the same one whenever the run is started again."""
+    dataset = V2VStreamDataset(
+        address,
+        batch_size=config.run.preview_samples,
+        recipe=config.stream.resolved_recipe,
+        seed=(config.stream.seed + PREVIEW_SEED) % (LARGEST_SEED + 1),
+        rank=0,
+        world_size=1,
+        timeout_seconds=config.stream.timeout_seconds,
+        **config.stream.spec,
+    )
+    return islice(dataset, 1)
+
+
+class Feed:
+    """Batches of a dataset on a device, epoch after epoch.
+
+    Args:
+        dataset: its epoch is set here; a state that was loaded into it counts.
+        device: where the tensors go.
+        loader_workers: processes that receive; 0: this one.
+
+    Attributes:
+        wait_seconds: time spent waiting for batches so far, copies not counted (they are queued, not waited for).
+    """
+
+    def __init__(self, dataset: V2VStreamDataset, device: torch.device, loader_workers: int = 0) -> None:
+        self._dataset = dataset
+        self._source: Iterable[Batch] = dataset
+        if loader_workers:
+            self._source = DataLoader(
+                dataset,
+                batch_size=None,
+                num_workers=loader_workers,
+                persistent_workers=True,
+                multiprocessing_context="spawn",  # a fork would take the threads' locks of this process with it
+                worker_init_fn=_leave_signals_to_the_trainer,
+            )
+        self._copies = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
+        self.wait_seconds = 0.0
+
+    def epochs(self, first: int, end: int) -> Iterator[Batch]:
+        """The batches of epochs ``first`` .. ``end - 1``."""
+        for epoch in range(first, end):
+            self._dataset.set_epoch(epoch)
+            batches = iter(self._source)
+            while (batch := self._timed(batches)) is not None:
+                yield batch if self._copies is None else _moved(batch, self._copies)
+
+    def _timed(self, batches: Iterator[Batch]) -> Batch | None:
+        began = time.perf_counter()
+        try:
+            return next(batches, None)
+        finally:
+            self.wait_seconds += time.perf_counter() - began
+
+
+def _moved(batch: Batch, copies: torch.cuda.Stream) -> Batch:
+    """The batch on the GPU; the copy is only queued, and whoever computes with it is made to wait for it there."""
+    with torch.cuda.stream(copies):
+        moved = batch.pin_memory().to(copies.device, non_blocking=True)
+    compute = torch.cuda.current_stream(copies.device)
+    compute.wait_stream(copies)
+    for tensor in moved.arrays.values():
+        # Its memory belongs to the copying stream; without this the allocator could give it away while it is read.
+        tensor.record_stream(compute)
+    return moved
+
+
+def _leave_signals_to_the_trainer(_worker: int) -> None:
+    """Ctrl-C reaches every process of a terminal; the training process decides what it means."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

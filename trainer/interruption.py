@@ -1,0 +1,99 @@
+"""A clean end on Ctrl-C, on SIGTERM, at a time limit or without a server: between two steps, on all ranks the same.
+
+The signal's handler only leaves a note, so no step is cut in half; but while the loop waits for data, which may take
+for ever (the same Ctrl-C reaches a server in the same terminal), the handler ends the wait.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator
+from types import FrameType
+from typing import TypeVar
+
+from v2v_protocol.errors import RemoteError, ServerLost
+
+Item = TypeVar("Item")
+
+_PATIENT_SIGNALS = 2
+"""torchrun passes on the Ctrl-C that its processes had from the terminal already; the next one is meant."""
+
+
+class _StopWaiting(BaseException):
+    """Leaves the wait for data. Not an Exception, so that nothing on the way takes it for an error."""
+
+
+class StopRequest:
+    """Whether the run shall end, from ``with`` on (in the main thread).
+
+    The third signal ends the process as if there were no handler.
+
+    Args:
+        seconds: end after this time; 0: no limit.
+        agree: turns the wish of this rank into that of any; called once per step by all ranks.
+
+    Attributes:
+        signal: number of the first signal that came; 0 without one.
+        failure: why the data ended, where it did not end by itself; to be raised once everything is saved.
+    """
+
+    def __init__(self, seconds: float = 0.0, agree: Callable[[bool], bool] = bool) -> None:
+        self.signal = 0
+        self.failure: ServerLost | RemoteError | None = None
+        self._count = 0
+        self._waiting = False
+        self._agree = agree
+        self._deadline = time.monotonic() + seconds if seconds else None
+
+    def __enter__(self) -> StopRequest:
+        self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        self.signal = self.signal or number
+        self._count += 1
+        if self._count > _PATIENT_SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        if self._waiting:
+            self._waiting = False  # raises once: what follows on the way out must not be cut short
+            raise _StopWaiting
+
+    @property
+    def wanted(self) -> bool:
+        """This rank wants to end."""
+        if self.signal or self.failure is not None:
+            return True
+        return self._deadline is not None and time.monotonic() >= self._deadline
+
+    def next(self, items: Iterator[Item]) -> Item | None:
+        """The next item; None at the end, or when a signal came while waiting for it."""
+        try:
+            try:
+                self._waiting = True
+                return next(items, None)
+            finally:
+                self._waiting = False
+        except _StopWaiting:
+            return None
+
+    def until(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items, up to the end or to the first one before which any rank wants to stop or has no server.
+
+        All ranks must have equally many.
+        """
+        iterator = iter(items)
+        while True:
+            item = None
+            try:
+                item = None if self.wanted else self.next(iterator)
+            except (ServerLost, RemoteError) as error:
+                self.failure = error
+            if self._agree(self.wanted) or item is None:
+                return
+            yield item

@@ -1,0 +1,153 @@
+"""``v2v-train``: train a reconstruction network on the stream.
+
+    v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid
+    v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4
+    torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555
+
+Without an address it starts a server of its own. Ctrl-C and SIGTERM end the run after the present step and save it; the
+third one ends it at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import torch
+
+from trainer.checkpoint import load_checkpoint
+from trainer.config import StreamConfig
+from trainer.config_file import load_config, shipped
+from trainer.distributed import Ranks, ranks
+from trainer.interruption import StopRequest
+from trainer.learner import build
+from trainer.loop import Diverged, train
+from trainer.resume import LAST, require_fresh, require_same_run
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import UsageError, V2VError
+
+SIGNAL_STATUS = 128
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="v2v-train",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Exit status: 0 trained to the end, 1 diverged, 2 wrong usage, input or no server, 128 + N ended and "
+        f"saved after signal N.\nShipped configurations: {', '.join(shipped())}.",
+    )
+    parser.add_argument("config", metavar="CONFIG.yaml", help="a file, or the name of a shipped configuration")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--connect", metavar="ADDRESS", help="of a running server (stream.address)")
+    source.add_argument("--videos", metavar="DIR", help="start a server on these videos (stream.videos)")
+    parser.add_argument("--workers", type=int, metavar="N", help="of the started server (stream.workers)")
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="change one key, repeatable"
+    )
+    parser.add_argument("--resume", metavar="FILE", help="checkpoint to go on from")
+    parser.add_argument("--out", metavar="DIR", help="folder of the run (run.out; default runs/NAME of the config)")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
+
+
+def _settings(arguments: argparse.Namespace) -> list[str]:
+    """The flags as settings, behind the ones that were typed."""
+    given = {
+        "stream.address": "" if arguments.videos else arguments.connect,
+        "stream.videos": arguments.videos,
+        "stream.workers": arguments.workers,
+        "run.out": arguments.out,
+    }
+    flags = [f"{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
+    return [*arguments.settings, *flags]
+
+
+@contextmanager
+def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
+    """The address to connect to; of a server of our own, for as long as the block lasts, where none is configured.
+
+    Raises:
+        UsageError: nothing to serve, on any rank; ServerLost: the server does not come up.
+    """
+    if stream.address:
+        yield stream.address
+        return
+    if not stream.videos:
+        raise UsageError("stream.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
+    if mine.hosts > 1:
+        raise UsageError("ranks on several hosts: start v2v-serve yourself and give all of them --connect ADDRESS")
+    if not mine.first:
+        address, error = mine.from_first(None)
+        if error:
+            raise UsageError(f"rank 0 could not start a server: {error}")
+        yield address
+        return
+    with ExitStack() as stack:
+        try:
+            server = LocalServer(stream.videos, workers=stream.workers, flags=_server_flags(stream))
+            stack.enter_context(server)
+        except V2VError as error:
+            mine.from_first(("", str(error)))
+            raise
+        mine.from_first((server.address, ""))
+        yield server.address
+
+
+def _server_flags(stream: StreamConfig) -> list[str]:
+    # A server looks at its own recipe to say which videos are long enough, so it is given ours.
+    recipe = stream.resolved_recipe.to_dict().items()
+    flags = [text for key, value in recipe for text in ("--set", f"{key}={json.dumps(value)}")]
+    return ["--rows", stream.rows, *flags, *(("--list", stream.list) if stream.list else ())]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """One run; returns the exit status.
+
+    Raises:
+        V2VError: of the configuration, of what :func:`trainer.learner.build` reads, or of :func:`trainer.loop.train`.
+    """
+    config = load_config(arguments.config, _settings(arguments))
+    out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
+    resume = None
+    if arguments.resume is None:
+        require_fresh(out)
+    else:
+        resume = load_checkpoint(arguments.resume)
+        for change in require_same_run(resume, config):
+            print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)
+    if config.compute.threads:
+        torch.set_num_threads(config.compute.threads)
+    with ranks(config.compute.device) as mine:
+        learner = build(config, mine)
+        with serving(config.stream, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
+            steps = train(config, learner, address, mine, stop, out, resume)
+        if mine.first:
+            why = f"ended by signal {stop.signal}" if stop.signal else "done"
+            print(f"{why} after step {steps}: {out / LAST}")
+    return SIGNAL_STATUS + stop.signal if stop.signal else 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return run(arguments)
+    except V2VError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        print(f"v2v-train: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1 if isinstance(error, Diverged) else 2
+    except KeyboardInterrupt:
+        print("v2v-train: interrupted before the first step", file=sys.stderr)
+        return SIGNAL_STATUS + signal.SIGINT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

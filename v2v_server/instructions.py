@@ -1,0 +1,60 @@
+"""What the dispatcher wants done. Whoever has the sockets, the processes and the disk carries it out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from v2v_protocol.messages import ErrorCode, Refused
+from v2v_protocol.wire import Frames, encode
+from v2v_server.leases import Task
+from v2v_server.quarantine import Verdict
+
+_LONGEST_TEXT = 2000
+"""Characters of a refusal: it quotes what the peer sent, which may be long, and must itself fit a header."""
+
+
+@dataclass(frozen=True, slots=True)
+class ToConsumer:
+    """Send these frames to a consumer."""
+
+    identity: bytes
+    frames: Sequence[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ToWorker:
+    """Send these frames to a worker."""
+
+    identity: bytes
+    frames: Frames
+
+
+@dataclass(frozen=True, slots=True)
+class GiveUp:
+    """This worker hangs: end its process where that is in our power, and report its loss."""
+
+    identity: bytes
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Write this verdict down before anything that follows is sent, and report what came of it.
+
+    Attributes:
+        verdict: not numbered yet.
+        task: whose candidate it refuses.
+    """
+
+    verdict: Verdict
+    task: Task
+
+
+Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record
+
+
+def refusal(code: ErrorCode, text: str) -> Frames:
+    """A Refused message that is short enough whatever the text quotes."""
+    return encode(Refused(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))

@@ -1,0 +1,89 @@
+"""Which arithmetic a clip needs: float32 where that is exact enough, float64 beyond, a refusal beyond that.
+
+Error of the kernel. Let u be the unit roundoff (2**-24 in float32, 2**-53 in float64) and D the largest |dL| that a
+step can make: the larger threshold (residual) + the range of the log intensity + the largest noise + the largest drift
+of a hot pixel. One step of ``pixel.py`` rounds, to first order, by at most
+
+    change of level, + noise              u (range) + u (range + noise)
+    scale of the noise, its product       2 u noise
+    drift, its scale, product, + residual u (residual + 5 drift)
+    potential                             u D
+    threshold * count                     u D             (subtracting it is exact, by Sterbenz' lemma)
+
+together no more than 7 u D. The start of the residual, one more such step, and the log intensities, rounded to u |L| at
+either end, come once (those of the frames between cancel). So after n steps residual and events together are off by
+
+    8 u ((n + 1) D + |L|)  =  8 u * threshold * most_events        (``v2v_protocol.recipe.most_events``)
+
+at most, where the 8 has room for the terms of second order. Float32 is used up to 2**20 events, float64 up to 2**49:
+then the error stays below half the smaller threshold in either, over the whole clip and not only over a step, and the
+count of a bin is exact, being below 2**24 or 2**53.
+
+Everything here is sums, products and correctly rounded roots: every host comes to the same decision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import LARGEST_EVENTS
+
+AUTO = "auto"
+Real = type[np.floating[Any]]
+LIMITS: dict[str, tuple[Real, float]] = {"float32": (np.float32, 2.0**20), "float64": (np.float64, LARGEST_EVENTS)}
+"""Most events a pixel may fire in a clip, by arithmetic; narrowest first."""
+THRESHOLD_ENDS = (2.0**-100, 2.0**100)
+"""Thresholds between these neither overflow nor lose digits to underflow, in either arithmetic."""
+
+
+def choose(asked: str, events: float) -> Real:
+    """The arithmetic for a clip.
+
+    Args:
+        asked: "auto" for the narrowest that is exact enough, or the name of one.
+        events: ``most_events`` of the clip.
+
+    Raises:
+        UsageError: no such arithmetic, or the clip is beyond the limit of the one asked for, of all with "auto".
+    """
+    if asked != AUTO and asked not in LIMITS:
+        raise UsageError(f"precision {asked!r}: choose one of {AUTO}, {', '.join(LIMITS)}")
+    for name, (real, limit) in LIMITS.items():
+        if asked in (AUTO, name) and events <= limit:
+            return real
+    name = "float64" if asked == AUTO else asked
+    raise UsageError(
+        f"a pixel of this clip may fire {events:.4g} events; {name} counts at most {LIMITS[name][1]:.4g} exactly: "
+        "raise the thresholds, lower noise or hot pixels, take fewer frames"
+        + (", or precision='auto'" if name == "float32" else "")
+    )
+
+
+def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
+    """Refuses thresholds that a float32 cannot work with.
+
+    Raises:
+        UsageError: one is outside THRESHOLD_ENDS.
+    """
+    low, high = THRESHOLD_ENDS
+    for name, value in (("threshold_pos", threshold_pos), ("threshold_neg", threshold_neg)):
+        if not low <= value <= high:
+            raise UsageError(f"{name} = {value!r}: give a number from {low:.3g} to {high:.3g}")
+
+
+def error_bound(real: Real, events: float, smaller_threshold: float) -> float:
+    """By how much (log units) events and residual of a pixel may miss the change and noise they came from."""
+    return 4.0 * float(np.finfo(real).eps) * events * smaller_threshold
+
+
+def noise_sum(noise_sigma: float, hot_pixel_sigma: float, step_seconds: npt.NDArray[np.float64]) -> float:
+    """The standard deviations of noise and hot drift, summed over the steps, log units."""
+    first = float(step_seconds[0])
+    if (step_seconds == first).all():
+        return len(step_seconds) * (noise_sigma * math.sqrt(first) + hot_pixel_sigma * first)
+    return noise_sigma * math.fsum(np.sqrt(step_seconds)) + hot_pixel_sigma * math.fsum(step_seconds)
