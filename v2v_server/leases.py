@@ -64,7 +64,6 @@ class _Lease:
     task: Task | None  # None: answered, or its consumer is gone; but the worker still has to get through it
     worker: bytes
     deadline: float
-    clip: tuple[bytes, int, int, int]
     begun_at: float | None = None
 
 
@@ -87,8 +86,12 @@ class LeaseBook:
         return len(self._leases)
 
     def held_by(self, worker: bytes) -> int:
-        """Clips that this worker has to decode for the leases that are out to it."""
-        return len({self._leases[number].clip for number in self._held.get(worker, ())})
+        """Clips that this worker has to decode for the leases that are out to it.
+
+        Of those that nobody waits for any more each counts, lest a clip that is asked for anew hides behind an old one.
+        """
+        tasks = [self._leases[number].task for number in self._held.get(worker, ())]
+        return len({task.clip for task in tasks if task is not None}) + tasks.count(None)
 
     def tasks_of(self, worker: bytes) -> Iterator[Task]:
         """The tasks that this worker holds and somebody still waits for."""
@@ -106,7 +109,7 @@ class LeaseBook:
         """Gives the task to a worker; returns the number of the lease."""
         number = self._next
         self._next += 1
-        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds, task.clip)
+        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
         self._held.setdefault(worker, []).append(number)
         self._out.setdefault(task.sample, []).append(number)
         return number

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import hypothesis.strategies as st
 from hypothesis import settings
@@ -20,6 +20,7 @@ class Interleaving(RuleBasedStateMachine):
     """Whatever happens in whatever order, once healthy workers are left to finish, every index that a consumer waits
     for has been answered exactly once, and nothing that was said to nobody is left."""
 
+    spec: Mapping[str, int] = {}
     consumers = st.sampled_from((b"c", b"d"))
     names = st.sampled_from((b"w1", b"w2", b"w3", b"w4"))
 
@@ -84,7 +85,9 @@ class Interleaving(RuleBasedStateMachine):
         """Connects, or connects again and asks again for what it still lacks, as far as its new credit goes."""
         self.seed[identity] = self.seed.get(identity, 0) + 1
         snapshot = None if pinned is None else min(pinned, self.at.quarantine.latest)
-        welcome = self.at.hello(identity, batch_size=batch_size, seed=self.seed[identity], quarantine=snapshot)
+        welcome = self.at.hello(
+            identity, batch_size=batch_size, seed=self.seed[identity], quarantine=snapshot, **self.spec
+        )
         assert welcome.quarantine == (self.at.quarantine.latest if snapshot is None else snapshot)
         self.credit[identity] = welcome.credit
         self._listen()
@@ -235,7 +238,7 @@ class Interleaving(RuleBasedStateMachine):
         if at is None:
             return
         for held in at.leases.values():
-            assert len(held) <= CREDIT
+            assert len(held) <= CREDIT * self.spec.get("samples_per_decode", 1)
         assert {session.identity for session in at.dispatcher.sessions} == set(self.owed)
         for session in at.dispatcher.sessions:
             assert session.unanswered == self.owed[session.identity]
@@ -283,10 +286,20 @@ TestInterleaving = Interleaving.TestCase
 TestInterleaving.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
 
 
+class OfSiblings(Interleaving):
+    """The same with two samples of each decode, neighbours but one."""
+
+    spec = {"samples_per_decode": 2, "sibling_spacing": 2}  # noqa: RUF012
+
+
+TestInterleavingOfSiblings = OfSiblings.TestCase
+TestInterleavingOfSiblings.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+
+
 # --- long walks -------------------------------------------------------------------------------------------------------
 
 
-def walk(seed: int, steps: int) -> Counter[str]:
+def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Counter[str]:
     """The same rules in a drawn order that keeps the server at work, so that rare states are reached.
 
     Returns:
@@ -294,7 +307,7 @@ def walk(seed: int, steps: int) -> Counter[str]:
     """
     draw = random.Random(seed)
     names = (b"w1", b"w2", b"w3", b"w4")
-    model = Interleaving()
+    model = kind()
     lethal = {"v0.mp4": draw.choice(list(Cause)), "v1.mp4": draw.choice((Cause.UNEXPLAINED, Cause.HUNG))}
     model.start(set(draw.sample(names, draw.randrange(3))), lethal)
     seen: Counter[str] = Counter()
@@ -337,5 +350,7 @@ def test_long_walks_reach_what_is_rare_and_keep_the_promise() -> None:
     seen: Counter[str] = Counter()
     for seed in range(24):
         seen += walk(seed, 150)
+    for seed in range(8):
+        seen += walk(seed, 150, OfSiblings)
     least = {"lone at work": 10, "lone waiting": 3, "twins": 5, "verdicts": 20, "samples": 500}
     assert {state: seen[state] for state in least if seen[state] < least[state]} == {}
