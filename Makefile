@@ -9,7 +9,7 @@ CLIPS := .demo/videos
 .PHONY: help demo test test-slow test-old-numpy check format clean
 
 help:
-	@echo "make demo            stream real clips through a server into a dataset; leaves out/demo.png"
+	@echo "make demo            stream real clips through a server into a dataset, train on them; leaves out/*.png"
 	@echo "make test            the fast tests (under five minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
 	@echo "make test-old-numpy  golden bytes of samples under an older numpy"

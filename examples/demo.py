@@ -19,6 +19,7 @@ from v2v_server.picture import Row, draw_rows, write_png
 
 _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2
+_SHOWN = 6
 _VOXELS_PER_CLIP = 10
 _CONFIGURATION = "tiny-cpu"
 
@@ -55,28 +56,25 @@ def main() -> int:
 
 def _stream(address: str, seconds: float, workers: int, picture: Path) -> None:
     # The demo's clips are short: 10 voxel grids need 51 frames, the paper's 40 need 201.
-    dataset = V2VStreamDataset(
-        address, batch_size=_BATCH_SIZE, recipe={"preset": "paper", "voxels_per_clip": _VOXELS_PER_CLIP}
-    )
-    shown: list[Row] = []
-    batches, started = 0, 0.0
+    recipe = {"preset": "paper", "voxels_per_clip": _VOXELS_PER_CLIP}
+    dataset = V2VStreamDataset(address, batch_size=_BATCH_SIZE, recipe=recipe)
+    batches, started, last = 0, 0.0, ""
     while not batches or time.monotonic() - started < seconds:
         for batch in dataset:
-            if len(shown) < 6:
-                shown += _rows(batch)
-            batches += 1
+            batches, last = batches + 1, repr(batch)
             if batches == _WARMUP_BATCHES:
                 started = time.monotonic()
     elapsed = time.monotonic() - started
 
     counted = batches - _WARMUP_BATCHES
-    print(f"last batch: {batch}")
+    print(f"last batch: {last}")
     print(
         f"{counted / elapsed:.2f} batches/s ({counted * _BATCH_SIZE / elapsed:.1f} samples/s) over {elapsed:.1f} s "
         f"with {workers} workers; batches of {_BATCH_SIZE} clips of {_VOXELS_PER_CLIP} voxel grids, "
         f"first {_WARMUP_BATCHES} batches left out"
     )
-    write_png(picture, draw_rows(shown[:6]))
+    with_flow = V2VStreamDataset(address, _SHOWN, ("voxels", "frames", "flow"), recipe)
+    write_png(picture, draw_rows(_rows(next(iter(with_flow)))))
     print(f"picture: {picture}")
 
 
@@ -87,7 +85,9 @@ def _rows(batch: Batch) -> list[Row]:
     for number in range(len(batch)):
         voxels, frames = arrays["voxels"][number], arrays["frames"][number]
         pick = int(abs(voxels.astype("int32")).sum(axis=(1, 2, 3)).argmax())
-        rows.append(Row(frames[pick, 0], voxels[pick], batch.provenance[number], f"voxel {pick}"))
+        rows.append(
+            Row(frames[pick, 0], voxels[pick], batch.provenance[number], f"voxel {pick}", arrays["flow"][number, pick])
+        )
     return rows
 
 
