@@ -70,7 +70,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         preset: speed against accuracy: "exact", "balanced" or "fast" (:data:`v2v_protocol.spec.SPEED_PRESETS`); the
             options below may change what it sets.
         voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
-            flow_*: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
+            flow_*, scene: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
 
@@ -117,6 +117,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         flow_direction: str | None = None,
         flow_from: int | None = None,
         flow_margin_px: int | None = None,
+        scene: str | None = None,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
     ) -> None:
@@ -142,6 +143,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             flow_direction=flow_direction,
             flow_from=flow_from,
             flow_margin_px=flow_margin_px,
+            scene=scene,
         )
         self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)

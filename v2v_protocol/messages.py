@@ -218,6 +218,7 @@ class Lease:
         refusals: candidates passed over before, as ``Refusal`` fields: {"refusals": [...]}.
         deadline_seconds: a worker silent for longer than this is taken for hung.
         quarantine: number of the quarantine snapshot that let the candidate pass.
+        scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.
     """
 
     lease: int
@@ -242,6 +243,7 @@ class Lease:
     refusals: Mapping[str, Any]
     deadline_seconds: float
     quarantine: int = 0
+    scene: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

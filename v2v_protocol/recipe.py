@@ -13,6 +13,9 @@ The pixel model (section 3 of the paper), per pixel, with F in 0..255:
     N-    = max(0, floor(-dL(t) / threshold_neg))
     residual(t) = dL(t) - threshold_pos N+ + threshold_neg N-
     V(bin)     += N+ - N-
+
+Effects beyond it (mismatch, shot noise, leak, refractory period, low-pass, dead pixels) are off in ``paper``; their
+equations and sources are in ``docs/effects.md``.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ Range = tuple[float, float]
 _LARGEST_FRAMES = 1_000_001
 LARGEST_SCALE = 100.0
 _LARGEST_SIDE_PX = 16_384
+SMALLEST_PHOTORECEPTOR_HZ = 0.01
+SMALLEST_THRESHOLD_SHARE = 0.25
+"""No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
 LARGEST_EVENTS = 2.0**49
@@ -75,6 +81,14 @@ class Recipe:
         hot_pixel_sigma: standard deviation of a hot pixel's constant drift, log units per frame, or per second.
         noise_unit: "frame" or "second": the time base of noise_sigma and hot_pixel_sigma.
 
+    Effects beyond the paper's model; zero is off
+        threshold_mismatch_sigma: standard deviation of each pixel's thresholds, as a share of the nominal ones.
+        shot_noise_hz: noise events of a black pixel, a second, both polarities together; a white one has a quarter.
+        leak_hz: positive events a second that every pixel fires by itself.
+        refractory_seconds: how long a pixel is blind after an event.
+        photoreceptor_hz: corner frequency of a white pixel's low-pass; 0 is none at all, so no range begins there.
+        dead_pixel_share: share of the crop's pixels that never fire.
+
     Raises:
         RecipeError: a value is outside its limits; the message names the field, the value and the limit.
     """
@@ -107,6 +121,13 @@ class Recipe:
     hot_pixel_sigma: Range = (0.0, 10.0)
     noise_unit: str = "frame"
 
+    threshold_mismatch_sigma: Range = (0.0, 0.0)
+    shot_noise_hz: Range = (0.0, 0.0)
+    leak_hz: Range = (0.0, 0.0)
+    refractory_seconds: Range = (0.0, 0.0)
+    photoreceptor_hz: Range = (0.0, 0.0)
+    dead_pixel_share: Range = (0.0, 0.0)
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = _coerced(field.name, getattr(self, field.name), field.default)
@@ -119,6 +140,12 @@ class Recipe:
         for name, words in _CHOICES.items():
             if getattr(self, name) not in words:
                 raise RecipeError(f"recipe {name} = {getattr(self, name)!r}: choose one of {', '.join(words)}")
+        lowest, highest = self.photoreceptor_hz
+        if highest > 0.0 and lowest < SMALLEST_PHOTORECEPTOR_HZ:
+            raise RecipeError(
+                f"recipe photoreceptor_hz = {_shown(self.photoreceptor_hz)}: give 0 for no low-pass, or a range from "
+                f"{SMALLEST_PHOTORECEPTOR_HZ} upwards"
+            )
         if self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
@@ -132,6 +159,21 @@ class Recipe:
                 f"{self.noise_sigma[1]:.4g}, hot_pixel_sigma {self.hot_pixel_sigma[1]:.4g}, {self.steps} steps): raise "
                 "threshold or threshold_ratio, lower noise_sigma or hot_pixel_sigma, or make the clip shorter"
             )
+
+    @property
+    def has_effects(self) -> bool:
+        """True where a draw may switch on an effect beyond the paper's model."""
+        return self.timed_effects or self.threshold_mismatch_sigma[1] > 0.0 or self.dead_pixel_share[1] > 0.0
+
+    @property
+    def timed_effects(self) -> bool:
+        """True where a draw may switch on an effect that is stated in Hz or seconds."""
+        return max(self.shot_noise_hz[1], self.leak_hz[1], self.refractory_seconds[1], self.photoreceptor_hz[1]) > 0.0
+
+    @property
+    def needs_seconds(self) -> bool:
+        """True where a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
+        return self.noise_unit == "second" or self.timed_effects
 
     @property
     def steps(self) -> int:
@@ -163,12 +205,14 @@ class Recipe:
 
     @property
     def most_events(self) -> float:
-        """:func:`most_events` of the worst draw; with ``noise_unit`` "second", at one frame a second."""
-        smallest, largest = self.smallest_and_largest_threshold
-        sigma = self.noise_sigma[1] * (largest if self.noise_scales_with_threshold else 1.0)
+        """:func:`most_events` of the worst draw; what is stated per second, at one frame a second."""
+        smallest, largest = pixel_thresholds(*self.smallest_and_largest_threshold, self.threshold_mismatch_sigma[1])
+        nominal = self.smallest_and_largest_threshold[1]
+        sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
         ends = math.log(self.log_eps), math.log1p(self.log_eps)
-        return most_events(self.steps, ends, (smallest, largest), self.steps * (sigma + hot))
+        leak = self.leak_hz[1] * largest
+        return most_events(self.steps, ends, (smallest, largest), self.steps * (sigma + hot + leak))
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as plain values (ranges as lists), in a stable order."""
@@ -204,6 +248,12 @@ class Recipe:
         return dataclasses.replace(self, **changes)
 
 
+def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
+    """Ends of what any pixel's threshold can be, for nominal ones between two values."""
+    spread = LARGEST_NORMAL * mismatch_sigma
+    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
+
+
 def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
     """An upper bound of the events that one pixel can fire in a clip, and the measure of the arithmetic it needs.
 
@@ -214,12 +264,20 @@ def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[flo
         steps: differences between frames.
         log_ends: smallest and largest log intensity L.
         thresholds: smallest and largest contrast threshold, log units.
-        noise_sum: standard deviations of noise and of hot drift, summed over the steps, log units.
+        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
     """
     low, high = log_ends
     change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
     return (change + max(abs(low), abs(high))) / min(thresholds)
 
+
+LIMITS_OF_EFFECTS: dict[str, tuple[float, float]] = {
+    "threshold_mismatch_sigma": (0.0, 1.0),
+    "shot_noise_hz": (0.0, 1e4),
+    "leak_hz": (0.0, 1e4),
+    "refractory_seconds": (0.0, 1e3),
+    "photoreceptor_hz": (0.0, 1e6),
+}
 
 _LIMITS: dict[str, tuple[float, float]] = {
     "voxels_per_clip": (1, 1_000_000),
@@ -243,6 +301,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "noise_sigma": (0.0, 1e6),
     "hot_pixel_share": (0.0, 1.0),
     "hot_pixel_sigma": (0.0, 1e9),
+    **LIMITS_OF_EFFECTS,
+    "dead_pixel_share": (0.0, 1.0),
 }
 
 _CHOICES: dict[str, tuple[str, ...]] = {
@@ -314,7 +374,25 @@ PRESETS: dict[str, Recipe] = {
     "noise-free": Recipe(
         noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), hot_pixel_sigma=(0.0, 0.0), pause_probability=0.0
     ),
-}
+    # What v2e (Hu et al. 2021) calls `clean`: thresholds 0.2 with a deviation of 0.02, nothing else.
+    "clean": Recipe(
+        threshold=(0.2, 0.2), threshold_ratio=(1.0, 1.0), threshold_mismatch_sigma=(0.1, 0.1),
+        noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), hot_pixel_sigma=(0.0, 0.0),
+    ),
+    # A DAVIS346 in ordinary light; where each value comes from is told in docs/effects.md.
+    "davis346": Recipe(
+        # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
+        threshold=(0.134, 0.405),
+        threshold_mismatch_sigma=(0.1, 0.25),  # 2.1 % of contrast (Lichtsteiner et al. 2008); 0.05 of 0.2 (v2e `noisy`)
+        shot_noise_hz=(0.0, 5.0),  # up to v2e's `noisy`
+        leak_hz=(0.05, 0.2),  # around v2e's 0.1; the width is a guess
+        refractory_seconds=(1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
+        photoreceptor_hz=(30.0, 300.0),  # v2e's `noisy` and its default
+        dead_pixel_share=(0.0, 1e-4),  # a guess
+        # Shot noise takes the place of the paper's noise; hot pixels of up to about a hundred events a second: a guess.
+        noise_sigma=(0.0, 0.0), noise_unit="second", hot_pixel_share=(0.0, 5e-4), hot_pixel_sigma=(0.0, 20.0),
+    ),
+}  # fmt: skip
 
 
 def preset(name: object) -> Recipe:

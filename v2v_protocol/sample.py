@@ -52,6 +52,39 @@ class SampleId:
 
 
 @dataclass(frozen=True, slots=True)
+class Effects:
+    """What a camera does beyond the paper's pixel model, one draw; zero is off. Equations: ``docs/effects.md``.
+
+    Attributes:
+        threshold_mismatch_sigma: standard deviation of a pixel's thresholds, as a share of the nominal ones.
+        shot_noise_hz: events a second of a black pixel, both polarities together.
+        leak_hz: positive events a second of every pixel.
+        refractory_seconds: how long a pixel is blind after an event.
+        photoreceptor_hz: corner frequency of a white pixel's low-pass; 0.0 for none.
+        dead_pixel_count: pixels of the crop that never fire.
+    """
+
+    threshold_mismatch_sigma: float = 0.0
+    shot_noise_hz: float = 0.0
+    leak_hz: float = 0.0
+    refractory_seconds: float = 0.0
+    photoreceptor_hz: float = 0.0
+    dead_pixel_count: int = 0
+
+    @property
+    def need_seconds(self) -> bool:
+        """True where the time between frames has to be known."""
+        return any((self.shot_noise_hz, self.leak_hz, self.refractory_seconds, self.photoreceptor_hz))
+
+    def __bool__(self) -> bool:
+        """True where any effect is on."""
+        return self.need_seconds or any((self.threshold_mismatch_sigma, self.dead_pixel_count))
+
+
+NO_EFFECTS = Effects()
+
+
+@dataclass(frozen=True, slots=True)
 class SampleParams:
     """One draw from a recipe.
 
@@ -66,6 +99,7 @@ class SampleParams:
         flip: True mirrors left and right.
         contrast: the degrade scale s, or 0.0 when the picture is left alone.
         noise_key: four 32-bit words that key every per-pixel random number of this sample.
+        effects: what the camera does beyond the paper's pixel model.
     """
 
     threshold_pos: float
@@ -80,6 +114,7 @@ class SampleParams:
     flip: bool
     contrast: float
     noise_key: tuple[int, int, int, int]
+    effects: Effects = NO_EFFECTS
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
         """Which decoded frame each position of the clip shows.
@@ -94,8 +129,11 @@ class SampleParams:
         return np.cumsum(advance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for the provenance."""
-        return dataclasses.asdict(self)
+        """Plain values for the provenance; ``effects`` only where there are any."""
+        values = dataclasses.asdict(self)
+        if not self.effects:
+            del values["effects"]
+        return values
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +167,7 @@ class Provenance:
             average rate there).
         decoder: codec name, and whether its decoding is bit-exact on every host.
         quarantine: number of the quarantine snapshot it was made under.
+        scene: what was decided by the statistics of its scene, and the figures behind it; empty with scene "off".
     """
 
     id: SampleId
@@ -142,10 +181,14 @@ class Provenance:
     irregular_timestamps: int
     decoder: str
     quarantine: int = 0
+    scene: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as they travel in the sample's header."""
-        return dataclasses.asdict(self)
+        """Plain values, as they travel in the sample's header; ``scene`` only where there is something to say."""
+        values = dataclasses.asdict(self) | {"params": self.params.to_dict()}
+        if not self.scene:
+            del values["scene"]
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
@@ -159,6 +202,7 @@ class Provenance:
             params = dict(rest.pop("params"))
             params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
+            params["effects"] = Effects(**params.get("effects", {}))
             return cls(
                 id=SampleId(**rest.pop("id")),
                 refusals=tuple(Refusal(**item) for item in rest.pop("refusals")),

@@ -14,13 +14,14 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe, preset
 
 FLOW_METHODS = (
-    "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-1", "dis-fast-1-stride-6",
-    "dis-medium", "dis-medium-0",
+    "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-lean", "dis-fast-1",
+    "dis-fast-1-stride-6", "dis-medium", "dis-medium-0",
     "farneback", "sparse-to-dense", "deepflow",
 )  # fmt: skip
 FLOW_DIRECTIONS = ("forward", "backward")
 LARGEST_FLOW_MARGIN_PX = 16_384
 MOST_SAMPLES_PER_DECODE = 32
+SCENES = ("off", "auto")
 VOXEL_DTYPES = ("int8", "int16", "float32")
 LOOP_FILTERS = ("exact", "skip-unreferenced", "skip")
 ON_BAD_VIDEO = ("substitute", "raise")
@@ -53,6 +54,8 @@ class StreamSpec:
         flow_direction: "forward", on the grid of a step's earlier frame, or "backward", on that of the later one.
         flow_from: flow of the voxels before this one is not computed but zero.
         flow_margin_px: flow is estimated on the crop and this much of the picture around it; -1: on all of it.
+        scene: "off" treats all clips alike; "auto" leaves out sequences with a cut or with nothing to see, and chooses
+            the flow of each step where ``flow_method`` is "auto", both by statistics that the catalogue must have.
 
     Raises:
         UsageError: a value outside its choices or limits.
@@ -70,6 +73,7 @@ class StreamSpec:
     flow_direction: str = "forward"
     flow_from: int = 0
     flow_margin_px: int = 64
+    scene: str = "off"
 
     def __post_init__(self) -> None:
         _choose("voxel_dtype", self.voxel_dtype, VOXEL_DTYPES)
@@ -77,6 +81,7 @@ class StreamSpec:
         _choose("loop_filter", self.loop_filter, LOOP_FILTERS)
         _choose("flow_method", self.flow_method, FLOW_METHODS)
         _choose("flow_direction", self.flow_direction, FLOW_DIRECTIONS)
+        _choose("scene", self.scene, SCENES)
         _whole("flow_from", self.flow_from, 0, self.recipe.voxels_per_clip)
         _whole("flow_margin_px", self.flow_margin_px, -1, LARGEST_FLOW_MARGIN_PX)
         if not isinstance(self.shuffle, bool):
@@ -157,9 +162,9 @@ def _digest(spec: StreamSpec) -> str:
 SPEED_PRESETS: dict[str, dict[str, Any]] = {
     "exact": {"samples_per_decode": 1, "loop_filter": "exact"},
     "balanced": {"samples_per_decode": 2, "loop_filter": "exact"},
-    "fast": {"samples_per_decode": 4, "loop_filter": "skip-unreferenced"},
+    "fast": {"samples_per_decode": 4, "loop_filter": "exact"},
 }
-"""What speed is bought with: the fields of the spec that each preset sets."""
+"""What speed is bought with: the fields of the spec that each preset sets. `docs/accuracy.md` says why these."""
 
 
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:

@@ -14,8 +14,17 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import PRESETS
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec import FLOW_DIRECTIONS, FLOW_METHODS, LOOP_FILTERS, ON_BAD_VIDEO, SPEED_PRESETS, VOXEL_DTYPES
+from v2v_protocol.spec import (
+    FLOW_DIRECTIONS,
+    FLOW_METHODS,
+    LOOP_FILTERS,
+    ON_BAD_VIDEO,
+    SCENES,
+    SPEED_PRESETS,
+    VOXEL_DTYPES,
+)
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
+from v2v_server.process import choose_compile_cache
 
 
 def serve(argv: Sequence[str] | None = None) -> None:
@@ -69,6 +78,7 @@ def worker(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
 
     def run(arguments: argparse.Namespace) -> None:
+        choose_compile_cache()
         from v2v_server.worker import run_worker
 
         run_worker(
@@ -95,6 +105,7 @@ def simulate(argv: Sequence[str] | None = None) -> None:
     _add_spec(parser)
 
     def run(arguments: argparse.Namespace) -> None:
+        choose_compile_cache()
         from v2v_server.remake import simulate_to_file
 
         simulate_to_file(
@@ -124,7 +135,7 @@ def new_parser(name: str, description: str) -> argparse.ArgumentParser:
 _SPEC_FLAGS = (
     "preset", "voxel_dtype", "shuffle", "max_sequences_per_video", "on_bad_video",
     "loop_filter", "samples_per_decode", "sibling_spacing",
-    "flow_method", "flow_direction", "flow_from", "flow_margin_px",
+    "flow_method", "flow_direction", "flow_from", "flow_margin_px", "scene",
 )  # fmt: skip
 
 
@@ -152,6 +163,9 @@ def _add_spec(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flow-direction", choices=FLOW_DIRECTIONS, help="default forward")
     parser.add_argument("--flow-from", type=int, metavar="T", help="first voxel whose flow is computed (default 0)")
     parser.add_argument("--flow-margin-px", type=int, metavar="N", help="picture around the crop (64; -1: all of it)")
+    parser.add_argument(
+        "--scene", choices=SCENES, help="auto: decode all once, leave out cuts, spare flow (default off)"
+    )
 
 
 def run_command(

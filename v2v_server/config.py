@@ -38,7 +38,7 @@ class ServeConfig:
         preset: speed preset ("exact", "balanced", "fast"), see :data:`v2v_protocol.spec.SPEED_PRESETS`.
         recipe: recipe preset name, or a mapping of recipe fields: the default for consumers that ask for none.
         voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
-            flow_method, flow_direction, flow_from, flow_margin_px: defaults of the other spec fields, see
+            flow_method, flow_direction, flow_from, flow_margin_px, scene: defaults of the other spec fields, see
             :class:`v2v_protocol.spec.StreamSpec`.
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
@@ -71,6 +71,7 @@ class ServeConfig:
     flow_direction: str = "forward"
     flow_from: int = 0
     flow_margin_px: int = 64
+    scene: str = "off"
     lease_deadline_seconds: float = 60.0
     session_idle_seconds: float = 600.0
     max_credit_bytes: int = 2 << 30

@@ -44,13 +44,16 @@ def describe(
     thresholds: tuple[str, ...] = ()
     if video.threshold_pos is not None and video.threshold_neg is not None:
         thresholds = (video.threshold_pos.hex(), video.threshold_neg.hex())
+    scene = b""
+    if spec.scene != "off":
+        scene = catalogue.scene(video.id).slice(sequence.start_frame, spec.recipe.frames_needed).to_bytes()
     index = catalogue.frame_index(video.id).slice(sequence.start_frame, spec.recipe.frames_needed)
     return Lease(
         lease=number,
         reply_to=task.session,
         spec=spec.canonical(),
         spec_digest=spec.digest,
-        catalogue_digest=catalogue.digest,
+        catalogue_digest=catalogue.digest_under(spec.scene),
         seed=seed,
         epoch=task.epoch,
         indices=(task.index, *siblings),
@@ -68,4 +71,5 @@ def describe(
         quarantine=quarantine,
         refusals={"refusals": [dataclasses.asdict(refusal) for refusal in task.refusals]},
         deadline_seconds=deadline_seconds,
+        scene=scene,
     )

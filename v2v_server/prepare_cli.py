@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.spec import SCENES
 from v2v_server.progress import catalogue_progress
 from v2v_server.video import prepare
 from v2v_server.video.catalogue import open_catalogue
@@ -55,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
         help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
     )  # fmt: skip
+    parser.add_argument(
+        "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
+    )
     parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     parser.add_argument("--json", metavar="FILE", help="also write a record of each video")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
@@ -95,6 +99,7 @@ def _run(arguments: argparse.Namespace) -> bool:
             encoding,
             processes=arguments.workers,
             floor_db=arguments.floor,
+            scene=arguments.scene != "off",
             progress=progress,
         )
     if arguments.json is not None:

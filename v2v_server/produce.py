@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,6 +21,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
+from v2v_server.scene_choice import FlowPlan, plan_flow
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
@@ -29,6 +30,7 @@ from v2v_server.video.decode import Cut, DecodedClip, decode_cuts
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.index import FrameIndex
 from v2v_server.video.rows import Rows
+from v2v_server.video.scene import Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,7 @@ class Draft:
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
         flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
+        plan: what the statistics of the scene say about flow; None where the spec does not ask them.
     """
 
     spec: StreamSpec
@@ -48,6 +51,7 @@ class Draft:
     source: npt.NDArray[np.int64]
     cut: Cut
     flow: FlowSettings | None
+    plan: FlowPlan | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +82,13 @@ def draft_of(lease: Lease, index: int) -> Draft:
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
+    plan = _plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
+        if plan is not None and plan.still:
+            flow = replace(flow, margin_px=0)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow)
+    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
 
 
 def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:
@@ -128,13 +135,14 @@ def make_sample(lease: Lease, decoded: Decoded) -> Sample:
     params, recipe, source = draft.params, draft.spec.recipe, draft.source
     frames, flow = decoded.clip.frames, None
     if draft.flow is not None:
-        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays)
+        plan = () if draft.plan is None else draft.plan.methods
+        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays, plan=plan)
         frames = view_part(frames, params, recipe, draft.flow.margin_px)
     view = apply_view(frames, params, recipe)
     seconds, irregular = None, 0
-    if recipe.noise_unit == "second":
+    if recipe.needs_seconds:
         if not lease.frames_per_second:
-            raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe states noise per second")
+            raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe needs seconds")
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     arrays: dict[str, npt.NDArray[Any]] = {}
     saturated = 0
@@ -168,6 +176,7 @@ def make_sample(lease: Lease, decoded: Decoded) -> Sample:
             irregular_timestamps=irregular,
             decoder=codec if decoded.clip.bit_exact else f"{codec} (host-dependent)",
             quarantine=lease.quarantine,
+            scene="" if draft.plan is None else draft.plan.reason,
         ),
     )
 
@@ -175,6 +184,13 @@ def make_sample(lease: Lease, decoded: Decoded) -> Sample:
 @lru_cache(maxsize=16)
 def _spec(canonical: bytes) -> StreamSpec:
     return StreamSpec.from_dict(json.loads(canonical))
+
+
+def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
+    if spec.scene == "off":
+        return None
+    scene = Scene.from_bytes(lease.scene)
+    return plan_flow(scene, lease.start_frame, params, spec, height_px, lease.width_px)
 
 
 def _thresholds(texts: tuple[str, ...]) -> tuple[float, float] | None:

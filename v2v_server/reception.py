@@ -102,7 +102,7 @@ class Reception:
         return session, Welcome(
             spec=spec.to_dict(),
             spec_digest=spec.digest,
-            catalogue_digest=self._catalogue.digest,
+            catalogue_digest=self._catalogue.digest_under(spec.scene),
             numerics_version=NUMERICS_VERSION,
             sequences=schedule.count,
             credit=session.credit,
@@ -135,6 +135,7 @@ class Reception:
             recipe.crop_width_px,
             recipe.resize_scale,
             spec.max_sequences_per_video,
+            spec.scene,
         )
         table = self._tables.get(geometry)
         if table is None:

@@ -51,7 +51,7 @@ def remake(
         SampleUnavailable: no candidate could give the sample.
     """
     array_layout(spec.recipe, spec.voxel_dtype, arrays)
-    SampleId(spec.digest, catalogue.digest, 0, seed, epoch, index)
+    SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
     if not table.count:
         story = "; ".join(
@@ -113,10 +113,11 @@ def simulate_to_file(
     Raises:
         UsageError, CorpusError, SampleUnavailable: see :func:`remake`; or a file cannot be written.
     """
-    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows))
+    stream = StreamSpec.from_dict(spec)
+    scene = stream.scene != "off"
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene)
     for problem in catalogue.problems:
         print(f"cannot be used: {problem.id}: {problem.reason}")
-    stream = StreamSpec.from_dict(spec)
     sample = remake(catalogue, stream, seed=seed, epoch=epoch, index=index, arrays=arrays)
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}

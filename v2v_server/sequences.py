@@ -1,7 +1,8 @@
 """Which sequences of which videos a spec may draw samples from.
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
-start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence).
+start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With
+scene "auto" the same holds of each stretch of the video between its cuts and where there is something to see.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, islice
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
@@ -51,15 +52,21 @@ class SequenceTable:
     Args:
         videos: the catalogue's entries, in its order.
         rows: the rows of each picture that may be used.
-        spec: says how many frames a sequence needs and how large the crop is.
+        spec: says how many frames a sequence needs, how large the crop is, and whether cuts count.
 
     Attributes:
         count: N, sequences in all.
         rejections: the videos that give none.
+        spoilt: sequences of the places 0, L, 2L ... that are left out or moved because of what they show.
+
+    Raises:
+        UsageError: the spec asks for scenes and the catalogue has none.
     """
 
     def __init__(self, videos: Iterable[VideoEntry], rows: Rows, spec: StreamSpec) -> None:
         self._stride = spec.recipe.frames_per_sequence
+        self._starts: dict[int, tuple[int, ...]] = {}
+        self.spoilt = 0
         admitted: list[VideoEntry] = []
         counts: list[int] = []
         rejections: list[Rejection] = []
@@ -69,8 +76,17 @@ class SequenceTable:
                 rejections.append(rejection)
                 continue
             fit = (video.frames - spec.recipe.frames_needed) // self._stride + 1
+            count = min(fit, spec.max_sequences_per_video)
+            if spec.scene != "off":
+                starts = _starts(video, spec)
+                self.spoilt += len({self._stride * place for place in range(count)} - set(starts))
+                if not starts:
+                    rejections.append(_all_cut(video, spec.recipe))
+                    continue
+                self._starts[len(admitted)] = starts
+                count = len(starts)
             admitted.append(video)
-            counts.append(min(fit, spec.max_sequences_per_video))
+            counts.append(count)
         self._videos = tuple(admitted)
         self._ends = tuple(accumulate(counts))
         self.count = self._ends[-1] if self._ends else 0
@@ -91,7 +107,31 @@ class SequenceTable:
             raise IndexError(f"sequence {rank} of {self.count}")
         video = bisect_right(self._ends, rank)
         first = self._ends[video - 1] if video else 0
-        return Sequence(self._videos[video], (rank - first) * self._stride)
+        place = rank - first
+        start = self._starts[video][place] if video in self._starts else place * self._stride
+        return Sequence(self._videos[video], start)
+
+
+def _starts(video: VideoEntry, spec: StreamSpec) -> tuple[int, ...]:
+    """First frames of the sequences that lie within one of the video's runs: at 0, L, 2L ... of each."""
+    if video.runs is None:
+        raise UsageError(
+            f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: start '
+            "the server with --scene auto"
+        )
+    needed, stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
+    starts = (start for first, end in video.runs for start in range(first, end - needed + 1, stride))
+    return tuple(islice(starts, spec.max_sequences_per_video))
+
+
+def _all_cut(video: VideoEntry, recipe: Recipe) -> Rejection:
+    longest = max((end - first for first, end in video.runs or ()), default=0)
+    most = (longest - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels
+    reason = (
+        f"at most {longest} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
+    )
+    remedy = f"voxels_per_clip at most {most}, or scene off" if most >= 1 else "scene off"
+    return Rejection(video.id, reason, remedy, max(most, 0))
 
 
 def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | None:

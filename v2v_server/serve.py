@@ -41,6 +41,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             list_file=config.list or None,
             rows=Rows.parse(config.rows),
             cache_dir=config.cache_dir or None,
+            scene=config.spec.scene != "off",
             processes=max(1, min(config.workers, os.cpu_count() or 1)),
             progress=progress,
         )

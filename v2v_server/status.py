@@ -24,6 +24,11 @@ def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> lis
         f"{len(catalogue.videos)} videos in {catalogue.root}: {table.videos} give {table.count} sequences of "
         f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
     ]
+    if spec.scene != "off":
+        cut = sum(video.runs != ((0, video.frames),) for video in catalogue.videos)
+        lines.append(
+            f"scene {spec.scene}: {cut} videos have cuts or empty parts; {table.spoilt} sequences are left out or moved"
+        )
     if table.rejections:
         lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
         for rejection in table.rejections[:_SHOWN]:

@@ -53,6 +53,12 @@ recipes = st.builds(
     hot_pixel_share=_range(0.0, 1.0),
     hot_pixel_sigma=_range(0.0, 1e9),
     noise_unit=st.sampled_from(("frame", "second")),
+    threshold_mismatch_sigma=_range(0.0, 1.0),
+    shot_noise_hz=_range(0.0, 1e4),
+    leak_hz=_range(0.0, 1e4),
+    refractory_seconds=_range(0.0, 1e3),
+    photoreceptor_hz=st.just((0.0, 0.0)) | _range(0.01, 1e6),
+    dead_pixel_share=_range(0.0, 1.0),
 ).filter(lambda recipe: recipe is not None)
 
 specs = st.builds(

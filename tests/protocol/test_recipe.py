@@ -22,6 +22,11 @@ RANGES = [name for name, default in FIELDS.items() if isinstance(default, tuple)
 FLAGS = [name for name, default in FIELDS.items() if isinstance(default, bool)]
 WORDS = [name for name, default in FIELDS.items() if isinstance(default, str)]
 
+EFFECTS = (
+    "threshold_mismatch_sigma", "shot_noise_hz", "leak_hz", "refractory_seconds", "photoreceptor_hz",
+    "dead_pixel_share",
+)  # fmt: skip
+
 
 def test_every_field_is_of_a_kind_that_these_tests_cover() -> None:
     assert sorted(WHOLE + NUMBERS + RANGES + FLAGS + WORDS) == sorted(FIELDS)
@@ -39,6 +44,8 @@ def test_every_field_is_of_a_kind_that_these_tests_cover() -> None:
         ("paper-flow", 201, 40, range(0, 201, 5)),
         ("paper-eraft", 206, 41, range(5, 206, 5)),
         ("noise-free", 201, 40, range(5, 201, 5)),
+        ("clean", 201, 40, range(5, 201, 5)),
+        ("davis346", 201, 40, range(5, 201, 5)),
     ],
 )
 def test_frames_of_the_presets(name: str, needed: int, voxels: int, targets: range) -> None:
@@ -96,7 +103,10 @@ def test_presets_differ_from_paper_only_where_they_say() -> None:
     assert changed("paper-contrast") == {"contrast_probability"}
     assert changed("paper-flow") == {"lead_frames"}
     assert changed("paper-eraft") == {"lead_frames", "lead_voxels"}
-    assert changed("noise-free") == {"noise_sigma", "hot_pixel_share", "hot_pixel_sigma", "pause_probability"}
+    noise = {"noise_sigma", "hot_pixel_share", "hot_pixel_sigma"}
+    assert changed("noise-free") == noise | {"pause_probability"}
+    assert changed("clean") == noise | {"threshold", "threshold_ratio", "threshold_mismatch_sigma"}
+    assert changed("davis346") == noise | {"threshold", "noise_unit", *EFFECTS}
 
 
 @pytest.mark.parametrize("name", ["papers", "", None, 7, ["paper"]])
@@ -109,6 +119,38 @@ def test_unknown_preset_lists_the_known_ones(name: object) -> None:
 def test_near_preset_is_named() -> None:
     with pytest.raises(RecipeError, match="did you mean 'paper-eraft'"):
         preset("paper-erraft")
+
+
+@pytest.mark.parametrize("name", [name for name in PRESETS if name.startswith("paper")] + ["noise-free"])
+def test_what_the_paper_does_not_model_is_off(name: str) -> None:
+    recipe = preset(name)
+    assert not recipe.has_effects
+    assert not recipe.needs_seconds
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_is_on_where_a_draw_may_be_above_zero(name: str) -> None:
+    recipe = Recipe().replace(**{name: (0.5, 0.5)})
+    assert recipe.has_effects
+    assert recipe.timed_effects == recipe.needs_seconds == name.endswith(("_hz", "_seconds"))
+
+
+def test_a_low_pass_of_almost_zero_hertz_is_refused() -> None:
+    """Zero means none: a range that begins there would jump from no light at all to all of it."""
+    for value in ([0.0, 30.0], [1e-9, 30.0], 1e-9):
+        assert "give 0 for no low-pass, or a range from 0.01 upwards" in refuse("photoreceptor_hz", value)
+    assert Recipe(photoreceptor_hz=(0.01, 0.01)).has_effects
+
+
+def test_the_events_of_a_recipe_count_its_effects() -> None:
+    """The smallest threshold of any pixel, and a leak at one frame a second."""
+    plain = Recipe(noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), threshold=(0.2, 0.2), threshold_ratio=(1.0, 1.0))
+    spread = plain.replace(threshold_mismatch_sigma=0.05)
+    assert spread.most_events > plain.most_events / (1 - 6.56 * 0.05)
+    assert plain.replace(threshold_mismatch_sigma=1.0).most_events > plain.most_events / 0.25
+    assert plain.replace(leak_hz=3.0).most_events - plain.most_events >= 3.0 * plain.steps
+    with pytest.raises(RecipeError, match="events in a clip"):
+        Recipe(threshold=(1e-6, 1e6), leak_hz=1e4)
 
 
 # --- plain values -----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -13,7 +14,17 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe, preset
-from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, layout_bytes
+from v2v_protocol.sample import (
+    NO_EFFECTS,
+    Effects,
+    Provenance,
+    Refusal,
+    Sample,
+    SampleId,
+    SampleParams,
+    array_layout,
+    layout_bytes,
+)
 
 PARAMS = SampleParams(
     threshold_pos=0.25,
@@ -108,6 +119,25 @@ def test_any_draw_travels_unchanged(number: float, pauses: list[tuple[int, int]]
     assert Provenance.from_dict(packed(provenance)) == provenance
 
 
+def test_effects_travel_where_there_are_any() -> None:
+    """Without effects the provenance has the bytes it had before there were any."""
+    assert "effects" not in packed(PROVENANCE)["params"]
+    assert "effects" not in PARAMS.to_dict()
+    effects = Effects(0.1, 5.0, 0.1, 0.001, 30.0, 3)
+    provenance = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, effects=effects))
+    assert packed(provenance)["params"]["effects"]["dead_pixel_count"] == 3
+    assert Provenance.from_dict(packed(provenance)) == provenance
+
+
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Effects)])
+def test_one_effect_is_enough(field: str) -> None:
+    effects = dataclasses.replace(NO_EFFECTS, **{field: 1})
+    assert effects
+    assert effects.need_seconds == field.endswith(("_hz", "_seconds"))
+    assert not NO_EFFECTS
+    assert not NO_EFFECTS.need_seconds
+
+
 def damage(path: tuple[str, ...], value: Any) -> dict[str, Any]:
     """The plain provenance with one entry replaced, or removed where ``value`` is Ellipsis."""
     values = packed(PROVENANCE)
@@ -147,6 +177,9 @@ def damage(path: tuple[str, ...], value: Any) -> dict[str, Any]:
         (("params", "noise_key"), [math.inf, 0, 0, 0]),
         (("params", "noise_key"), [math.nan, 0, 0, 0]),
         (("params", "noise_key"), None),
+        (("params", "effects"), 5),
+        (("params", "effects"), None),
+        (("params", "effects"), {"glow": 1.0}),
         (("refusals",), 7),
         (("refusals",), [7]),
         (("refusals",), [{"candidate": 1}]),

@@ -40,6 +40,12 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "hot_pixel_share": [0.0, 0.002],
     "hot_pixel_sigma": [1.0, 10.0],
     "noise_unit": "second",
+    "threshold_mismatch_sigma": [0.0, 0.1],
+    "shot_noise_hz": [0.0, 5.0],
+    "leak_hz": [0.0, 0.1],
+    "refractory_seconds": [0.0, 0.001],
+    "photoreceptor_hz": [30.0, 300.0],
+    "dead_pixel_share": [0.0, 0.001],
 }
 OTHER_SPEC_VALUES: dict[str, Any] = {
     "recipe": preset("paper-flow"),
@@ -54,13 +60,14 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_direction": "backward",
     "flow_from": 20,
     "flow_margin_px": -1,
+    "scene": "auto",
 }
 
 
 def test_digests_are_stable() -> None:
     """A saved position names this digest: if it changes, so must NUMERICS_VERSION or the digest's own version."""
-    assert StreamSpec().digest == "6df0ce602ec44c7943dbe655e81d18e2"
-    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "66d11296efcaed2ccb21c9c4cdd2a68c"
+    assert StreamSpec().digest == "6180584cd161f5eba42684a63d8275b4"
+    assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "67935ef83490b49ed37b001687cc2eb4"
 
 
 def test_canonical_form_of_the_default() -> None:

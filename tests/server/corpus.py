@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.video.catalogue import Catalogue, Problem, VideoEntry
@@ -35,6 +35,12 @@ class NamedCorpus:
     root: Path = Path("/corpus")
     digest: str = "c" * 32
     unreadable: frozenset[str] = frozenset()
+
+    def digest_under(self, scene: str) -> str:
+        """The digest; these videos have no statistics."""
+        if scene != "off":
+            raise UsageError(f'scene = "{scene}" needs statistics')
+        return self.digest
 
     def frame_index(self, name: str) -> FrameIndex:
         """A regular index with a keyframe at every twelfth frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import subprocess
 import sys
@@ -13,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
 from v2v_server.simulation.draw import admits, draw, resized_size, smallest_scale
 
 PAPER = Recipe()
@@ -161,6 +162,51 @@ def test_noise_in_units_of_the_threshold() -> None:
 def test_hot_pixel_share_rounds_half_up() -> None:
     for share, count in ((0.5 / 16384, 1), (0.49 / 16384, 0), (1.0, 16384), (0.0, 0)):
         assert drawn(Recipe(hot_pixel_share=(share, share)))[0].hot_pixel_count == count
+
+
+EFFECTS: dict[str, Any] = {
+    "threshold_mismatch_sigma": (0.1, 0.2), "shot_noise_hz": (1.0, 5.0), "leak_hz": (0.05, 0.2),
+    "refractory_seconds": (1e-4, 1e-3), "photoreceptor_hz": (30.0, 300.0), "dead_pixel_share": (0.0, 0.01),
+}  # fmt: skip
+
+
+def test_effects_change_no_other_draw() -> None:
+    plain, other = drawn(count=20), drawn(Recipe(**EFFECTS), 20)
+    assert all(params.effects == NO_EFFECTS for params in plain)
+    assert all(params.effects for params in other)
+    assert [dataclasses.replace(params, effects=NO_EFFECTS) for params in other] == plain
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_one_effect_changes_no_other_effect(name: str) -> None:
+    [base], [changed] = drawn(Recipe(**EFFECTS)), drawn(Recipe(**EFFECTS).replace(**{name: (0.0, 0.0)}))
+    field = "dead_pixel_count" if name == "dead_pixel_share" else name
+    assert dataclasses.replace(base.effects, **{field: 0}) == changed.effects
+
+
+def test_effects_are_uniform_in_their_ranges_and_independent() -> None:
+    many = [dataclasses.astuple(params.effects) for params in drawn(Recipe(**EFFECTS), 600)]
+    columns = np.array(many).T
+    for column, (low, high) in zip(columns, EFFECTS.values(), strict=True):
+        low, high = (low, high) if high != 0.01 else (0.0, 164.0)
+        assert low <= column.min() <= column.max() <= high
+        assert abs(column.mean() - (low + high) / 2) < 4 * (high - low) / math.sqrt(12 * len(many))
+    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 4.5 / math.sqrt(len(many))
+
+
+def test_golden_effects() -> None:
+    [params] = drawn(PRESETS["davis346"], seed=2**64 - 1)
+    assert params.effects == GOLDEN_EFFECTS
+
+
+GOLDEN_EFFECTS = Effects(
+    threshold_mismatch_sigma=0.1831126706935205,
+    shot_noise_hz=0.18366444970891183,
+    leak_hz=0.14871067332232515,
+    refractory_seconds=0.0005565123425010149,
+    photoreceptor_hz=201.38932850677057,
+    dead_pixel_count=0,
+)
 
 
 def test_golden_draw() -> None:

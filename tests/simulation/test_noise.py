@@ -130,3 +130,42 @@ def test_hot_pixels_fall_everywhere_alike() -> None:
     for seed in range(2000):
         hits[noise.hot_pixels((seed, 0, 0, 0), 5, 100)[0]] += 1
     assert ((hits - 100) ** 2 / 95).sum() < 99 + 5 * math.sqrt(198)
+
+
+def test_dead_and_hot_pixels_are_chosen_apart() -> None:
+    key = (1, 2, 3, 4)
+    dead = noise.dead_pixels(key, 500, 1000)
+    assert len(set(dead.tolist())) == 500
+    assert (np.diff(dead) > 0).all()
+    assert noise.dead_pixels(key, 0, 1000).size == 0
+    hot, _ = noise.hot_pixels(key, 500, 1000)
+    # Hypergeometric: 250 in common on average, with a deviation of 7.9.
+    assert abs(len(set(dead.tolist()) & set(hot.tolist())) - 250) < 4 * 7.9
+
+
+def test_mismatch_normals_are_normal_and_independent() -> None:
+    positive, negative = noise.mismatch_normals((5, 6, 7, 8), 200_000)
+    for sample in (positive, negative):
+        assert abs(sample.mean()) < 4 / math.sqrt(sample.size)
+        assert abs(sample.var() - 1) < 4 * math.sqrt(2 / sample.size)
+        assert abs((np.abs(sample) > 2).mean() - 0.0455) < 4 * math.sqrt(0.0455 / sample.size)
+        assert abs(np.corrcoef(sample[1:], sample[:-1])[0, 1]) < 4 / math.sqrt(sample.size)
+    assert abs(np.corrcoef(positive, negative)[0, 1]) < 4 / math.sqrt(positive.size)
+    noisy = noise.standard_normals((5, 6, 7, 8), 2, 200_000)
+    for step in noisy:
+        assert abs(np.corrcoef(positive, step)[0, 1]) < 4 / math.sqrt(positive.size)
+
+
+def test_shot_words_are_uniform_and_independent() -> None:
+    """Of pixel, step and sign; the smallest ones too, which alone make events."""
+    steps, pixels = 200, 2000
+    both = np.stack(noise.shot_words((9, 8, 7, 6), steps, pixels)) * 2.0**-32
+    n = both[0].size
+    for uniform in both:
+        assert abs(uniform.mean() - 0.5) < 4 / math.sqrt(12 * n)
+        for chance in (0.5, 0.1, 0.01):
+            rare = uniform < chance
+            assert abs(rare.mean() - chance) < 4 * math.sqrt(chance / n)
+            for one, other in ((rare[1:], rare[:-1]), (rare[2:], rare[:-2]), (rare[:, 1:], rare[:, :-1])):
+                assert abs((one & other).mean() - chance**2) < 4.5 * chance / math.sqrt(n)
+    assert abs(((both[0] < 0.1) & (both[1] < 0.1)).mean() - 0.01) < 4 * 0.1 / math.sqrt(n)

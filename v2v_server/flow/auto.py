@@ -27,21 +27,21 @@ SLOW = "dis-ultrafast"
 MOVING = "dis-fast"
 
 _BLOCK_PX = 8
-_STILL_GREY_LEVELS = 1.5
+STILL_GREY_LEVELS = 1.5
 _SHRINK = 4
-_SLOW_PX = 0.5
+SLOW_PX = 0.5
 _MOST_OF_THE_PICTURE = 0.95
 
 
 def choose(first: Picture, second: Picture) -> str:
     """The name of the method for a pair of [h, w] uint8 pictures."""
     change = cv2.subtract(first, second, dtype=cv2.CV_32F)
-    if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= _STILL_GREY_LEVELS:
+    if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= STILL_GREY_LEVELS:
         return STILL
     look = guarded(dis.dis(dis.ULTRAFAST, 1), dis.SMALLEST_SIDE_PX)
     field = look(_shrunk(first, _SHRINK), _shrunk(second, _SHRINK))
     pace = np.quantile(np.hypot(field[..., 0], field[..., 1]), _MOST_OF_THE_PICTURE) * _SHRINK
-    return SLOW if pace < _SLOW_PX else MOVING
+    return SLOW if pace < SLOW_PX else MOVING
 
 
 def _shrunk(picture: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:

@@ -6,6 +6,7 @@ out: it moves nothing and clips what could be matched.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.flow.auto import choose
+from v2v_server.flow.auto import STILL, choose
 from v2v_server.flow.estimator import Estimator, Picture, one_thread
 from v2v_server.flow.methods import method
 from v2v_server.flow.settings import AUTO, FlowSettings
@@ -74,7 +75,13 @@ def view_part(frames: Frames, params: SampleParams, recipe: Recipe, margin_px: i
 
 
 def flow_for(
-    frames: Frames, params: SampleParams, recipe: Recipe, settings: FlowSettings, *, validity: bool = False
+    frames: Frames,
+    params: SampleParams,
+    recipe: Recipe,
+    settings: FlowSettings,
+    *,
+    validity: bool = False,
+    plan: Sequence[str] = (),
 ) -> FlowClip:
     """Flow between the ends of each voxel of one drawn sample.
 
@@ -85,6 +92,7 @@ def flow_for(
         params, recipe: the draw and its recipe.
         settings: how.
         validity: also make the mask, which takes a second estimate of each pair.
+        plan: the method of each voxel, in place of the one of the settings; "zero" is not even looked at.
 
     Raises:
         UsageError: the frames do not hold the crop or what the draw shows, or there is no voxel to begin at.
@@ -103,14 +111,15 @@ def flow_for(
             span = recipe.bins * recipe.frames_per_bin
             start = (recipe.lead_voxels + voxel) * span
             ends = int(source[start]), int(source[start + span])
-            if ends[0] == ends[1]:
-                methods.append(PAUSED)
+            planned = plan[voxel] if plan else settings.method
+            if ends[0] == ends[1] or (plan and planned == STILL):
+                methods.append(PAUSED if ends[0] == ends[1] else STILL)
                 if valid is not None:
                     valid[voxel] = 1
                 continue
             earlier, later = pictures.pair(*ends)
             first, second = (earlier, later) if settings.direction == "forward" else (later, earlier)
-            name = choose(first, second) if settings.method == AUTO else settings.method
+            name = choose(first, second) if planned == AUTO else planned
             methods.append(name)
             estimate = estimators.setdefault(name, method(name).estimator())
             field = estimate(first, second)

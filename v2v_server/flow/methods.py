@@ -38,8 +38,8 @@ def _zero() -> Estimator:
     return estimate
 
 
-def _dis(preset: int, finest_scale: int, patch_stride_px: int | None = None) -> Method:
-    return Method(partial(dis.dis, preset, finest_scale, patch_stride_px), dis.SMALLEST_SIDE_PX)
+def _dis(preset: int, finest_scale: int, patch_stride_px: int | None = None, refinements: int | None = None) -> Method:
+    return Method(partial(dis.dis, preset, finest_scale, patch_stride_px, refinements), dis.SMALLEST_SIDE_PX)
 
 
 METHODS: Mapping[str, Method] = MappingProxyType(
@@ -48,6 +48,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "dis-ultrafast": _dis(dis.ULTRAFAST, 2),
         "dis-ultrafast-1": _dis(dis.ULTRAFAST, 1),
         "dis-fast": _dis(dis.FAST, 2),
+        "dis-fast-lean": _dis(dis.FAST, 2, None, 3),
         "dis-fast-1": _dis(dis.FAST, 1),
         "dis-fast-1-stride-6": _dis(dis.FAST, 1, 6),
         "dis-medium": _dis(dis.MEDIUM, 1),

@@ -9,14 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe, most_events
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.recipe import Recipe, most_events, pixel_thresholds
+from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.effect_pixel import simulate_pixels_with_effects
+from v2v_server.simulation.effects import Prepared, prepare
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
-from v2v_server.simulation.precision import AUTO, check_thresholds, choose, noise_sum
+from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_effects, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
 
 
@@ -48,6 +50,13 @@ def simulate(
     seed: int = 0,
     dtype: str = "int8",
     precision: str = AUTO,
+    frames_per_second: float | None = None,
+    threshold_mismatch_sigma: float = 0.0,
+    shot_noise_hz: float = 0.0,
+    leak_hz: float = 0.0,
+    refractory_seconds: float = 0.0,
+    photoreceptor_hz: float = 0.0,
+    dead_pixel_count: int = 0,
 ) -> Voxels:
     """Simulate an event camera that watches a clip.
 
@@ -65,6 +74,9 @@ def simulate(
         dtype: "int8", "int16" or "float32".
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
             below half a threshold (``precision.py``).
+        frames_per_second: of the frames; needed for an effect in Hz or seconds.
+        threshold_mismatch_sigma, shot_noise_hz, leak_hz, refractory_seconds, photoreceptor_hz, dead_pixel_count:
+            effects beyond the paper's model, see ``v2v_protocol.sample.Effects``; zero is off.
 
     Returns:
         voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins.
@@ -77,9 +89,17 @@ def simulate(
         raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give uint8 [n, H, W]")
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
+    effects = Effects(
+        threshold_mismatch_sigma, shot_noise_hz, leak_hz, refractory_seconds, photoreceptor_hz, dead_pixel_count
+    )
+    check_effects(effects, frames[0].size if len(frames) else 0)
+    if frames_per_second is not None:
+        _check_number("frames_per_second", frames_per_second, positive=True)
+    elif effects.need_seconds:
+        raise UsageError("frames_per_second is missing: effects in Hz or seconds need the time between frames")
     return _simulate_array(
         frames, (gamma, log_eps), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
-        start_residual, bins, frames_per_bin, seed, dtype, precision,
+        start_residual, bins, frames_per_bin, seed, dtype, precision, effects, 1.0 / (frames_per_second or 1.0),
     )  # fmt: skip
 
 
@@ -103,7 +123,8 @@ def simulate_log(
     Args:
         log_frames: [n, H, W] floating point, natural log of intensity; rounded to ``precision`` first.
 
-    Other arguments, result and errors are those of :func:`simulate`.
+    Other arguments, result and errors are those of :func:`simulate`. There are no effects beyond the paper's model:
+    some depend on how bright a pixel is beside white, which a logarithm of unknown scale does not tell.
     """
     log_frames = np.asarray(log_frames)
     if log_frames.ndim != 3 or log_frames.dtype.kind != "f":
@@ -130,7 +151,7 @@ def simulate_clip(
             frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: [steps] duration of each step (``timing.py``); given exactly when ``noise_unit`` is "second".
+        step_seconds: [steps] duration of each step (``timing.py``); given exactly when ``recipe.needs_seconds``.
 
     Returns:
         voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
@@ -144,9 +165,10 @@ def simulate_clip(
         raise UsageError(
             f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, uint8 [n, H, W]"
         )
-    if (step_seconds is None) != (recipe.noise_unit == "frame"):
+    if (step_seconds is None) == recipe.needs_seconds:
         raise UsageError(
-            f"noise_unit is {recipe.noise_unit!r}: step_seconds is {'missing' if step_seconds is None else 'unwanted'}"
+            f"step_seconds is {'missing' if step_seconds is None else 'unwanted'}: noise_unit is "
+            f"{recipe.noise_unit!r}, and there {'is an' if recipe.timed_effects else 'is no'} effect in Hz or seconds"
         )
     if step_seconds is None:
         step_seconds = np.ones(recipe.steps)
@@ -154,12 +176,16 @@ def simulate_clip(
         raise UsageError(
             f"step_seconds {list(step_seconds.shape)}: give {recipe.steps} positive finite durations, one per step"
         )
+    noise_durations = step_seconds if recipe.noise_unit == "second" else np.ones(recipe.steps)
     check_thresholds(params.threshold_pos, params.threshold_neg)
-    ends = _log_ends(recipe.gamma, recipe.log_eps)
-    real = choose(AUTO, _most_events(params, ends, step_seconds))
+    intensity = recipe.gamma, recipe.log_eps
+    real = choose(AUTO, _most_events(params, _log_ends(*intensity), noise_durations, step_seconds))
+    prepared = None
+    if params.effects:
+        prepared = prepare(params, intensity, step_seconds, frames[0].size, real, _compiled_words)
     return _run(
-        frames, _table(recipe.gamma, recipe.log_eps, real), source_index, params, step_seconds,
-        recipe.bins, recipe.frames_per_bin, voxel_dtype,
+        frames, _table(*intensity, real), source_index, params, noise_durations,
+        recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared,
     )  # fmt: skip
 
 
@@ -185,8 +211,10 @@ def _simulate_array(
     seed: int,
     dtype: str,
     precision: str,
+    effects: Effects = NO_EFFECTS,
+    frame_seconds: float = 1.0,
 ) -> Voxels:
-    """``intensity``: gamma and log_eps of grey levels, None where the frames are log intensities."""
+    """``intensity``: gamma and log_eps of grey levels, None where the frames are log intensities (without effects)."""
     threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
     _check_number("threshold_pos", threshold_pos, positive=True)
     _check_number("threshold_neg", threshold_neg, positive=True)
@@ -209,21 +237,37 @@ def _simulate_array(
             f"k > 0 (k x {bins * frames_per_bin} + 1), of at least one pixel"
         )
     steps = count - 1
-    params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed)
+    params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed, effects)
+    step_seconds = np.full(steps, frame_seconds)
     ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(*intensity)
-    real = choose(precision, _most_events(params, ends, np.ones(steps)))
+    real = choose(precision, _most_events(params, ends, np.ones(steps), step_seconds))
+    prepared = None
     if intensity is None:
         frames, table = frames.astype(real), np.empty(0, real)
     else:
         table = _table(*intensity, real)
-    return _run(frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual)
+        if effects:
+            prepared = prepare(params, intensity, step_seconds, height * width, real, _compiled_words)
+    return _run(
+        frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual, prepared
+    )
 
 
-def _most_events(params: SampleParams, log_ends: tuple[float, float], step_seconds: npt.NDArray[np.float64]) -> float:
+def _most_events(
+    params: SampleParams,
+    log_ends: tuple[float, float],
+    noise_durations: npt.NDArray[np.float64],
+    step_seconds: npt.NDArray[np.float64],
+) -> float:
     thresholds = params.threshold_pos, params.threshold_neg
     hot_sigma = params.hot_pixel_sigma if params.hot_pixel_count else 0.0
-    noise_total = noise_sum(params.noise_sigma, hot_sigma, step_seconds)
-    return most_events(len(step_seconds), log_ends, thresholds, noise_total)
+    noise_total = noise_sum(params.noise_sigma, hot_sigma, noise_durations)
+    if not params.effects:
+        return most_events(len(noise_durations), log_ends, thresholds, noise_total)
+    effects = params.effects
+    thresholds = pixel_thresholds(min(thresholds), max(thresholds), effects.threshold_mismatch_sigma)
+    noise_total += effects.leak_hz * thresholds[1] * math.fsum(step_seconds)
+    return EFFECTS_MARGIN * most_events(len(noise_durations), log_ends, thresholds, noise_total)
 
 
 def _log_ends(gamma: float, log_eps: float) -> tuple[float, float]:
@@ -237,26 +281,23 @@ def _run(
     table: npt.NDArray[Any],
     source_index: npt.NDArray[np.int64],
     params: SampleParams,
-    step_seconds: npt.NDArray[np.float64],
+    noise_durations: npt.NDArray[np.float64],
     bins: int,
     frames_per_bin: int,
     dtype: str,
     start_residual: float | None = None,
+    prepared: Prepared | None = None,
 ) -> Voxels:
+    """``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: None without effects."""
     _, height, width = frames.shape
-    steps, pixels, real = len(step_seconds), height * width, table.dtype.type
+    steps, pixels, real = len(noise_durations), height * width, table.dtype.type
     voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype)
     # Noise of independent increments: its variance, not its deviation, grows with time.
-    noise_scale = params.noise_sigma * np.sqrt(step_seconds) if params.noise_sigma > 0.0 else np.empty(0)
+    noise_scale = params.noise_sigma * np.sqrt(noise_durations) if params.noise_sigma > 0.0 else np.empty(0)
     hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
     key = np.array(params.noise_key, np.uint32)
     position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels, _compiled_words)
-    threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
-    if start_residual is None:
-        start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
-    else:
-        start_low, start_span = real(start_residual), real(0)
-    saturated = simulate_pixels(
+    shared = (
         np.ascontiguousarray(frames).reshape(len(frames), pixels),
         table,
         source_index,
@@ -264,15 +305,40 @@ def _run(
         noise_scale.astype(real),
         position,
         normal.astype(real) * real(params.hot_pixel_sigma),
-        step_seconds.astype(real),
+        noise_durations.astype(real),
+    )
+    limit, stored = real(LARGEST_COUNT[dtype]), voxels.reshape(steps // frames_per_bin, pixels)
+    threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
+    if prepared is not None:
+        sigma = params.effects.threshold_mismatch_sigma
+        smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
+        saturated = simulate_pixels_with_effects(
+            *shared,
+            threshold_pos,
+            threshold_neg,
+            real(rounding_tolerance(smallest, smallest)),
+            start_residual is None,
+            real(start_residual or 0.0),
+            frames_per_bin,
+            limit,
+            stored,
+            *prepared,
+        )
+        return Voxels(voxels, int(saturated))
+    if start_residual is None:
+        start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
+    else:
+        start_low, start_span = real(start_residual), real(0)
+    saturated = simulate_pixels(
+        *shared,
         threshold_pos,
         threshold_neg,
         real(rounding_tolerance(params.threshold_pos, params.threshold_neg)),
         start_low,
         start_span,
         frames_per_bin,
-        real(LARGEST_COUNT[dtype]),
-        voxels.reshape(steps // frames_per_bin, pixels),
+        limit,
+        stored,
     )
     return Voxels(voxels, int(saturated))
 
@@ -282,7 +348,13 @@ def _compiled_words(key: noise.NoiseKey, purpose: int, counters: npt.NDArray[np.
 
 
 def _params(
-    threshold_pos: float, threshold_neg: float, noise_sigma: float, hot_count: int, hot_sigma: float, seed: int
+    threshold_pos: float,
+    threshold_neg: float,
+    noise_sigma: float,
+    hot_count: int,
+    hot_sigma: float,
+    seed: int,
+    effects: Effects = NO_EFFECTS,
 ) -> SampleParams:
     """A camera without a view."""
     return SampleParams(
@@ -298,6 +370,7 @@ def _params(
         flip=False,
         contrast=0.0,
         noise_key=noise_key_of_seed(seed),
+        effects=effects,
     )
 
 

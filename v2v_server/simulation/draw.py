@@ -23,7 +23,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Range, Recipe
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
 
 _SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
@@ -42,6 +42,12 @@ class Purpose(IntEnum):
     FLIP = 7
     CONTRAST = 8
     NOISE_KEY = 9
+    THRESHOLD_MISMATCH = 10
+    SHOT_NOISE = 11
+    LEAK = 12
+    REFRACTORY = 13
+    PHOTORECEPTOR = 14
+    DEAD_PIXELS = 15
 
 
 _Stream = Callable[[Purpose, int], list[int]]
@@ -99,7 +105,7 @@ def draw(
         threshold_pos=threshold_pos,
         threshold_neg=threshold_neg,
         noise_sigma=noise_sigma * threshold_pos if recipe.noise_scales_with_threshold else noise_sigma,
-        hot_pixel_count=math.floor(_in_range(recipe.hot_pixel_share, share) * crop + 0.5),
+        hot_pixel_count=_rounded(_in_range(recipe.hot_pixel_share, share) * crop),
         hot_pixel_sigma=_in_range(recipe.hot_pixel_sigma, sigma),
         pauses=_pauses(recipe, stream),
         scale=scale,
@@ -112,6 +118,7 @@ def draw(
             else 0.0
         ),
         noise_key=(first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32),
+        effects=_effects(recipe, stream),
     )
 
 
@@ -130,7 +137,7 @@ def admits(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> boo
 
 def resized_size(height_px: int, width_px: int, scale: float) -> tuple[int, int]:
     """Height and width of the picture after the resize, each rounded half up."""
-    return math.floor(height_px * scale + 0.5), math.floor(width_px * scale + 0.5)
+    return _rounded(height_px * scale), _rounded(width_px * scale)
 
 
 def noise_key_of_seed(seed: int) -> tuple[int, int, int, int]:
@@ -152,6 +159,24 @@ def _thresholds(
     other = one * _in_range(recipe.threshold_ratio, raw[1])
     first, second = float(np.float32(one)), float(np.float32(other))
     return (first, second) if raw[2] >> 63 else (second, first)
+
+
+def _effects(recipe: Recipe, stream: _Stream) -> Effects:
+    if not recipe.has_effects:
+        return NO_EFFECTS
+
+    def drawn(ends: Range, purpose: Purpose) -> float:
+        return _in_range(ends, stream(purpose, 1)[0])
+
+    dead_share = drawn(recipe.dead_pixel_share, Purpose.DEAD_PIXELS)
+    return Effects(
+        threshold_mismatch_sigma=drawn(recipe.threshold_mismatch_sigma, Purpose.THRESHOLD_MISMATCH),
+        shot_noise_hz=drawn(recipe.shot_noise_hz, Purpose.SHOT_NOISE),
+        leak_hz=drawn(recipe.leak_hz, Purpose.LEAK),
+        refractory_seconds=drawn(recipe.refractory_seconds, Purpose.REFRACTORY),
+        photoreceptor_hz=drawn(recipe.photoreceptor_hz, Purpose.PHOTORECEPTOR),
+        dead_pixel_count=_rounded(dead_share * recipe.crop_height_px * recipe.crop_width_px),
+    )
 
 
 def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
@@ -184,6 +209,10 @@ def _unit(raw: int) -> float:
 def _in_range(ends: Range, raw: int) -> float:
     low, high = ends
     return min(low + _unit(raw) * (high - low), high)
+
+
+def _rounded(value: float) -> int:
+    return math.floor(value + 0.5)
 
 
 def _below(count: int, raw: int) -> int:

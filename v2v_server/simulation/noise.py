@@ -46,7 +46,8 @@ NoiseKey = tuple[int, int, int, int]
 WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
 PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
-"""What a word is for."""
+MISMATCH_RADIUS, MISMATCH_ANGLE, SHOT_PIXEL_POS, SHOT_PIXEL_NEG, SHOT_STEP_POS, SHOT_STEP_NEG, DEAD_PLACE = range(9, 16)
+"""What a word is for. Numbers are never reused."""
 
 # Numba's cache is keyed by the source of pixel.py alone: after changing a number below, save pixel.py too.
 GOLDEN = np.uint32(0x9E3779B9)
@@ -171,11 +172,40 @@ def hot_pixels(
     if count == 0:
         return np.empty(0, np.int64), np.empty(0, np.float32)
     words_of = words_of or words
-    place_words = words_of(key, HOT_PLACE, np.arange(pixels))
-    largest = np.partition(place_words, count - 1)[count - 1]
-    position = np.flatnonzero(place_words <= largest).astype(np.int64)
+    position = _smallest_words(key, HOT_PLACE, count, pixels, words_of)
     normal, _ = box_muller(words_of(key, HOT_RADIUS, position), words_of(key, HOT_ANGLE, position))
     return position, normal
+
+
+def dead_pixels(key: NoiseKey, count: int, pixels: int, words_of: WordsOf | None = None) -> npt.NDArray[np.int64]:
+    """The dead pixels, chosen like the hot ones: positions [count] int64, ascending, in row order."""
+    return _smallest_words(key, DEAD_PLACE, count, pixels, words_of or words) if count else np.empty(0, np.int64)
+
+
+def mismatch_normals(key: NoiseKey, pixels: int) -> tuple[Reals, Reals]:
+    """By how many deviations each pixel's positive and negative threshold lies off: two of [pixels] float32."""
+    place = np.arange(pixels)
+    return box_muller(*mix(words(key, MISMATCH_RADIUS, place), words(key, MISMATCH_ANGLE, place)))
+
+
+def shot_words(key: NoiseKey, steps: int, pixels: int) -> tuple[Words, Words]:
+    """Independent uniform words that decide the shot events: those of positive and of negative events.
+
+    ``mix`` of the words of pixel and step, as for the normals: with SHOT_PIXEL_POS and SHOT_STEP_POS in the place of
+    the two radius words, SHOT_PIXEL_NEG and SHOT_STEP_NEG in that of the two angle words.
+
+    Returns:
+        each [steps, pixels] uint32.
+    """
+    place, step = np.arange(pixels), np.arange(steps)
+    positive = words(key, SHOT_STEP_POS, step)[:, None] ^ words(key, SHOT_PIXEL_POS, place)
+    return mix(positive, words(key, SHOT_STEP_NEG, step)[:, None] ^ words(key, SHOT_PIXEL_NEG, place))
+
+
+def _smallest_words(key: NoiseKey, purpose: int, count: int, pixels: int, words_of: WordsOf) -> npt.NDArray[np.int64]:
+    place_words = words_of(key, purpose, np.arange(pixels))
+    largest = np.partition(place_words, count - 1)[count - 1]
+    return np.flatnonzero(place_words <= largest).astype(np.int64)
 
 
 def _cubic(coefficients: tuple[np.float32, ...], x: Reals) -> Reals:

@@ -19,6 +19,10 @@ at most, where the 8 has room for the terms of second order. Float32 is used up 
 then the error stays below half the smaller threshold in either, over the whole clip and not only over a step, and the
 count of a bin is exact, being below 2**24 or 2**53.
 
+Effects (``effects.py``) round more: 4 u (range) for the low-pass, whose own error a step can only pass on, 3 u D for
+the leak, and up to 12 u D for a refractory period in place of the 2 u D of potential and product: no more than 24 u D
+in all. The most events of such a clip are counted EFFECTS_MARGIN times, which has room for that.
+
 Everything here is sums, products and correctly rounded roots: every host comes to the same decision.
 """
 
@@ -31,7 +35,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS
+from v2v_protocol.recipe import LARGEST_EVENTS, LIMITS_OF_EFFECTS, SMALLEST_PHOTORECEPTOR_HZ
+from v2v_protocol.sample import Effects
 
 AUTO = "auto"
 Real = type[np.floating[Any]]
@@ -39,6 +44,9 @@ LIMITS: dict[str, tuple[Real, float]] = {"float32": (np.float32, 2.0**20), "floa
 """Most events a pixel may fire in a clip, by arithmetic; narrowest first."""
 THRESHOLD_ENDS = (2.0**-100, 2.0**100)
 """Thresholds between these neither overflow nor lose digits to underflow, in either arithmetic."""
+
+EFFECTS_MARGIN = 4.0
+"""How many times the error of the plain model that with effects may be."""
 
 
 def choose(asked: str, events: float) -> Real:
@@ -74,6 +82,26 @@ def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
     for name, value in (("threshold_pos", threshold_pos), ("threshold_neg", threshold_neg)):
         if not low <= value <= high:
             raise UsageError(f"{name} = {value!r}: give a number from {low:.3g} to {high:.3g}")
+
+
+def check_effects(effects: Effects, pixels: int) -> None:
+    """Refuses effects outside the limits of a recipe.
+
+    Raises:
+        UsageError: one is; the message names it, the value and the limits.
+    """
+    for name, (low, high) in LIMITS_OF_EFFECTS.items():
+        value = getattr(effects, name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
+            raise UsageError(f"{name} = {value!r}: give a number from {low} to {high}")
+    if 0.0 < effects.photoreceptor_hz < SMALLEST_PHOTORECEPTOR_HZ:
+        raise UsageError(
+            f"photoreceptor_hz = {effects.photoreceptor_hz!r}: give 0 for no low-pass, or "
+            f"{SMALLEST_PHOTORECEPTOR_HZ} or more"
+        )
+    count = effects.dead_pixel_count
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= pixels:
+        raise UsageError(f"dead_pixel_count = {count!r}: give a whole number from 0 to {pixels}")
 
 
 def error_bound(real: Real, events: float, smaller_threshold: float) -> float:

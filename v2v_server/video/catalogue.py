@@ -7,14 +7,16 @@ import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, VideoChanged
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
 from v2v_server.video.index import FrameIndex, unseekable
 from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.video.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.rows import Rows
+from v2v_server.video.scene import Scene
+from v2v_server.video.scenes import Looking
 from v2v_server.video.store import Record, Store
 from v2v_server.video.survey import survey
 from v2v_server.video.tree import VIDEO_SUFFIXES, printable, video_files
@@ -37,6 +39,8 @@ class VideoEntry:
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
+        runs: (first frame, frame after the last) of each stretch without a cut and with something to see; None where
+            the catalogue was opened without ``scene``.
     """
 
     id: str
@@ -48,6 +52,7 @@ class VideoEntry:
     codec: str
     threshold_pos: float | None = None
     threshold_neg: float | None = None
+    runs: tuple[tuple[int, int], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +77,7 @@ class Catalogue:
         prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.video.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
+        scene_digest: names this snapshot together with the statistics of its videos; None without them.
     """
 
     root: Path
@@ -81,9 +87,12 @@ class Catalogue:
     notes: tuple[str, ...]
     digest: str
     prepared: Header | None
+    scene_digest: str | None
     _store: Store = field(repr=False, compare=False)
     _fingerprints: dict[str, str] = field(repr=False, compare=False)
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
+    _looking: Looking | None = field(repr=False, compare=False)
+    _unseen: frozenset[str] = field(repr=False, compare=False)
 
     def path(self, id: str) -> Path:
         """Where the video lies.
@@ -113,6 +122,45 @@ class Catalogue:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return FrameIndex.from_bytes(data)
 
+    def scene(self, id: str) -> Scene:
+        """The statistics of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue, the catalogue was opened without ``scene``, or the index can no
+                longer be read.
+            VideoChanged: another process has catalogued a changed file under this id since.
+        """
+        fingerprint = self._fingerprint(id)
+        if self._looking is None:
+            raise CorpusError("this catalogue was opened without statistics of its videos")
+        if id in self._unseen:
+            return Scene.unknown()
+        try:
+            data = self._store.scene(id, fingerprint, self._looking.key)
+        except sqlite3.Error as error:
+            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return Scene.from_bytes(data)
+
+    def digest_under(self, scene: str) -> str:
+        """The digest that names this snapshot in samples of a spec.
+
+        Args:
+            scene: of the spec; with "off" the statistics do not count.
+
+        Raises:
+            UsageError: "auto", and the catalogue was opened without ``scene``.
+        """
+        if scene == "off":
+            return self.digest
+        if self.scene_digest is None:
+            raise UsageError(
+                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
+                "server with --scene auto"
+            )
+        return self.scene_digest
+
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""
         self._store.close()
@@ -129,6 +177,7 @@ def open_catalogue(
     list_file: str | os.PathLike[str] | None = None,
     rows: Rows | None = None,
     cache_dir: str | os.PathLike[str] | None = None,
+    scene: bool = False,
     processes: int = 1,
     progress: Progress | None = None,
 ) -> Catalogue:
@@ -140,6 +189,8 @@ def open_catalogue(
         rows: which rows may be used; all when None.
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
             ``~/.cache/v2v``.
+        scene: also take in what the videos show, which decodes what was not looked at yet; see
+            :mod:`v2v_server.video.scene`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
 
@@ -158,9 +209,10 @@ def open_catalogue(
         refuse_prepared_below(root, ids)
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
-    store, records, notes = _up_to_date(root, ids, index_path(root, cache_dir), processes, progress)
+    looking = Looking(rows or Rows(), manifest) if scene else None
+    store, records, notes = _up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress)
     try:
-        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest)
+        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
     except BaseException:
         store.close()
         raise
@@ -195,22 +247,32 @@ def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
 
 
 def _up_to_date(
-    root: Path, ids: Sequence[str], path: Path, processes: int, progress: Progress | None
+    root: Path,
+    ids: Sequence[str],
+    path: Path,
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
 ) -> tuple[Store, dict[str, Record], list[str]]:
     """An open index that knows every id, and its records; in memory, with a note, where the file cannot serve."""
     try:
-        return *_refreshed(path, root, ids, processes, progress), []
+        return *_refreshed(path, root, ids, looking, processes, progress), []
     except (sqlite3.Error, OSError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        return *_refreshed(None, root, ids, processes, progress), [note]
+        return *_refreshed(None, root, ids, looking, processes, progress), [note]
 
 
 def _refreshed(
-    path: Path | None, root: Path, ids: Sequence[str], processes: int, progress: Progress | None
+    path: Path | None,
+    root: Path,
+    ids: Sequence[str],
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
 ) -> tuple[Store, dict[str, Record]]:
     store = Store(path)
     try:
@@ -222,7 +284,10 @@ def _refreshed(
             for batch in _batches(found, len(stale), progress):
                 store.put(batch)
                 known.update((record.id, record) for record in batch)
-        return store, {id: known[id] for id in ids}
+        records = {id: known[id] for id in ids}
+        if looking is not None:
+            looking.take_in(store, root, records, processes, progress)
+        return store, records
     except BaseException:
         store.close()
         raise
@@ -257,6 +322,7 @@ def _snapshot(
     notes: list[str],
     store: Store,
     manifest: Manifest | None,
+    looking: Looking | None,
 ) -> Catalogue:
     by_id = {entry.id: entry for entry in listed}
     problems = dict(refused)
@@ -284,18 +350,44 @@ def _snapshot(
         notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{_told(reasons)}"]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
+    digest = _digest(rows, videos)
+    scene_digest, unseen = None, set(absent)
+    if looking is not None:
+        videos, scene_digest = _with_runs(videos, unseen, store, looking, digest)
+        if died := sorted(unseen - absent.keys()):
+            notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
     return Catalogue(
         root=root,
         rows=rows,
         videos=tuple(videos),
         problems=tuple(Problem(id, problems[id]) for id in sorted(problems)),
         notes=tuple(notes),
-        digest=_digest(rows, videos),
+        digest=digest,
         prepared=None if manifest is None else manifest.header,
+        scene_digest=scene_digest,
         _store=store,
         _fingerprints={video.id: video.fingerprint for video in videos},
         _absent=absent,
+        _looking=looking,
+        _unseen=frozenset(unseen),
     )
+
+
+def _with_runs(
+    videos: Sequence[VideoEntry], unseen: set[str], store: Store, looking: Looking, digest: str
+) -> tuple[list[VideoEntry], str]:
+    """The videos with their runs, and the digest of all that is known of them; ``unseen`` receives the ids of those of
+    which nothing is."""
+    sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+    seen = []
+    for video in videos:
+        data = None if video.id in unseen else store.scene(video.id, video.fingerprint, looking.key)
+        if data is None:
+            unseen.add(video.id)
+        scene = Scene.unknown() if data is None else Scene.from_bytes(data)
+        sha.update(scene.to_bytes())
+        seen.append(replace(video, runs=tuple(scene.runs(video.frames))))
+    return seen, sha.hexdigest()[:32]
 
 
 def _entry(record: Record, entry: ListEntry) -> VideoEntry:

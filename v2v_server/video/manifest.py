@@ -10,16 +10,18 @@ from __future__ import annotations
 import json
 import math
 import os
+from base64 import b64decode
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any
 
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.video.encode import Encoding
 from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
+from v2v_server.video.scene import Scene
 from v2v_server.video.store import Record
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
@@ -70,6 +72,7 @@ class PreparedVideo:
         psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
         worst_psnr_db: the same of the worst frame.
         problem: why there is no prepared file; None if there is one.
+        scene: statistics of the source's frames, base64 of ``Scene.to_bytes()``; "" where they were not asked for.
     """
 
     id: str
@@ -84,6 +87,7 @@ class PreparedVideo:
     psnr_db: float | None = None
     worst_psnr_db: float | None = None
     problem: str | None = None
+    scene: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +251,10 @@ class ManifestWriter:
 
 
 def _line(item: Header | PreparedVideo) -> bytes:
-    return json.dumps(asdict(item), allow_nan=False).encode() + b"\n"
+    values = asdict(item)
+    if isinstance(item, PreparedVideo) and not item.scene:
+        del values["scene"]  # earlier versions of this program know no such field
+    return json.dumps(values, allow_nan=False).encode() + b"\n"
 
 
 def _header(line: bytes) -> Header:
@@ -274,6 +281,11 @@ def _video(line: bytes) -> PreparedVideo:
     sizes = (video.height_px, video.width_px)
     if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(_whole(size, 0, LARGEST_SIDE_PX) for size in sizes):
         raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
+    if video.scene:
+        try:
+            Scene.from_bytes(b64decode(video.scene, validate=True))
+        except ProtocolError as error:
+            raise ValueError(f"{video.id}: {error}") from error
     return video
 
 

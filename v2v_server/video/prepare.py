@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import math
 import os
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -96,6 +97,7 @@ def prepare(
     *,
     processes: int = 1,
     floor_db: float = DEFAULT_FLOOR_DB,
+    scene: bool = False,
     progress: Progress | None = None,
 ) -> Report:
     """Transcode a corpus; a video that cannot be is recorded with the reason, and the others go on.
@@ -106,6 +108,7 @@ def prepare(
         encoding: codec settings.
         processes: how many transcode at a time, spawned; 0 transcodes in this one.
         floor_db: least PSNR of a clip for ``Report.below_floor``.
+        scene: also take the statistics of what each video shows; one prepared without them is prepared again.
         progress: told at the start and after each video.
 
     Raises:
@@ -125,9 +128,9 @@ def prepare(
         target.mkdir(parents=True, exist_ok=True)
         with _locked(target):
             known = _known(target, header)
-            kept = {video.id: known[video.id] for video in catalogue.videos if _stands(target, video, known)}
+            kept = {video.id: known[video.id] for video in catalogue.videos if _stands(target, video, known, scene)}
             with ManifestWriter(target, header, kept.values()) as manifest:
-                made = _transcode_rest(catalogue, target, encoding, kept, processes, manifest, progress)
+                made = _transcode_rest(catalogue, target, encoding, kept, scene, processes, manifest, progress)
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     records = kept | made
@@ -180,10 +183,12 @@ def _known(target: Path, header: Header) -> dict[str, PreparedVideo]:
     return manifest.videos
 
 
-def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
+def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo], scene: bool) -> bool:
     """Whether the prepared file is there, unchanged, and that of this state of the source."""
     record = known.get(video.id)
     if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
+        return False
+    if scene and not record.scene:
         return False
     try:
         return fingerprint(target / video.id) == record.fingerprint
@@ -196,6 +201,7 @@ def _transcode_rest(
     target: Path,
     encoding: Encoding,
     kept: dict[str, PreparedVideo],
+    scene: bool,
     processes: int,
     manifest: ManifestWriter,
     progress: Progress | None,
@@ -206,7 +212,7 @@ def _transcode_rest(
     made: dict[str, PreparedVideo] = {}
     if progress is not None:
         progress(done, total)
-    for record in _records(catalogue, left.values(), target, encoding, processes):
+    for record in _records(catalogue, left.values(), target, encoding, scene, processes):
         manifest.add(record)
         made[record.id] = record
         done += left[record.id].frames
@@ -216,7 +222,12 @@ def _transcode_rest(
 
 
 def _records(
-    catalogue: Catalogue, videos: Iterable[VideoEntry], target: Path, encoding: Encoding, processes: int
+    catalogue: Catalogue,
+    videos: Iterable[VideoEntry],
+    target: Path,
+    encoding: Encoding,
+    scene: bool,
+    processes: int,
 ) -> Iterator[PreparedVideo]:
     jobs = []
     for video in videos:
@@ -231,7 +242,7 @@ def _records(
             index = catalogue.frame_index(id).to_bytes()
             yield job, Transcoding(
                 catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second, job.window, encoding,
-                target, target / id,
+                target, target / id, scene,
             )  # fmt: skip
 
     for (job, _), result in run_isolated(_attempt, transcodings(), processes):
@@ -278,6 +289,7 @@ def _record(video: VideoEntry, height: int, width: int, result: Made | str) -> P
         bytes=result.bytes,
         psnr_db=result.psnr_db,
         worst_psnr_db=result.worst_psnr_db,
+        scene="" if result.scene is None else b64encode(result.scene.to_bytes()).decode(),
     )
 
 

@@ -8,7 +8,7 @@ alone, it does not matter which of them wrote it.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +31,16 @@ CREATE TABLE video (
     codec TEXT NOT NULL,
     problem TEXT,
     frame_index BLOB
+)"""
+
+
+_SCENES = """
+CREATE TABLE IF NOT EXISTS scene (
+    id TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    look TEXT NOT NULL,
+    data BLOB NOT NULL,
+    PRIMARY KEY (id, look)
 )"""
 
 
@@ -115,6 +125,36 @@ class Store:
         row = self._database.execute(query, (id, fingerprint)).fetchone()
         return None if row is None else row[0]
 
+    def looked_at(self, look: str) -> dict[str, str]:
+        """Fingerprint by id of the files whose scene is known.
+
+        Args:
+            look: how and at which rows, see :class:`v2v_server.video.scenes.Looking`.
+
+        Raises:
+            sqlite3.Error: the file is damaged or cannot be written.
+        """
+        self._database.execute(_SCENES)
+        return dict(self._database.execute("SELECT id, fingerprint FROM scene WHERE look = ?", (look,)).fetchall())
+
+    def scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
+        """The encoded scene of a file; None if the index has none of that state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
+        row = self._database.execute(query, (id, fingerprint, look)).fetchone()
+        return None if row is None else row[0]
+
+    def put_scenes(self, scenes: Iterable[tuple[str, str, str, bytes]]) -> None:
+        """Add or replace (id, fingerprint, look, encoded scene), in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._change("INSERT OR REPLACE INTO scene (id, fingerprint, look, data) VALUES (?, ?, ?, ?)", list(scenes))
+
     def put(self, records: Iterable[Record]) -> None:
         """Add or replace records, in one transaction.
 
@@ -132,7 +172,7 @@ class Store:
         """
         self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
 
-    def _change(self, statement: str, rows: list[tuple[object, ...]]) -> None:
+    def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
         if not rows:
             return
         self._database.execute("BEGIN IMMEDIATE")

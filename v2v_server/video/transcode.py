@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -21,9 +21,11 @@ from v2v_server.video.decode import decode_luma
 from v2v_server.video.encode import Encoding, encode_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.index import FrameIndex
+from v2v_server.video.look import Look
 from v2v_server.video.luma import LumaFormat, copy_luma, range_table
 from v2v_server.video.orientation import Orientation, Window
 from v2v_server.video.probe import probe
+from v2v_server.video.scene import MOST_FRAMES, Scene
 from v2v_server.video.source import opened, pictures, reason
 
 PARTIAL_SUFFIX = ".v2v-partial"
@@ -47,6 +49,7 @@ class Transcoding:
         encoding: codec settings.
         root: the folder that the target must not leave, resolved.
         target: the file to make; its folder is made if missing.
+        scene: whether to take the statistics of what it shows.
     """
 
     source: Path
@@ -57,6 +60,7 @@ class Transcoding:
     encoding: Encoding
     root: Path
     target: Path
+    scene: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +70,14 @@ class Made:
     Attributes:
         fingerprint, bytes: of it.
         psnr_db, worst_psnr_db: of all frames together and of the worst, against what the source decodes to.
+        scene: of the source's frames; None where it was not asked for.
     """
 
     fingerprint: str
     bytes: int
     psnr_db: float
     worst_psnr_db: float
+    scene: Scene | None = None
 
 
 def transcode(job: Transcoding) -> Made:
@@ -94,6 +100,9 @@ def transcode(job: Transcoding) -> Made:
     try:
         height, width = job.window[2:]
         frames = luma_frames(job.source, index, job.window)
+        seen = Look()
+        if job.scene:
+            frames = _watched(frames, seen)
         encode_luma(partial, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)
         made = _verified(job, index, partial, pts, time_base)
         with partial.open("rb") as file:
@@ -101,7 +110,15 @@ def transcode(job: Transcoding) -> Made:
         partial.replace(job.target)
     finally:
         partial.unlink(missing_ok=True)
-    return made
+    return replace(made, scene=seen.scene()) if job.scene else made
+
+
+def _watched(frames: Iterator[npt.NDArray[np.uint8]], seen: Look) -> Iterator[npt.NDArray[np.uint8]]:
+    """The same frames; those at the beginning are looked at on their way."""
+    for number, frame in enumerate(frames):
+        if number < MOST_FRAMES:
+            seen.add(frame)
+        yield frame
 
 
 def luma_frames(path: str | os.PathLike[str], index: FrameIndex, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
