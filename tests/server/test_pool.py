@@ -23,6 +23,14 @@ SLEEPS = "import time\ntime.sleep(600)"
 LEAVES = "import sys\nsys.exit(3)"
 
 
+@pytest.fixture(autouse=True)
+def _hangups_count() -> Iterator[None]:
+    """Under ``nohup`` they are ignored, and children inherit that."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool]]:
     """Makes a pool of programs given as Python text; all are gone at the end."""
