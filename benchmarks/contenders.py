@@ -111,7 +111,7 @@ def line_up(source: Corpus, prepared: list[Corpus], presets: list[str]) -> list[
 def _released(corpus: Corpus, setting: Setting) -> Measured:
     dataset = ReleasedStyleDataset(corpus.videos, rows=corpus.rows)
     loader = DataLoader(dataset, batch_size=setting.batch_size, num_workers=setting.workers)
-    return _measure(setting, iter(loader), _own_cpu_seconds)
+    return _measure(setting, iter(loader), _own_cpu_seconds, burst=setting.workers)
 
 
 def _preset(name: str, corpus: Corpus, setting: Setting) -> Measured:
@@ -128,7 +128,8 @@ def _preset(name: str, corpus: Corpus, setting: Setting) -> Measured:
         def cpu_seconds() -> float:
             return sum(server.cpu_seconds().values()) + _cpu_seconds(psutil.Process())
 
-        measured = _measure(setting, batches(), cpu_seconds)
+        views = int(SPEED_PRESETS[name]["samples_per_decode"])
+        measured = _measure(setting, batches(), cpu_seconds, burst=views)
     achieved = made["samples"] / made["decodes"]
     return Measured(measured.batches, measured.seconds, measured.cpu_seconds, achieved)
 
@@ -169,12 +170,17 @@ def _decode_jobs(corpus: Corpus, workers: int, number: int, count: Any, stop: Ev
             count.value += 1
 
 
-def _measure(setting: Setting, stream: Iterator[object], cpu_seconds: Callable[[], float]) -> Measured:
-    """Counts whole batches after the warm-up until the time is over."""
-    for _ in range(setting.warmup_batches):
+def _measure(setting: Setting, stream: Iterator[object], cpu_seconds: Callable[[], float], burst: int = 1) -> Measured:
+    """Counts whole batches after the warm-up until the time is over.
+
+    Args:
+        burst: batches come so many at a time (each loader process makes one; siblings finish K batches together), so
+            that only whole bursts are counted: a window that ended within one would be off by half of it.
+    """
+    for _ in range(-(-setting.warmup_batches // burst) * burst):
         next(stream)
     cpu, started, taken = cpu_seconds(), time.perf_counter(), 0
-    while time.perf_counter() - started < setting.seconds:
+    while time.perf_counter() - started < setting.seconds or taken % burst:
         next(stream)
         taken += 1
     return Measured(taken, time.perf_counter() - started, cpu_seconds() - cpu)
