@@ -42,7 +42,8 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, encode_sample
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
+from v2v_server.handover import sample_message
 from v2v_server.process import die_with_parent, keep_freed_memory
 
 CREDIT = 2
@@ -160,14 +161,8 @@ def answer(lease: Lease, name: str) -> list[Any]:
         decoder="none",
         quarantine=lease.quarantine,
     )
-    return encode_sample(
-        epoch=lease.epoch,
-        index=index,
-        arrays=_arrays(lease.spec, lease.arrays),
-        provenance=provenance.to_dict(),
-        worker=name,
-        cpu_seconds=0.0,
-    )
+    arrays = _arrays(lease.spec, lease.arrays)
+    return sample_message(lease, arrays, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
 
 
 @lru_cache(maxsize=4)

@@ -11,7 +11,9 @@ Rules
     Nothing heard for ``timeout_seconds`` of listening: ServerLost.
 
 Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
-answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again.
+answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again. Workers on
+this host put them into an arena (:mod:`v2v_protocol.arena`). A sample asked for again is asked for without a slot:
+its first worker may be at it still, and has one.
 
 A connection belongs to the process that made it; its ZeroMQ context is made when it is opened, never before a fork.
 """
@@ -22,17 +24,19 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
-import numpy.typing as npt
 import zmq
 
+from v2v_client.arena import Arena, open_arena
+from v2v_client.arrival import Arrival, InMessage, InSlot, Payload
 from v2v_client.link import Link
 from v2v_client.liveness import Due, Liveness, Patience
+from v2v_client.slots import Answer, Slots
 from v2v_client.state import Stream
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.messages import (
     ErrorCode,
@@ -48,34 +52,13 @@ from v2v_protocol.messages import (
     Welcome,
 )
 from v2v_protocol.sample import Provenance, SampleId, array_layout
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_sample, encode
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_sample, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
 _MOST_CREDIT_REFUSALS = 3
 
 Layout = dict[str, tuple[str, tuple[int, ...]]]
-
-
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """One sample off the wire.
-
-    Attributes:
-        index: global index.
-        arrays: read-only views of the received message, by name.
-        provenance: where it came from.
-        worker: name of the server worker that made it.
-        cpu_seconds: processor time that took there.
-        decoded: whether a clip was decoded for it.
-    """
-
-    index: int
-    arrays: Mapping[str, npt.NDArray[Any]]
-    provenance: Provenance
-    worker: str
-    cpu_seconds: float
-    decoded: bool
 
 
 class Connection:
@@ -88,6 +71,7 @@ class Connection:
         pinned: the stream that the server must offer; None takes what it offers.
         pinned_by: what pinned it, in words, for the message of a mismatch.
         patience: when to ping, to ask again and to give up.
+        shared_memory: whether workers on this host may put samples into memory of this process.
         clock: seconds, never going back.
 
     Attributes:
@@ -109,6 +93,7 @@ class Connection:
         pinned: Stream | None = None,
         pinned_by: str = "this dataset",
         patience: Patience | None = None,
+        shared_memory: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._address = address
@@ -120,6 +105,9 @@ class Connection:
         self._patience = patience or Patience()
         self._clock = clock
         self._process = os.getpid()
+        self._shared_memory = shared_memory
+        self._arena: Arena | None = None
+        self._slots = Slots()
         self._link: Link | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._liveness = Liveness(self._patience, clock())
@@ -159,6 +147,7 @@ class Connection:
             self.layout = self._layout(self._pinned)
             largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
             self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, largest)
+            self._arena = open_arena(self.layout) if self._shared_memory else None
             self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
         except BaseException:
@@ -190,16 +179,20 @@ class Connection:
         link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
 
     def close(self) -> None:
-        """Leaves the server and frees socket, context and thread. May be called again, and in a forked child, where
-        it does nothing."""
+        """Leaves the server and frees socket, context, thread and arena. May be called again, and in a forked child,
+        where it does nothing."""
         if os.getpid() != self._process:
             return
         link, self._link = self._link, None
-        if link is not None:
-            try:
+        arena, self._arena = self._arena, None
+        try:
+            if link is not None:
                 self._leave(link)
-            finally:
+        finally:
+            if link is not None:
                 link.close()
+            if arena is not None:
+                arena.close()
 
     # --- asking and receiving -----------------------------------------------------------------------------------------
 
@@ -214,9 +207,18 @@ class Connection:
             return
         room = self.credit - len(self._asked)
         now = [self._queued.popleft() for _ in range(min(room, len(self._queued)))]
-        if now:
-            self._asked.update(dict.fromkeys(now))
+        if not now:
+            return
+        self._asked.update(dict.fromkeys(now))
+        if self._arena is None:
             self._send(Want(self._epoch, tuple(now)))
+            return
+        again = tuple(index for index in now if self._slots.of(index) != NO_SLOT)
+        if again:
+            self._send(Want(self._epoch, again))
+        slots = {index: self._slots.take(index) for index in now if index not in again}
+        if slots:
+            self._send(Want(self._epoch, tuple(slots), self._arena.name, tuple(slots.values())))
 
     def _want_again(self) -> None:
         # In the order they were asked; after a Welcome with less credit, the rest waits its turn.
@@ -344,12 +346,15 @@ class Connection:
         if header.epoch != self._epoch:
             self.strays += 1
             return None
-        arrays = decode_sample(header, [frame.buffer for frame in payload])
-        found = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
-        if found != self.layout:
+        found = layout_of(header)
+        if list(found.items()) != list(self.layout.items()):  # in a slot, the order says which is which
             raise ProtocolError(
                 f"{self._address} sent sample {header.index} of epoch {header.epoch} as {found}; asked: {self.layout}"
             )
+        arrays = self._payload(header, payload)
+        if arrays is None:
+            self.strays += 1
+            return None
         provenance = Provenance.from_dict(header.provenance)
         identity = SampleId(
             spec_digest=self.stream.spec_digest,
@@ -367,6 +372,18 @@ class Connection:
         self._last = header.index
         self.want(())
         return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds, header.decoded)
+
+    def _payload(self, header: SampleHeader, payload: list[zmq.Frame]) -> Payload | None:
+        """Where the arrays are; None where nobody knows: in a slot that was not named for them, or not any more."""
+        slot = self._slots.of(header.index)
+        in_message = bool(payload) or header.slot == NO_SLOT
+        arrays = decode_sample(header, [frame.buffer for frame in payload]) if in_message else {}
+        match self._slots.answered(header.index, header.slot, in_message=in_message):
+            case Answer.THERE if self._arena is not None:
+                return InSlot(self._arena, self._slots, slot)
+            case Answer.ABANDONED if self._arena is not None:
+                self._arena.free(slot)
+        return InMessage(arrays) if in_message else None
 
     # --- the link -----------------------------------------------------------------------------------------------------
 

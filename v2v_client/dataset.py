@@ -71,6 +71,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             options below may change what it sets.
         voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
             flow_*, scene: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
+        shared_memory: whether server workers on this host may put samples into memory of this process, which saves
+            most of what moving them costs; where they cannot, samples come in messages by themselves.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
 
@@ -82,7 +84,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
     twice its number of workers if that is more; ``samples_per_decode`` times as much (in whole batches) where siblings
     share a decode; less where ``--max-credit-bytes`` says so.
 
-        received, waiting in ZeroMQ    C S           (2 C S while everything is asked for again)
+        received, waiting              C S           (2 C S while everything is asked for again)
         batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
         at the server, not yet sent    C S
 
@@ -118,6 +120,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         flow_from: int | None = None,
         flow_margin_px: int | None = None,
         scene: str | None = None,
+        shared_memory: bool = True,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
     ) -> None:
@@ -146,6 +149,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             scene=scene,
         )
         self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
+        self._shared_memory = shared_memory
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
         self._progress = Progress(_whole("epoch", epoch, 0, LARGEST_EPOCH))
@@ -348,6 +352,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
             patience=self._patience,
+            shared_memory=self._shared_memory,
         )
         try:
             connection.open()

@@ -9,9 +9,10 @@ from typing import Any
 import numpy.typing as npt
 import torch
 
+from v2v_client.arrival import Arrival
 from v2v_client.batch import Batch
 from v2v_client.buffers import BufferPool
-from v2v_client.connection import Arrival, Connection
+from v2v_client.connection import Connection
 from v2v_client.ordering import ReorderWindow
 from v2v_client.world import EpochPlan
 from v2v_protocol.errors import ProtocolError
@@ -28,8 +29,7 @@ class _Draft:
         self.decodes = 0
 
     def fill(self, row: int, sample: Arrival) -> None:
-        for name, array in sample.arrays.items():
-            self.arrays[name][row] = array  # the one copy between the wire and the trainer
+        sample.payload.copy_to({name: array[row] for name, array in self.arrays.items()})
         self.provenance[row] = sample.provenance
         self.cpu_seconds += sample.cpu_seconds
         self.decodes += sample.decoded
@@ -67,6 +67,7 @@ def deliver(
     def accept(sample: Arrival) -> None:
         slot = window.receive(sample.index)
         if slot is None:
+            sample.payload.drop()
             return
         if slot.batch not in drafts:
             drafts[slot.batch] = _Draft({name: pool.take() for name, pool in pools.items()}, plan.batch_size)

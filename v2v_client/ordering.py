@@ -18,6 +18,9 @@ from dataclasses import dataclass
 
 from v2v_protocol.errors import LimitExceeded
 
+_REQUESTS_A_CREDIT = 8
+"""A request asks for at least this part of the credit; so much less of it is ever under way."""
+
 
 @dataclass(frozen=True, slots=True)
 class Slot:
@@ -73,12 +76,18 @@ class ReorderWindow:
         return tuple(self._outstanding)
 
     def ask(self) -> tuple[int, ...]:
-        """What to ask for now, within both limits; it counts as asked for from here on."""
+        """What to ask for now, within both limits; it counts as asked for from here on.
+
+        Nothing as long as it is little and some is under way: a request for every sample that arrives would cost the
+        server as much as the sample does.
+        """
         asked: list[int] = []
         room = min(
             self._credit - len(self._outstanding),
             self._credit + self._batch_size - len(self._slots),
         )
+        if room < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
+            return ()
         while len(asked) < room:
             if not self._unasked and not self._begin_batch():
                 break

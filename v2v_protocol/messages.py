@@ -60,10 +60,17 @@ class Want:
     """Asks for samples of one epoch; each index is one unit of credit spent until it is answered.
 
     An index that is asked for again while it is in work is not made twice.
+
+    Attributes:
+        epoch, indices: which samples.
+        arena: memory that workers of the same host may put them into, see :mod:`v2v_protocol.arena`; empty: none.
+        slots: the slot for each index, or none at all.
     """
 
     epoch: int
     indices: tuple[int, ...]
+    arena: str = ""
+    slots: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +111,8 @@ class Welcome:
 class SampleHeader:
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
+    With ``slot`` set and no frames behind it, the arrays lie in that slot, one after the other.
+
     Attributes:
         epoch, index: which sample.
         names, dtypes: of the arrays, in the order of the raw frames.
@@ -112,6 +121,7 @@ class SampleHeader:
         worker: name of the server worker that made it.
         cpu_seconds: processor time it took there.
         decoded: whether a clip was decoded for it; False where it came from that of a sibling.
+        slot: the slot that the lease named, to which this worker writes no more; 0: it named none.
     """
 
     epoch: int
@@ -123,6 +133,7 @@ class SampleHeader:
     worker: str
     cpu_seconds: float
     decoded: bool = True
+    slot: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +230,7 @@ class Lease:
         deadline_seconds: a worker silent for longer than this is taken for hung.
         quarantine: number of the quarantine snapshot that let the candidate pass.
         scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.
+        arena, slot: where the sample may be put, see :mod:`v2v_protocol.arena`; "" and 0: in the message only.
     """
 
     lease: int
@@ -244,6 +256,8 @@ class Lease:
     deadline_seconds: float
     quarantine: int = 0
     scene: bytes = b""
+    arena: str = ""
+    slot: int = 0
 
 
 @dataclass(frozen=True, slots=True)

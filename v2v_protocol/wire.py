@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
@@ -97,8 +98,15 @@ def encode_sample(
     worker: str,
     cpu_seconds: float,
     decoded: bool = True,
+    slot: int = NO_SLOT,
+    in_slot: bool = False,
 ) -> Frames:
     """A whole SampleHeader message. The arrays are not copied: leave them alone until they are sent.
+
+    Args:
+        slot: the slot that the lease named.
+        in_slot: the arrays lie there, so the header goes alone.
+        epoch, index, arrays, provenance, worker, cpu_seconds, decoded: see :class:`SampleHeader`.
 
     Raises:
         LimitExceeded: an array dtype that is not on the allow-list, or an array that is not C-contiguous.
@@ -118,7 +126,10 @@ def encode_sample(
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
+        slot=slot,
     )
+    if in_slot:
+        return encode(header)
     return [*encode(header), *(array.reshape(-1).view(np.uint8).data for array in arrays.values())]
 
 
@@ -160,15 +171,34 @@ def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, 
     Raises:
         ProtocolError, LimitExceeded: names, dtypes, shapes and frame lengths do not agree, or break a limit.
     """
-    if not len(header.names) == len(header.dtypes) == len(payload):
+    if len(header.names) != len(payload):
         raise ProtocolError(
             f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
         )
-    if len(payload) > _MOST_ARRAYS or len(set(header.names)) != len(header.names):
-        raise LimitExceeded(f"sample: arrays {list(header.names)!r:.200}; at most {_MOST_ARRAYS}, no name twice")
     arrays: dict[str, npt.NDArray[Any]] = {}
+    for (name, (dtype, shape)), raw in zip(layout_of(header).items(), payload, strict=True):
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size != len(raw):
+            raise ProtocolError(f"sample: array {name!r:.40} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
+        array = np.frombuffer(raw, dtype=np.dtype(dtype)).reshape(shape)
+        array.flags.writeable = False
+        arrays[name] = array
+    return arrays
+
+
+def layout_of(header: SampleHeader) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """dtype and shape of each array of a sample, as its header says.
+
+    Raises:
+        ProtocolError, LimitExceeded: names, dtypes and shapes do not agree, or break a limit.
+    """
+    if len(header.names) != len(header.dtypes):
+        raise ProtocolError(f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes")
+    if len(header.names) > _MOST_ARRAYS or len(set(header.names)) != len(header.names):
+        raise LimitExceeded(f"sample: arrays {list(header.names)!r:.200}; at most {_MOST_ARRAYS}, no name twice")
+    layout: dict[str, tuple[str, tuple[int, ...]]] = {}
     rest = list(header.shapes)
-    for name, dtype, raw in zip(header.names, header.dtypes, payload, strict=True):
+    for name, dtype in zip(header.names, header.dtypes, strict=True):
         if dtype not in ARRAY_DTYPES:
             raise ProtocolError(
                 f"sample: array {name!r:.40} of dtype {dtype!r:.40}; allowed: {', '.join(ARRAY_DTYPES)}"
@@ -180,14 +210,10 @@ def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, 
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if size > LARGEST_ARRAY_BYTES:
             raise LimitExceeded(f"sample: array {name!r:.40} of {size} bytes; the limit is {LARGEST_ARRAY_BYTES}")
-        if size != len(raw):
-            raise ProtocolError(f"sample: array {name!r:.40} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
-        array = np.frombuffer(raw, dtype=np.dtype(dtype)).reshape(shape)
-        array.flags.writeable = False
-        arrays[name] = array
+        layout[name] = (dtype, shape)
     if rest:
         raise ProtocolError(f"sample: {len(rest)} extents belong to no array")
-    return arrays
+    return layout
 
 
 # --- field checks -----------------------------------------------------------------------------------------------------

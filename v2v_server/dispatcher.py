@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.arena import LARGEST_SLOT, ArenaName, Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
@@ -27,7 +29,7 @@ from v2v_protocol.messages import (
     Want,
     WorkerHello,
 )
-from v2v_protocol.sample import Refusal, SampleId
+from v2v_protocol.sample import Refusal, SampleId, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
@@ -145,9 +147,13 @@ class Dispatcher:
 
     def _want(self, session: Session, want: Want) -> list[Instruction]:
         try:
+            slots = _slots(want)
+        except ProtocolError as error:
+            return [ToConsumer(session.identity, self._malformed(error))]
+        try:
             for index in want.indices[:1]:
                 SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
-            self.sessions.want(session, want.epoch, want.indices)
+            self.sessions.want(session, want.epoch, want.indices, slots)
         except LimitExceeded as error:
             return [_refuse(session.identity, ErrorCode.CREDIT, str(error))]
         except (IndexError, UsageError) as error:
@@ -230,7 +236,7 @@ class Dispatcher:
             second = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone), other_than=worker)
             if second is not None and not runs_alone(task):
                 self.counters.second_leases += 1
-                instructions += self._grant(task, second, now)
+                instructions += self._grant(replace(task, slot=None), second, now)
         # A consumer that left may have freed a worker that was kept for it, or for its tasks.
         return instructions + self._assign(now)
 
@@ -265,10 +271,11 @@ class Dispatcher:
             return self._assign(now)
         self.counters.samples += 1
         self.counters.decodes += result.decoded
-        self.counters.bytes += sum(len(frame) for frame in payload)
         self.counters.worker_cpu_seconds += cpu_seconds
         if session is not None:
             self.counters.batches += 1 / session.batch_size
+            self.counters.bytes += layout_bytes(session.layout)
+            self.counters.in_slots += len(payload) == 1
         return [ToConsumer(task.session, payload), *self._assign(now)]
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
@@ -351,6 +358,20 @@ def _only(frames: Sequence[Buffer]) -> Message:
     if len(frames) != 1:
         raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
     return decode(frames[0])
+
+
+def _slots(want: Want) -> list[Slot]:
+    """Where the samples may be put.
+
+    Raises:
+        ProtocolError: that is nowhere.
+    """
+    if not want.slots:
+        return []
+    ArenaName.parse(want.arena)
+    if len(want.slots) != len(want.indices) or not all(0 < number <= LARGEST_SLOT for number in want.slots):
+        raise ProtocolError(f"want.slots: {len(want.slots)} for {len(want.indices)} indices, each 1 to {LARGEST_SLOT}")
+    return [Slot(want.arena, number) for number in want.slots]
 
 
 def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.leases import Task
@@ -72,4 +73,6 @@ def describe(
         refusals={"refusals": [dataclasses.asdict(refusal) for refusal in task.refusals]},
         deadline_seconds=deadline_seconds,
         scene=scene,
+        arena="" if task.slot is None else task.slot.arena,
+        slot=NO_SLOT if task.slot is None else task.slot.number,
     )

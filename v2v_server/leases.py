@@ -14,8 +14,9 @@ from __future__ import annotations
 import statistics
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Refusal
 
 SLOW_FACTOR = 3.0
@@ -37,6 +38,7 @@ class Task:
         deaths: unexplained deaths of workers that were at this candidate.
         snapshot: number of the quarantine snapshot under which those candidates were passed over.
         place: of the index in the epoch's order (:mod:`v2v_server.schedule`); None: the index itself.
+        slot: where its consumer lets it be put; given to one worker only.
     """
 
     session: bytes
@@ -47,6 +49,7 @@ class Task:
     deaths: int = 0
     snapshot: int = 0
     place: int | None = None
+    slot: Slot | None = None
 
     @property
     def clip(self) -> tuple[bytes, int, int, int]:
@@ -153,14 +156,16 @@ class LeaseBook:
             at: number of the lease it was at by its own record; None goes by what it announced.
 
         Returns:
-            those of its tasks that nobody else is at, oldest first, each with whether it had been begun.
+            those of its tasks that nobody else is at, oldest first, each with whether it had been begun; without their
+            slots, where this worker may still write.
         """
         returned = []
         for number in list(self._held.get(worker, ())):
             lease = self._leases[number]
             self._drop(number)
             if lease.task is not None and lease.task.sample not in self._out:
-                returned.append((lease.task, lease.begun_at is not None if at is None else number == at))
+                begun = lease.begun_at is not None if at is None else number == at
+                returned.append((replace(lease.task, slot=None), begun))
         return returned
 
     def overdue(self, now: float) -> set[bytes]:

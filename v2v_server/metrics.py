@@ -14,7 +14,8 @@ class Counters:
         samples: samples handed to consumers.
         batches: the same in batches of each consumer's own size (a fraction while one is filling).
         decodes: clips decoded for those samples; fewer than samples where siblings share one.
-        bytes: payload bytes of those samples.
+        bytes: of the arrays of those samples.
+        in_slots: samples put into memory shared with their consumer; the others travelled in messages.
         worker_cpu_seconds: processor time the workers took for them.
         refused_candidates: videos passed over because they could not give what they promised.
         unavailable: samples that no candidate could give.
@@ -29,6 +30,7 @@ class Counters:
     batches: float = 0.0
     decodes: int = 0
     bytes: int = 0
+    in_slots: int = 0
     worker_cpu_seconds: float = 0.0
     refused_candidates: int = 0
     unavailable: int = 0

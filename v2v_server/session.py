@@ -14,9 +14,10 @@ Memory: the server holds at most credit x sample bytes for a session in its queu
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+from v2v_protocol.arena import Slot
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import StreamSpec
@@ -98,14 +99,20 @@ class Sessions:
         if self._sessions.pop(identity, None) is not None:
             self._turns.remove(identity)
 
-    def want(self, session: Session, epoch: int, indices: Iterable[int]) -> None:
-        """The consumer asks for samples. Those it is already waiting for are not made twice.
+    def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot] = ()) -> None:
+        """The consumer asks for samples. Those it is already waiting for are not made twice, and keep their slots.
+
+        Args:
+            session: of the consumer.
+            epoch, indices: which samples.
+            slots: where each may be put; empty: none of them anywhere.
 
         Raises:
             LimitExceeded: more than its credit would then be unanswered; none of them is taken.
             IndexError: an index outside the epoch; none of them is taken.
         """
-        new = [index for index in dict.fromkeys(indices) if (epoch, index) not in session.unanswered]
+        places: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
+        new = [index for index in places if (epoch, index) not in session.unanswered]
         for index in new:
             if index >= session.schedule.count:
                 raise IndexError(f"index {index} of an epoch of {session.schedule.count} sequences")
@@ -116,7 +123,8 @@ class Sessions:
             )
         for index in new:
             session.unanswered.add((epoch, index))
-            session.waiting.append(Task(session.identity, epoch, index, place=session.schedule.place(index)))
+            place = session.schedule.place(index)
+            session.waiting.append(Task(session.identity, epoch, index, place=place, slot=places[index]))
 
     def next_task(self) -> Task | None:
         """The next task to give to a worker, by deficit round robin; None when nobody waits."""

@@ -34,8 +34,9 @@ from v2v_protocol.messages import (
     Stop,
     WorkerHello,
 )
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, encode_sample
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode
 from v2v_server.clips import Clips
+from v2v_server.handover import sample_message
 from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
@@ -151,17 +152,15 @@ class Worker:
             self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
             return
         cpu_seconds = time.process_time() - started
-        index = lease.indices[0]
-        frames = encode_sample(
-            epoch=lease.epoch,
-            index=index,
-            arrays=sample.arrays,
+        frames = sample_message(
+            lease,
+            sample.arrays,
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=cpu_seconds,
             decoded=decoded,
         )
-        self._send([*encode(Result(lease.lease, index, cpu_seconds, decoded)), *frames])
+        self._send([*encode(Result(lease.lease, lease.indices[0], cpu_seconds, decoded)), *frames])
 
     def _send(self, frames: Frames) -> None:
         self._socket.send_multipart(frames, copy=False)

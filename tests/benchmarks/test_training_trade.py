@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -35,7 +36,21 @@ def test_the_error_is_a_share_of_that_of_the_mean_grey(
     batch: Any = SimpleNamespace(arrays={"frames": frames, "voxels": true + 2 * seen})
     monkeypatch.setattr(training_trade, "NETWORKS", {"firenet": Sees})
     monkeypatch.setattr(training_trade, "load_into", lambda network, weights, ema: None)
-    assert training_trade.error_of_constant(Path("unused"), [batch, batch]) == pytest.approx(expected)
+    judgement = training_trade.judge_weights(Path("unused"), [batch, batch])
+    assert judgement == pytest.approx((expected, 1.0))
+
+
+def test_a_constant_has_no_correlation_and_a_negative_has_minus_one() -> None:
+    target = torch.rand(2, 4, 1, 8, 8)
+    assert training_trade.judge(torch.full_like(target, 0.5), target).correlation == pytest.approx(0.0, abs=1e-3)
+    assert training_trade.judge(1 - target, target).correlation == pytest.approx(-1.0)
+
+
+def test_correlation_is_that_of_the_later_half_within_each_frame() -> None:
+    """Numpy's, frame by frame; what the network sees before it has seen much does not count."""
+    target, prediction = torch.rand(2, 2, 4, 1, 8, 8)
+    expected = [np.corrcoef(prediction[b, t].flatten(), target[b, t].flatten())[0, 1] for b in (0, 1) for t in (2, 3)]
+    assert training_trade.judge(prediction, target).correlation == pytest.approx(np.mean(expected), abs=1e-5)
 
 
 def test_a_failed_training_says_which_and_why(tmp_path: Path) -> None:

@@ -30,9 +30,18 @@ def proxy(server: LocalServer) -> Iterator[Proxy]:
         yield running
 
 
-def dataset(proxy: Proxy, patience: Patience = QUICK, timeout_seconds: float = 30.0) -> V2VStreamDataset:
+def dataset(
+    proxy: Proxy, patience: Patience = QUICK, timeout_seconds: float = 30.0, *, shared_memory: bool = False
+) -> V2VStreamDataset:
+    """As on another host, unless it shares memory with the workers: then little but headers goes through the proxy."""
     return V2VStreamDataset(
-        proxy.address, batch_size=3, recipe=SMALL, seed=3, patience=patience, timeout_seconds=timeout_seconds
+        proxy.address,
+        batch_size=3,
+        recipe=SMALL,
+        seed=3,
+        patience=patience,
+        timeout_seconds=timeout_seconds,
+        shared_memory=shared_memory,
     )
 
 
@@ -49,6 +58,22 @@ def test_cut_after_every_batch(proxy: Proxy, undisturbed: list[str]) -> None:
         proxy.cut()
     assert got == undisturbed
     assert proxy.connections > 3
+
+
+def test_cut_after_every_batch_with_shared_memory(proxy: Proxy, undisturbed: list[str]) -> None:
+    """What was answered and not heard of is in slots that are never used again."""
+    got = []
+    for batch in dataset(proxy, NEVER_BY_THE_CLOCK, shared_memory=True):
+        got.append(digest(batch))
+        proxy.cut()
+    assert got == undisturbed
+
+
+@pytest.mark.parametrize("after_bytes", [1500, 4000, 9000])
+def test_truncated_with_shared_memory(proxy: Proxy, undisturbed: list[str], after_bytes: int) -> None:
+    proxy.truncate(after_bytes, connections=3)
+    assert [digest(batch) for batch in dataset(proxy, shared_memory=True)] == undisturbed
+    assert proxy.truncated == 3
 
 
 def test_cut_and_refused_for_a_while(proxy: Proxy, undisturbed: list[str]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import (
     Begun,
     Hello,
@@ -44,14 +45,17 @@ def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
     return frames_of(array_layout(SMALL_SPEC.recipe, "int8", ("voxels",)), epoch, index, seed)
 
 
-def answer_to(lease: Lease) -> list[Buffer]:
+def answer_to(lease: Lease, *, in_slot: bool = False) -> list[Buffer]:
     """What an honest worker sends behind its Result."""
     spec = StreamSpec.from_dict(json.loads(lease.spec))
     layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
-    return frames_of(layout, lease.epoch, lease.indices[0], lease.seed)
+    frames = frames_of(layout, lease.epoch, lease.indices[0], lease.seed, lease.slot)
+    return frames[:1] if in_slot else frames
 
 
-def frames_of(layout: Mapping[str, tuple[str, tuple[int, ...]]], epoch: int, index: int, seed: int) -> list[Buffer]:
+def frames_of(
+    layout: Mapping[str, tuple[str, tuple[int, ...]]], epoch: int, index: int, seed: int, slot: int = NO_SLOT
+) -> list[Buffer]:
     """A sample message of zeros in that layout."""
     header = SampleHeader(
         epoch=epoch,
@@ -62,6 +66,7 @@ def frames_of(layout: Mapping[str, tuple[str, tuple[int, ...]]], epoch: int, ind
         provenance={"seed": seed},
         worker="w",
         cpu_seconds=0.1,
+        slot=slot,
     )
     return [*encode(header), *(memoryview(bytes(layout_bytes({name: layout[name]}))) for name in layout)]
 
@@ -164,8 +169,10 @@ class Peers:
             raise AssertionError(welcome)
         return welcome
 
-    def want(self, *indices: int, identity: bytes = b"c", epoch: int = 0) -> list[Message]:
-        return self.consumer_says(identity, Want(epoch, indices))
+    def want(
+        self, *indices: int, identity: bytes = b"c", epoch: int = 0, arena: str = "", slots: Sequence[int] = ()
+    ) -> list[Message]:
+        return self.consumer_says(identity, Want(epoch, indices, arena, tuple(slots)))
 
     def join(self, identity: bytes = b"w", credit: int = CREDIT) -> None:
         self.leases[identity] = deque()
@@ -176,10 +183,11 @@ class Peers:
         self.worker_says(identity, Begun(lease.lease))
         return lease
 
-    def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1) -> Lease:
-        """Answers the oldest lease."""
+    def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1, *, in_slot: bool = False) -> Lease:
+        """Answers the oldest lease, in its slot if asked to and it has one."""
         lease = self.leases[identity].popleft()
-        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *answer_to(lease))
+        frames = answer_to(lease, in_slot=in_slot and lease.slot != NO_SLOT)
+        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *frames)
         return lease
 
     def fail(self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7) -> Lease:

@@ -85,7 +85,7 @@ def test_a_sample_goes_from_want_to_answer() -> None:
     assert at.samples() == [(3, 7)]
     counters = at.dispatcher.counters
     assert (counters.samples, counters.batches, counters.worker_cpu_seconds) == (1, 0.25, 0.1)
-    assert counters.bytes == sum(len(frame) for frame in at.frames[b"c"][-1])
+    assert counters.bytes == sum(len(frame) for frame in at.frames[b"c"][-1][1:])
     assert counters.faults == 0
 
 

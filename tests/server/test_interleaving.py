@@ -12,8 +12,12 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
+from v2v_client.slots import Answer, Slots
+from v2v_protocol.arena import NO_SLOT, ArenaName
 from v2v_protocol.messages import ErrorCode, Goodbye, JobFailed, Lease, Ping, Refused, Result, SampleHeader, Unavailable
 from v2v_server.blame import Cause, runs_alone
+
+_HALF_WRITTEN = (-1, -1, -1)
 
 
 class Interleaving(RuleBasedStateMachine):
@@ -51,7 +55,7 @@ class Interleaving(RuleBasedStateMachine):
             self.ask(identity, 0, list(range(8)))
         while self.at.leases[b"w1"]:
             self.at.begin(b"w1")
-            self.at.finish(b"w1")
+            self.answer(b"w1")
         self._listen()
         for identity in (b"c", b"d"):
             self.ask(identity, 0, list(range(8, 14)))
@@ -60,7 +64,9 @@ class Interleaving(RuleBasedStateMachine):
     def _listen(self) -> None:
         """Each consumer takes what it was sent; workers that nobody knows clear their table and say hello again."""
         for identity, heard in self.at.heard.items():
-            for message in heard[self.read.get(identity, 0) :]:
+            for number, message in enumerate(heard[self.read.get(identity, 0) :], self.read.get(identity, 0)):
+                if isinstance(message, SampleHeader):
+                    self.take_in(identity, message, in_message=len(self.at.frames[identity][number]) > 1)
                 if isinstance(message, SampleHeader | Unavailable):
                     # The heart of the promise: nothing comes that is not waited for.
                     self.owed[identity].remove((message.epoch, message.index))
@@ -80,6 +86,21 @@ class Interleaving(RuleBasedStateMachine):
                     self.at.join(identity)
             told.clear()
 
+    # What a consumer and a worker do about slots: nothing, here.
+
+    def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
+        self.at.want(*indices, identity=identity, epoch=epoch)
+
+    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+        assert in_message
+        assert header.slot == NO_SLOT
+
+    def answer(self, identity: bytes) -> Lease:
+        return self.at.finish(identity)
+
+    def fail(self, identity: bytes) -> Lease:
+        return self.at.fail(identity)
+
     @rule(identity=consumers, batch_size=st.integers(1, 4), pinned=st.none() | st.integers(0, 3))
     def connect(self, identity: bytes, batch_size: int, pinned: int | None) -> None:
         """Connects, or connects again and asks again for what it still lacks, as far as its new credit goes."""
@@ -95,7 +116,7 @@ class Interleaving(RuleBasedStateMachine):
         self.owed[identity] = set(lacking)
         for epoch, index in lacking:
             refusals = len(self.at.refusals(identity))
-            self.at.want(index, identity=identity, epoch=epoch)
+            self.want(identity, epoch, [index])
             assert len(self.at.refusals(identity)) == refusals
         self._listen()
 
@@ -117,7 +138,7 @@ class Interleaving(RuleBasedStateMachine):
         if within:
             self.owed[identity] = wanted
         refusals = len(self.at.refusals(identity))
-        self.at.want(*indices, identity=identity, epoch=epoch)
+        self.want(identity, epoch, indices)
         assert len(self.at.refusals(identity)) == refusals + (not within)
         self._listen()
 
@@ -125,7 +146,7 @@ class Interleaving(RuleBasedStateMachine):
     def ask_again(self, identity: bytes) -> None:
         """A consumer that is not sure whether it was heard: no index is made twice for it."""
         for epoch, index in sorted(self.owed.get(identity, ())):
-            self.at.want(index, identity=identity, epoch=epoch)
+            self.want(identity, epoch, [index])
         self._listen()
 
     @rule(identity=names, credit=st.sampled_from((1, CREDIT, CREDIT)))
@@ -156,7 +177,7 @@ class Interleaving(RuleBasedStateMachine):
         if what == "begin":
             self._begin(identity)
             return
-        lease = self.at.finish(identity) if what == "finish" else self.at.fail(identity)
+        lease = self.answer(identity) if what == "finish" else self.fail(identity)
         self.late.append((identity, lease))
         self._listen()
 
@@ -173,7 +194,7 @@ class Interleaving(RuleBasedStateMachine):
                 return
             identity = busy[which % len(busy)]
             if self._begin(identity):
-                self.at.finish(identity)
+                self.answer(identity)
                 self._listen()
 
     @rule(identities=st.sets(names, min_size=1), credit=st.sampled_from((1, CREDIT)))
@@ -271,7 +292,7 @@ class Interleaving(RuleBasedStateMachine):
             for identity in healthy:
                 if self.at.leases[identity]:
                     self.at.begin(identity)
-                    self.at.finish(identity)
+                    self.answer(identity)
                     self._listen()
         assert not any(self.owed.values())
         assert self.at.dispatcher.waiting == 0
@@ -294,6 +315,85 @@ class OfSiblings(Interleaving):
 
 TestInterleavingOfSiblings = OfSiblings.TestCase
 TestInterleavingOfSiblings.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+
+
+class WithSlots(Interleaving):
+    """The same with consumers that lend slots, and workers that may write to what they were ever lent until they have
+    answered: no consumer ever reads anything but its sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.slots: dict[bytes, Slots] = {}
+        self.memory: dict[tuple[str, int], tuple[int, int, int]] = {}
+        self.lent: dict[int, Lease] = {}  # the lease of each worker that may still write, by number
+        self.read_there = 0
+        self.abandoned = 0
+
+    def _arena(self, identity: bytes) -> str:
+        return str(ArenaName(ord(identity), 3, identity.hex() * 16))
+
+    def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
+        slots = self.slots.setdefault(identity, Slots())
+        session = self.at.dispatcher.sessions.get(identity)
+        keys = {epoch * 1000 + index: index for index in indices}
+        fresh = {key: index for key, index in keys.items() if slots.of(key) == NO_SLOT}
+        if session is None or len(session.unanswered | {(epoch, index) for index in indices}) > session.credit:
+            super().want(identity, epoch, indices)  # refused as a whole, which no client of ours lets happen
+            return
+        super().want(identity, epoch, [index for key, index in keys.items() if key not in fresh])
+        if fresh:
+            lent = [slots.take(key) for key in fresh]
+            self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=self._arena(identity), slots=lent)
+
+    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+        slots = self.slots[identity]
+        key = header.epoch * 1000 + header.index
+        slot = slots.of(key)
+        answer = slots.answered(key, header.slot, in_message=in_message)
+        assert answer is not Answer.NOWHERE
+        self.abandoned += answer is Answer.ABANDONED
+        if answer is Answer.THERE:
+            self.read_there += 1
+            place = (self._arena(identity), slot)
+            assert place not in {(lease.arena, lease.slot) for lease in self.lent.values()}, "it may change as we read"
+            assert self.memory[place] == (header.epoch, header.index, self.seed[identity])
+            slots.give_back(slot)
+
+    def _note_leases(self) -> None:
+        for held in self.at.leases.values():
+            self.lent |= {lease.lease: lease for lease in held if lease.slot != NO_SLOT}
+
+    def answer(self, identity: bytes) -> Lease:
+        self._note_leases()
+        lease = self.at.leases[identity][0]
+        if lease.slot == NO_SLOT or lease.lease % 7 == 0:  # some cannot reach it
+            self.lent.pop(lease.lease, None)
+            return self.at.finish(identity)
+        self.memory[lease.arena, lease.slot] = (lease.epoch, lease.indices[0], lease.seed)
+        del self.lent[lease.lease]
+        return self.at.finish(identity, in_slot=True)
+
+    def fail(self, identity: bytes) -> Lease:
+        self._note_leases()
+        lease = super().fail(identity)
+        self.lent.pop(lease.lease, None)
+        return lease
+
+    @rule(which=st.integers(0, 99))
+    def late_write(self, which: int) -> None:
+        """Half a sample, of a worker that may have been given up long ago."""
+        self._note_leases()
+        if self.lent:
+            lease = self.lent[sorted(self.lent)[which % len(self.lent)]]
+            self.memory[lease.arena, lease.slot] = _HALF_WRITTEN
+
+    def _listen(self) -> None:
+        self._note_leases()
+        super()._listen()
+
+
+TestInterleavingWithSlots = WithSlots.TestCase
+TestInterleavingWithSlots.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
 
 
 # --- long walks -------------------------------------------------------------------------------------------------------
@@ -330,6 +430,8 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         "go": (2, lambda: model.at.leases and model.go(draw.randrange(4), draw.choice(("unreachable", "nonsense")))),
         "disk": (1, lambda: model.disk(draw.random() < 0.7)),
     }
+    if isinstance(model, WithSlots):
+        moves["late_write"] = (10, lambda: model.late_write(draw.randrange(100)))
     weights = [weight for weight, _ in moves.values()]
     for _ in range(steps):
         _, move = draw.choices(list(moves.values()), weights)[0]
@@ -342,6 +444,9 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
     seen["twins"] = model.at.dispatcher.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)
     seen["samples"] = model.at.dispatcher.counters.samples
+    if isinstance(model, WithSlots):
+        seen["read in slots"] = model.read_there
+        seen["abandoned slots"] = model.abandoned
     model.teardown()
     return seen
 
@@ -352,5 +457,7 @@ def test_long_walks_reach_what_is_rare_and_keep_the_promise() -> None:
         seen += walk(seed, 150)
     for seed in range(8):
         seen += walk(seed, 150, OfSiblings)
+        seen += walk(seed, 150, WithSlots)
     least = {"lone at work": 10, "lone waiting": 3, "twins": 5, "verdicts": 20, "samples": 500}
+    least |= {"read in slots": 40, "abandoned slots": 5}
     assert {state: seen[state] for state in least if seen[state] < least[state]} == {}

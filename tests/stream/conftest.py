@@ -93,6 +93,11 @@ def digest(batch: Batch) -> str:
     return sha.hexdigest()
 
 
-def epoch_of(address: str, *, seed: int = 3, epoch: int = 0, batch_size: int = 3) -> list[Batch]:
+def epoch_of(
+    address: str, *, seed: int = 3, epoch: int = 0, batch_size: int = 3, shared_memory: bool = True
+) -> list[Batch]:
     """All batches of one epoch under SMALL."""
-    return list(V2VStreamDataset(address, batch_size=batch_size, recipe=SMALL, seed=seed, epoch=epoch))
+    dataset = V2VStreamDataset(
+        address, batch_size=batch_size, recipe=SMALL, seed=seed, epoch=epoch, shared_memory=shared_memory
+    )
+    return list(dataset)

@@ -7,9 +7,11 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
@@ -44,6 +46,15 @@ def test_batch_size_changes_no_sample(clips: Path) -> None:
     np.testing.assert_array_equal(threes[:common], fours[:common])
 
 
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_way_they_travel_changes_nothing(clips: Path, reference: list[str], shared: bool) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
+        got = [
+            digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, shared_memory=shared)
+        ]
+    assert got == reference
+
+
 def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> None:
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
         workers = server_workers(server.pid)
@@ -61,10 +72,19 @@ def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None
     """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
     with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
         stopped = server_workers(server.pid)[0]
+        until_connected(stopped)
         stopped.suspend()
         got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
         stopped.wait(timeout=20)
     assert got == reference
+
+
+def until_connected(worker: psutil.Process, seconds: float = 60.0) -> None:
+    """Waits for a worker that is still loading its kernels: before its hello nobody would miss it."""
+    deadline = time.monotonic() + seconds
+    while not worker.net_connections(kind="unix"):
+        assert time.monotonic() < deadline, "the worker never found its server"
+        time.sleep(0.02)
 
 
 def test_one_process_makes_the_same_samples(clips: Path) -> None:

@@ -1,0 +1,139 @@
+"""Slots on the server's side: who is told of one, and that nobody is told of one that somebody may still write to."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tests.server.peers import DEADLINE, Peers, answer_to, peers
+from v2v_protocol.arena import LARGEST_SLOT, NO_SLOT
+from v2v_protocol.messages import ErrorCode, Result, SampleHeader
+from v2v_protocol.wire import Buffer, decode, encode
+
+ARENA = f"17:9:{'0123456789abcdef' * 2}"
+
+
+def at_work(*, workers: int = 1) -> Peers:
+    """A consumer that asked for index 0 in slot 5, and so many workers; the first has the lease."""
+    at = peers()
+    at.join(b"w")
+    at.hello()
+    at.want(0, arena=ARENA, slots=[5])
+    for number in range(1, workers):
+        at.join(f"w{number}".encode())
+    return at
+
+
+def test_a_lease_names_the_slot_and_its_header_goes_alone() -> None:
+    at = at_work()
+    lease = at.begin()
+    assert (lease.arena, lease.slot) == (ARENA, 5)
+    at.finish(in_slot=True)
+    (header,) = (message for message in at.heard[b"c"] if isinstance(message, SampleHeader))
+    assert header.slot == 5
+    assert [len(frames) for frames in at.frames[b"c"]] == [1, 1]
+    counters = at.dispatcher.counters
+    assert (counters.in_slots, counters.bytes) == (1, 2 * 2 * 8 * 8)
+
+
+def test_a_worker_that_cannot_reach_it_sends_the_arrays_and_says_that_the_slot_is_free() -> None:
+    at = at_work()
+    at.begin()
+    at.finish(in_slot=False)
+    assert [len(frames) for frames in at.frames[b"c"]] == [1, 2]
+    assert at.heard[b"c"][-1].slot == 5  # type: ignore[union-attr]
+    assert at.dispatcher.counters.in_slots == 0
+
+
+def test_a_lease_after_a_lost_one_names_none() -> None:
+    at = at_work()
+    at.begin()
+    at.die(b"w")
+    at.join(b"w2")
+    assert (at.leases[b"w2"][0].arena, at.leases[b"w2"][0].slot) == ("", NO_SLOT)
+
+
+def test_the_second_worker_of_a_slow_sample_is_told_of_none() -> None:
+    at = peers()
+    at.join(b"w")
+    at.hello()
+    for index in range(8):  # what is usual
+        at.want(index)
+        at.begin()
+        at.tick(0.1)
+        at.finish()
+    at.want(20, arena=ARENA, slots=[5])
+    at.begin()
+    at.join(b"w2")
+    at.tick(DEADLINE / 2)
+    (second,) = at.leases[b"w2"]
+    assert second.indices == (20,)
+    assert (second.arena, second.slot) == ("", NO_SLOT)
+    at.begin(b"w2")
+    at.finish(b"w2")
+    assert at.heard[b"c"][-1].slot == NO_SLOT  # type: ignore[union-attr]
+
+
+def test_the_next_candidate_of_a_failed_one_keeps_it_because_the_worker_answered() -> None:
+    at = at_work()
+    at.begin()
+    at.fail()
+    (again,) = at.leases[b"w"]
+    assert (again.candidate, again.slot) == (1, 5)
+
+
+def test_an_index_that_is_asked_again_keeps_its_first_slot() -> None:
+    at = at_work()
+    at.want(0, arena=ARENA, slots=[6])
+    assert [lease.slot for lease in at.leases[b"w"]] == [5]
+
+
+@pytest.mark.parametrize(
+    ("arena", "slots"),
+    [
+        (ARENA, [1, 2]),
+        (ARENA, [0]),
+        (ARENA, [LARGEST_SLOT + 1]),
+        ("", [1]),
+        ("17:9:short", [1]),
+        ("../../etc/passwd", [1]),
+        (ARENA.upper(), [1]),
+    ],
+)
+def test_slots_that_are_none_are_refused_and_nothing_is_taken(arena: str, slots: list[int]) -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0, arena=arena, slots=slots)
+    assert [refused.code for refused in at.refusals()] == [ErrorCode.MALFORMED]
+    assert not at.leases[b"w"]
+    assert at.dispatcher.waiting == 0
+
+
+@pytest.mark.parametrize("slot", [NO_SLOT, 6])
+def test_a_result_in_another_slot_than_was_lent_is_none(slot: int) -> None:
+    at = at_work(workers=2)
+    lease = at.begin()
+    frames = answer_to(lease)
+    header = at_header(frames[0], slot)
+    at.worker_says(b"w", Result(lease.lease, 0, 0.1), header, *frames[1:])
+    assert at.samples() == []
+    assert [held.indices for held in at.leases[b"w1"]] == [(0,)]
+
+
+def test_a_header_alone_is_no_result_where_no_slot_was_lent() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    lease = at.begin()
+    at.worker_says(b"w", Result(lease.lease, 0, 0.1), *answer_to(lease)[:1])
+    assert at.samples() == []
+
+
+def at_header(raw: Buffer, slot: int) -> bytes:
+    """The header with another slot."""
+    message = decode(raw)
+    assert isinstance(message, SampleHeader)
+    return bytes(encode(dataclasses.replace(message, slot=slot))[0])
