@@ -22,7 +22,7 @@ from v2v_server.video.rows import Rows
 
 @contextmanager
 def open_jobs(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Path, Iterator[Lease]]]:
-    """The leases of seed 0, one sample each, epoch after epoch, without end.
+    """The leases of seed 0, one sample each, epoch after epoch, without end; each names the siblings still to come.
 
     Args:
         videos: the corpus.
@@ -42,12 +42,17 @@ def open_jobs(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Path,
             raise CorpusError(f"--videos {videos}: no video gives a sequence of {spec.recipe.frames_needed} frames")
         schedule = Schedule.of(table, spec)
 
+        spacing = max(1, spec.sibling_spacing)
+
         def leases() -> Iterator[Lease]:
             for number in itertools.count():
                 epoch, index = divmod(number, schedule.count)
+                view = index // spacing % spec.samples_per_decode
+                siblings = tuple(index + spacing * more for more in range(1, spec.samples_per_decode - view))
                 yield describe(
                     Task(b"", epoch, index), number=1, sequence=schedule.candidate(0, epoch, index, 0), quarantine=0,
                     catalogue=catalogue, spec=spec, seed=0, arrays=DEFAULT_ARRAYS, deadline_seconds=60.0,
+                    siblings=siblings,
                 )  # fmt: skip
 
         yield catalogue.root, leases()

@@ -2,13 +2,15 @@
 
     python -m benchmarks.transport --videos CLIPS --fast-videos PREPARED --json transport.json --plot transport.png
 
-The first row is the product as it stands: null workers, the server, a V2VStreamDataset. The others are prototypes
-(:mod:`benchmarks.routes`) over a bare relay, so they are to be compared with "message", and what the server's own
-bookkeeping costs is the difference between the first two rows. Figures are processor time, which a busy machine changes
-less than the clock.
+The first row is the product as it stands: null workers, the server, a V2VStreamDataset; the second the same without
+shared memory. The others are prototypes (:mod:`benchmarks.routes`) over a bare relay, so they are to be compared with
+"message", and what the server's own bookkeeping costs is the difference between that and the second row. Figures are
+processor time, which a busy machine changes less than the clock.
 
-Exit status: 0 what stands costs at most 5 % of production in exact mode and 10 % at the fastest (``--fast-videos``);
-1 it costs more; 2 wrong usage.
+Production is exact mode on ``--videos``, and the fastest preset on ``--fast-videos`` (a prepared folder).
+
+Exit status: 0 what stands costs at most 5 % of production in exact mode and 10 % at the fastest; 1 it costs more;
+2 wrong usage.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import plots
-from benchmarks.jobs import open_jobs, whole_sample
+from benchmarks.jobs import open_jobs
 from benchmarks.null_service import null_service
 from benchmarks.records import parser_of, recipe_of, run, say_missed, server_flags, show, write
 from benchmarks.routes import Route, missing, travel
@@ -29,10 +31,13 @@ from benchmarks.usage import consume
 from v2v_client.dataset import V2VStreamDataset
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_server.clips import Clips
+from v2v_server.produce import make_sample
 from v2v_server.simulation.clip import warm_up
 
 STANDING = "as it stands"
+IN_MESSAGES = "as it stands, in messages"
 MOST_OF_EXACT, MOST_OF_FASTEST = 0.05, 0.10
 """Bars: processor time of the transport, as shares of production."""
 
@@ -62,34 +67,42 @@ _COLUMNS = (
 )
 
 
-def production(videos: Path, rows: str, recipe: Recipe, seconds: float, keep: int) -> tuple[float, list[Sample]]:
+def production(
+    videos: Path, rows: str, recipe: Recipe, seconds: float, keep: int, samples_per_decode: int = 1
+) -> tuple[float, list[Sample]]:
     """CPU seconds of one sample, made in this process for that long, and the first ``keep`` (so many at least)."""
     warm_up()
     samples: list[Sample] = []
-    with open_jobs(videos, rows, StreamSpec(recipe=recipe)) as (root, leases):
+    # Siblings one after the other: each clip is decoded, then all its samples are made.
+    spec = StreamSpec(recipe=recipe, samples_per_decode=samples_per_decode, sibling_spacing=int(samples_per_decode > 1))
+    with open_jobs(videos, rows, spec) as (root, leases):
+        clips = Clips(root)
         made, began, cpu = 0, time.perf_counter(), time.process_time()
         for lease in leases:
-            sample = whole_sample(lease, root)
+            sample = make_sample(lease, clips.take(lease)[0])
             made += 1
             if made <= keep:
                 samples.append(sample)
-            elif time.perf_counter() - began >= seconds:
+            elif time.perf_counter() - began >= seconds and made % samples_per_decode == 0:
                 break
         return (time.process_time() - cpu) / made, samples
 
 
-def standing(recipe: Recipe, flags: Sequence[str], batch_size: int, seconds: float) -> dict[str, Any]:
+def standing(
+    recipe: Recipe, flags: Sequence[str], batch_size: int, seconds: float, *, shared_memory: bool
+) -> dict[str, Any]:
     """The record of the product as it is."""
     with null_service(recipe, workers=2, flags=flags) as service:
-        dataset = V2VStreamDataset(service.server.address, batch_size=batch_size, rank=0, world_size=1)
+        dataset = V2VStreamDataset(
+            service.server.address, batch_size=batch_size, rank=0, world_size=1, shared_memory=shared_memory
+        )
         consumed = consume(dataset, service.roles, seconds=seconds, warmup_batches=2)
     return {
-        "name": STANDING,
+        "name": STANDING if shared_memory else IN_MESSAGES,
         "sender_cpu_seconds_per_batch": consumed.cpu_seconds_per_batch("workers"),
         "broker_cpu_seconds_per_batch": consumed.cpu_seconds_per_batch("broker"),
         "receiver_cpu_seconds_per_batch": consumed.cpu_seconds_per_batch("client"),
         "cpu_seconds_per_batch": consumed.cpu_seconds_per_batch(),
-        "wire_bytes_per_batch": consumed.nbytes / consumed.batches,
         "batches_per_second": consumed.batches_per_second,
     }
 
@@ -130,8 +143,10 @@ def work(asked: argparse.Namespace) -> int:
     exact, samples = production(asked.videos, asked.rows, recipe, asked.seconds, keep=size)
     fastest = None
     if asked.fast_videos is not None:
-        fastest, _ = production(asked.fast_videos, asked.fast_rows, recipe, asked.seconds, keep=1)
-    records = [standing(recipe, server_flags(asked.changes), size, asked.seconds)]
+        views = int(SPEED_PRESETS["fast"]["samples_per_decode"])
+        fastest, _ = production(asked.fast_videos, asked.fast_rows, recipe, asked.seconds, 1, views)
+    flags = server_flags(asked.changes)
+    records = [standing(recipe, flags, size, asked.seconds, shared_memory=shared) for shared in (True, False)]
     records += [prototype(route, samples, size, asked.seconds) for route in ROUTES]
     for record in records:
         record |= {
@@ -172,7 +187,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__, "transport", seconds=5.0, what="each row")
     parser.add_argument("--videos", required=True, type=Path, metavar="DIR", help="clips of exact mode")
     parser.add_argument("--rows", default="top:0.54")
-    parser.add_argument("--fast-videos", type=Path, metavar="DIR", help="clips of the fastest mode (a prepared folder)")
+    parser.add_argument(
+        "--fast-videos", type=Path, metavar="DIR", help="clips of the fastest preset (a prepared folder)"
+    )
     parser.add_argument("--fast-rows", default="full")
     parser.add_argument("--batch-size", type=int, default=12)
     return run(parser, work, arguments)

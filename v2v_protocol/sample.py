@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -239,7 +240,7 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> d
 
 def layout_bytes(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> int:
     """Bytes of one sample of that layout."""
-    return sum(np.dtype(dtype).itemsize * int(np.prod(shape)) for dtype, shape in layout.values())
+    return sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
 
 
 @dataclass(frozen=True, slots=True)

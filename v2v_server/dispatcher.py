@@ -29,7 +29,7 @@ from v2v_protocol.messages import (
     Want,
     WorkerHello,
 )
-from v2v_protocol.sample import Refusal, SampleId, layout_bytes
+from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
@@ -259,7 +259,7 @@ class Dispatcher:
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
         asked = self._leases.task(result.lease, identity)
         session = None if asked is None else self.sessions.get(asked.session)
-        wrong = None if asked is None or session is None else flaw(result, payload, asked, session.layout)
+        wrong = None if asked is None or session is None else flaw(result, payload, asked, session.form)
         if wrong is not None:
             # No worker of ours does this, and one that did it once would do it again.
             refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {wrong}")))
@@ -274,7 +274,7 @@ class Dispatcher:
         self.counters.worker_cpu_seconds += cpu_seconds
         if session is not None:
             self.counters.batches += 1 / session.batch_size
-            self.counters.bytes += layout_bytes(session.layout)
+            self.counters.bytes += sum(session.form.sizes)
             self.counters.in_slots += len(payload) == 1
         return [ToConsumer(task.session, payload), *self._assign(now)]
 

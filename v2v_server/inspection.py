@@ -7,6 +7,7 @@ small header is read; the arrays are only measured, and not even that where they
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
@@ -17,16 +18,39 @@ from v2v_protocol.wire import decode
 from v2v_server.leases import Task
 
 
-def flaw(
-    result: Result, payload: Sequence[Any], task: Task, layout: Mapping[str, tuple[str, tuple[int, ...]]]
-) -> str | None:
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What the arrays of a sample must be.
+
+    Attributes:
+        names, dtypes, shapes: as a SampleHeader states them.
+        sizes: bytes of each array.
+    """
+
+    names: tuple[str, ...]
+    dtypes: tuple[str, ...]
+    shapes: tuple[int, ...]
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> Form:
+        """The form of samples whose arrays have these dtypes and shapes (``array_layout``)."""
+        return cls(
+            names=tuple(layout),
+            dtypes=tuple(dtype for dtype, _ in layout.values()),
+            shapes=tuple(extent for _, shape in layout.values() for extent in (len(shape), *shape)),
+            sizes=tuple(layout_bytes({name: layout[name]}) for name in layout),
+        )
+
+
+def flaw(result: Result, payload: Sequence[Any], task: Task, form: Form) -> str | None:
     """Why a result must not be passed on; None when its consumer will be able to read it.
 
     Args:
         result: what the worker says it is.
         payload: the frames behind it: a whole SampleHeader message.
         task: what was asked.
-        layout: dtype and shape of each asked array (``array_layout``).
+        form: of the sample.
     """
     if result.index != task.index:
         return f"it answers index {result.index}, index {task.index} was asked"
@@ -38,14 +62,12 @@ def flaw(
         return str(error)
     if not isinstance(header, SampleHeader) or (header.epoch, header.index) != (task.epoch, task.index):
         return "its header is that of another sample, or of none"
-    if header.names != tuple(layout) or header.dtypes != tuple(dtype for dtype, _ in layout.values()):
+    if (header.names, header.dtypes) != (form.names, form.dtypes):
         return f"it has {list(header.names)!r:.100} of {list(header.dtypes)!r:.100}"
     slot = NO_SLOT if task.slot is None else task.slot.number
     if header.slot != slot:
         return f"it names slot {header.slot}, slot {slot} was lent"
-    shapes = [extent for _, shape in layout.values() for extent in (len(shape), *shape)]
-    sizes = [layout_bytes({name: layout[name]}) for name in layout]
     in_slot = slot != NO_SLOT and len(payload) == 1
-    if list(header.shapes) != shapes or not (in_slot or [len(frame) for frame in payload[1:]] == sizes):
+    if header.shapes != form.shapes or not (in_slot or tuple(map(len, payload[1:])) == form.sizes):
         return "its arrays have other shapes or sizes than were asked"
     return None

@@ -84,6 +84,7 @@ class LeaseBook:
         self._out: dict[tuple[bytes, int, int], list[int]] = {}
         self._durations: dict[bytes, deque[float]] = {}
         self._next = 1
+        self._lightened: set[bytes] = set()
 
     def __len__(self) -> int:
         return len(self._leases)
@@ -95,6 +96,11 @@ class LeaseBook:
         """
         tasks = [self._leases[number].task for number in self._held.get(worker, ())]
         return len({task.clip for task in tasks if task is not None}) + tasks.count(None)
+
+    def take_lightened(self) -> set[bytes]:
+        """Workers that hold less than they did, or nothing that somebody waits for, since the last call."""
+        lightened, self._lightened = self._lightened, set()
+        return lightened
 
     def tasks_of(self, worker: bytes) -> Iterator[Task]:
         """The tasks that this worker holds and somebody still waits for."""
@@ -205,9 +211,11 @@ class LeaseBook:
     def _retire(self, sample: tuple[bytes, int, int]) -> None:
         for number in self._out.pop(sample, ()):
             self._leases[number].task = None
+            self._lightened.add(self._leases[number].worker)
 
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)
+        self._lightened.add(lease.worker)
         held = self._held[lease.worker]
         held.remove(number)
         if not held:

@@ -95,7 +95,7 @@ class Schedule:
             IndexError: index is outside 0 .. count-1.
         """
         place = self.place(index)
-        first = self._table[_permutation(self._table.count, seed, epoch)(place) if self._shuffle else place]
+        first = self._table[_permuted(self._table.count, seed, epoch, place) if self._shuffle else place]
         tried = [first]
         for number in range(1, candidate + 1):
             tried.append(self._substitute(seed, epoch, place, number, {sequence.video.id for sequence in tried}))
@@ -107,6 +107,11 @@ class Schedule:
             if sequence.video.id not in refused:
                 break
         return sequence
+
+
+@lru_cache(maxsize=1024)  # a lease asks twice, and so do its siblings
+def _permuted(count: int, seed: int, epoch: int, place: int) -> int:
+    return _permutation(count, seed, epoch)(place)
 
 
 @lru_cache(maxsize=64)

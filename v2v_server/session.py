@@ -22,6 +22,7 @@ from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.blame import runs_alone
+from v2v_server.inspection import Form
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
 
@@ -43,6 +44,7 @@ class Session:
         balance_seconds: worker time it has earned and not used.
         served: samples sent.
         quarantine: number of the quarantine snapshot its samples are made under.
+        form: of one of its samples.
     """
 
     identity: bytes
@@ -59,10 +61,10 @@ class Session:
     served: int = 0
     quarantine: int = 0
 
-    @property
-    def layout(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """dtype and shape of each array of one of its samples."""
-        return array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays)
+    form: Form = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
 
 
 class Sessions:

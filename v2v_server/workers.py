@@ -31,6 +31,8 @@ class Workers:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, _Worker] = {}
+        # Among a thousand busy workers the one that has just answered is found at once.
+        self._may_have_room: set[bytes] = set()
 
     def __len__(self) -> int:
         return len(self._workers)
@@ -45,6 +47,7 @@ class Workers:
     def add(self, identity: bytes, credit: int, now: float) -> None:
         """A worker said hello."""
         self._workers[identity] = _Worker(max(1, min(credit, MOST_WORKER_CREDIT)), now)
+        self._may_have_room.add(identity)
 
     def remove(self, identity: bytes) -> None:
         """It is gone."""
@@ -92,10 +95,13 @@ class Workers:
 
     def _free(self) -> list[tuple[int, bytes]]:
         """(leases held, identity) of those with room; a task that runs alone leaves none."""
+        self._may_have_room |= self._leases.take_lightened()
         free = []
-        for identity, worker in self._workers.items():
+        for identity in list(self._may_have_room):
+            worker = self._workers.get(identity)
             held = self._leases.held_by(identity)
-            lonely = any(runs_alone(task) for task in self._leases.tasks_of(identity))
-            if held < worker.credit and not lonely and not worker.given_up:
+            if worker is None or worker.given_up or held >= worker.credit:
+                self._may_have_room.remove(identity)
+            elif not any(runs_alone(task) for task in self._leases.tasks_of(identity)):
                 free.append((held, identity))
         return free

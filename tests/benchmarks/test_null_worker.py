@@ -14,7 +14,7 @@ from v2v_client import V2VStreamDataset
 from v2v_protocol.messages import Result, SampleHeader
 from v2v_protocol.sample import DEFAULT_ARRAYS, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode, decode_sample
-from v2v_server.inspection import flaw
+from v2v_server.inspection import Form, flaw
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
@@ -32,7 +32,7 @@ def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ..
     )  # fmt: skip
     frames = answer(lease, "null-1")
     layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
-    assert flaw(Result(7, 1, 0.0), frames, task, layout) is None
+    assert flaw(Result(7, 1, 0.0), frames, task, Form.of(layout)) is None
     header = decode(frames[0])
     assert isinstance(header, SampleHeader)
     found = decode_sample(header, frames[1:])

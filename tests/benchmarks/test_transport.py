@@ -77,9 +77,14 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flags = ["--videos", folder, "--rows", "full", "--fast-videos", folder, "--batch-size", "3", "--seconds", "0.2"]
     assert transport.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) in (0, 1)
     found = records(out)
-    assert [record["name"] for record in found] == [transport.STANDING, "message", "shared memory"]
+    assert [record["name"] for record in found] == [
+        transport.STANDING,
+        transport.IN_MESSAGES,
+        "message",
+        "shared memory",
+    ]
     assert all(record["share_of_exact"] > 0 for record in found)
-    assert found[0]["wire_bytes_per_batch"] == 3 * (4 * 5 + 4) * 32 * 40
+    assert found[2]["wire_bytes_per_batch"] == 3 * (4 * 5 + 4) * 32 * 40
     assert is_picture(picture)
 
 

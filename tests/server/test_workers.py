@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from v2v_server.blame import ALONE_AFTER
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_server.blame import ALONE_AFTER, runs_alone
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.workers import MOST_WORKER_CREDIT, SILENCE_SECONDS, Workers
 
@@ -54,6 +57,43 @@ def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
     table.workers.remove(b"a")
     assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)
     assert not table.workers.heard(b"a", 0.0)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(("add", "remove", "load", "finish", "leave", "give up")), st.integers(0, 9)),
+        max_size=60,
+    )
+)
+def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int]]) -> None:
+    """The table looks only at workers that may have room: none is ever forgotten."""
+    table, out = Table(), []
+    for what, which in moves:
+        name = f"w{which % 4}"
+        identity = name.encode()
+        if what == "add" and identity not in table.workers:
+            table.workers.add(identity, 1 + which % 3, 0.0)
+        elif what == "remove":
+            table.workers.remove(identity)
+            table.book.lost(identity)
+        elif what == "load" and identity in table.workers and not lonely(table, identity):
+            out.append((table.load(name, deaths=ALONE_AFTER * (which == 9), session=b"cd"[which % 2 :][:1]), identity))
+        elif what == "finish" and out:
+            table.book.finished(*out.pop(which % len(out)), 0.0)
+        elif what == "leave":
+            table.book.forget_session(b"cd"[which % 2 :][:1])
+        elif what == "give up":
+            table.workers.hanging(DEADLINE * 10)
+        expected = sorted(
+            (table.book.held_by(identity), identity)
+            for identity, worker in table.workers._workers.items()
+            if not worker.given_up and table.book.held_by(identity) < worker.credit and not lonely(table, identity)
+        )
+        assert sorted(table.workers._free()) == expected
+
+
+def lonely(table: Table, identity: bytes) -> bool:
+    return any(runs_alone(task) for task in table.book.tasks_of(identity))
 
 
 # --- tasks that run alone ---------------------------------------------------------------------------------------------

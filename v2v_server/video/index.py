@@ -165,7 +165,9 @@ def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     # Differences wrap around modulo 2**64, and so do the sums that undo them: exact for any value.
-    return np.diff(values, prepend=np.int64(0))
+    steps = values.copy()
+    steps[1:] -= values[:-1]
+    return steps
 
 
 def _increasing(values: npt.NDArray[np.int64]) -> bool:
