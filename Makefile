@@ -33,10 +33,10 @@ demo: $(READY) $(CLIPS)
 	$(BIN)/python -m examples.demo --videos $(CLIPS) --picture out/demo.png
 
 test: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow"
 
 test-slow: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 2 -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
 
 $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLD_NUMPY)

@@ -139,7 +139,7 @@ def _decode(corpus: Corpus, setting: Setting) -> Measured:
     counts = [context.Value("q", 0) for _ in range(setting.workers)]
     stop = context.Event()
     processes = [
-        context.Process(target=_decode_jobs, args=(corpus, setting.workers, number, count, stop))
+        context.Process(target=_decode_jobs, args=(corpus, setting.workers, number, count, stop), daemon=True)
         for number, count in enumerate(counts)
     ]
     for process in processes:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,10 +56,14 @@ def run(
 ) -> int:
     """Parses and works; an error of ours, or of the operating system, becomes one line and status 2.
 
+    A SIGTERM ends it as an exception does, so that whatever was started is stopped.
+
     Raises:
         SystemExit: argparse's own, for flags that it does not understand.
     """
     asked = parser.parse_args(arguments)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         if not 0 < asked.seconds < math.inf:
             raise UsageError(f"--seconds {asked.seconds:g}: give more than 0")

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
-import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -29,6 +27,7 @@ from trainer.interruption import StopRequest
 from trainer.learner import build
 from trainer.loop import Diverged, train
 from trainer.resume import LAST, require_fresh, require_same_run
+from v2v_client.command import run_command
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError, V2VError
 
@@ -136,17 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
-    arguments = _parser().parse_args(argv)
-    try:
-        return run(arguments)
-    except V2VError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"v2v-train: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1 if isinstance(error, Diverged) else 2
-    except KeyboardInterrupt:
-        print("v2v-train: interrupted before the first step", file=sys.stderr)
-        return SIGNAL_STATUS + signal.SIGINT
+    return run_command(_parser(), run, argv, failures=(Diverged,), interrupted="interrupted before the first step")
 
 
 if __name__ == "__main__":

@@ -2,43 +2,32 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch.distributed
-from torch.utils.data import IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset
 
 from v2v_client.batch import Batch
 from v2v_client.connection import Connection
 from v2v_client.delivery import deliver
 from v2v_client.liveness import Patience
 from v2v_client.options import Options
-from v2v_client.progress import Progress
-from v2v_client.state import LoaderShare, ResumeState, Stream
-from v2v_client.world import EpochPlan, resumed
+from v2v_client.position import Consumer, Iteration, Position
+from v2v_client.state import ResumeState, Stream
+from v2v_client.world import EpochPlan
 from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 
-_NO_BATCH_YET = 0
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
     "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class _Loader:
-    """The loader worker this process is; ``number`` is which start of the iteration it is."""
-
-    worker: int
-    workers: int
-    iteration: str
-    number: int
 
 
 class V2VStreamDataset(IterableDataset[Batch]):
@@ -152,15 +141,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._shared_memory = shared_memory
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
-        self._progress = Progress(_whole("epoch", epoch, 0, LARGEST_EPOCH))
-        self._iterations = 0
-        self._here: ResumeState | None = None  # after the last batch of this process; None where the log says
-        self._loaded: ResumeState | None = None  # of this loader worker, from a stateful loader
+        self._position = Position(_whole("epoch", epoch, 0, LARGEST_EPOCH))
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A spawned loader worker knows nothing of the process group.
-        return self.__dict__ | {"_ambient": _distributed() or self._ambient}
+        # A spawned loader worker knows nothing of the process group. A copy, even a shallow one, moves on by itself.
+        return self.__dict__ | {"_ambient": _distributed() or self._ambient, "_position": copy.copy(self._position)}
 
     # --- what it is ---------------------------------------------------------------------------------------------------
 
@@ -177,12 +163,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
     @property
     def epoch(self) -> int:
         """The epoch that the next iteration delivers."""
-        return self._progress.standing().epoch
+        return self._position.standing().epoch
 
     @property
     def stream(self) -> Stream | None:
         """What the samples are made of: resolved spec, digests, sequences per epoch; None before the first Welcome."""
-        return self._progress.standing().stream
+        return self._position.standing().stream
 
     def describe(self) -> dict[str, Any]:
         """The stream and this consumer's part in it as plain values, for a log.
@@ -208,19 +194,20 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             TypeError: not known before the first Welcome (or a loaded state): a guess would make a DataLoader lie.
         """
-        standing = self._progress.standing()
+        standing = self._position.standing()
         if standing.stream is None:
             raise TypeError("the number of batches is known once the server has answered: iterate first")
-        return self._plan(standing.stream, standing.state).batches
+        return self._consumer.plan(standing.stream, standing.state).batches
+
+    @property
+    def _consumer(self) -> Consumer:
+        return Consumer(self._seed, self._batch_size, self.rank, self.world_size)
 
     # --- position -----------------------------------------------------------------------------------------------------
 
     def set_epoch(self, epoch: int) -> None:
         """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded."""
-        standing = self._progress.standing()
-        same = standing.epoch == _whole("epoch", epoch, 0, LARGEST_EPOCH)
-        self._progress.set(epoch, standing.state if same else None)
-        self._here = None
+        self._position.set_epoch(_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
         """The position after the last batch that this process took.
@@ -230,18 +217,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             UsageError: loader workers took the batches, so that this process does not know.
         """
-        if self._here is not None and get_worker_info() is not None:
-            return self._here.to_dict()
-        standing = self._progress.standing()
-        if standing.stale:
-            raise UsageError(
-                "state_dict: the batches went through DataLoader workers, and this process does not know which of them "
-                "were used; save Batch.resume_state of the last batch you trained on instead"
-            )
-        return (self._here or standing.state or self._beginning(standing)).to_dict()
-
-    def _beginning(self, standing: Any) -> ResumeState:
-        return ResumeState(standing.stream, self._seed, standing.epoch, 0, 0, self.world_size)
+        return self._position.state(self._consumer).to_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """The next iteration begins where ``state`` was taken.
@@ -261,83 +237,16 @@ class V2VStreamDataset(IterableDataset[Batch]):
             )
         if loaded.stream is not None:
             self._options.spec(loaded.stream, "the state")
-        loader = get_worker_info()
-        if loaded.share is not None:
-            self._require_share(loaded, loader)
-        origin, position = resumed(
-            origin=loaded.origin,
-            position=loaded.position,
-            saved_world_size=loaded.world_size,
-            world_size=self.world_size,
-        )
-        loaded = dataclasses.replace(loaded, origin=origin, position=position, world_size=self.world_size)
-        begun = loaded.position + loaded.origin > 0
-        if begun and loaded.stream is not None and self._plan(loaded.stream, loaded).batches == 0:
-            # Nothing but what an epoch drops is left of this one.
-            loaded = dataclasses.replace(loaded, epoch=loaded.epoch + 1, origin=0, position=0, share=None)
-        shared = dataclasses.replace(loaded, share=None)
-        if loader is None:
-            self._progress.set(loaded.epoch, shared)
-        else:
-            self._progress.set(loaded.epoch, shared, iteration=self._iteration(loader))
-            self._loaded = loaded
-        self._here = loaded
-
-    def _require_share(self, state: ResumeState, loader: Any) -> None:
-        share = state.share
-        here = None if loader is None else (loader.id, loader.num_workers, self._batch_size, self.world_size)
-        if share is None or here == (share.worker, share.workers, share.batch_size, state.world_size):
-            return
-        raise UsageError(
-            f"this is the state of loader worker {share.worker} of {share.workers} (batch_size {share.batch_size}, "
-            f"world size {state.world_size}); only the same worker of an equal loader can go on from it. "
-            "Batch.resume_state holds for any number of loader workers"
-        )
+        self._position.load(loaded, self._consumer)
 
     # --- iteration ----------------------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[Batch]:
-        self._iterations += 1
-        worker = get_worker_info()
-        if worker is None:
-            self._progress.main()
-            standing = self._progress.standing()
-            epoch, state = standing.epoch, standing.state
-            self._here = state or self._beginning(standing)
-            return self._iterate(epoch, state, None, _NO_BATCH_YET, self._iterations)
-        iteration = self._iteration(worker)
-        number, epoch, state = self._progress.start(iteration, worker.id)
-        loader = _Loader(worker.id, worker.num_workers, iteration, number)
-        done = self._already_done(epoch, state)
-        known = state.stream if state is not None else None
-        if known is not None and self._share_done(known, state, loader, done):
-            # A stateful loader may discard this iterator unused; the epoch is over all the same.
-            self._finish(epoch, loader)
-        else:
-            self._here = self._worker_state(self.stream, epoch, state, loader, done)
-        return self._iterate(epoch, state, loader, done, self._iterations)
+        return self._iterate(self._position.begin(self._consumer))
 
-    def _iteration(self, worker: Any) -> str:
-        """A name that the loader workers of one iteration share: PyTorch seeds them alike, and they iterate alike."""
-        return f"{worker.seed - worker.id}:{self._iterations}"
-
-    def _already_done(self, epoch: int, state: ResumeState | None) -> int:
-        """Batches of this loader worker's share that a loaded state says it delivered."""
-        loaded = self._loaded
-        if loaded is None or loaded.share is None or state is None:
-            return _NO_BATCH_YET
-        here, there = (loaded.epoch, loaded.origin, loaded.position), (epoch, state.origin, state.position)
-        return loaded.share.batches if here == there else _NO_BATCH_YET
-
-    def _share_done(self, stream: Stream, state: ResumeState | None, loader: _Loader, done: int) -> bool:
-        share = self._plan(stream, state).batches_of_worker(loader.worker, loader.workers)
-        return done > 0 and done >= len(share)
-
-    def _iterate(
-        self, epoch: int, state: ResumeState | None, loader: _Loader | None, done: int, mine: int
-    ) -> Iterator[Batch]:
+    def _iterate(self, begun: Iteration) -> Iterator[Batch]:
+        consumer, epoch, state = self._consumer, begun.epoch, begun.state
         pinned = self.stream
-        workers = loader or _Loader(0, 1, "", 0)
         connection = Connection(
             self._address,
             Hello(
@@ -346,7 +255,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 self._batch_size,
                 self._seed,
                 quarantine=None if state is None else state.quarantine,
-                stride=self._batch_size * self.world_size * workers.workers,
+                stride=self._batch_size * consumer.world_size * begun.workers,
             ),
             epoch,
             pinned=pinned,
@@ -358,68 +267,32 @@ class V2VStreamDataset(IterableDataset[Batch]):
             connection.open()
             stream = connection.stream
             if pinned is None:
-                self._progress.pin(stream)
-                first = self.stream
-                if first is not None:  # a loader worker beside us may have been offered another one
-                    first.require_same(stream, ours="another loader worker", theirs=self._address)
-            plan = self._plan(stream, state)
+                self._position.pin(stream, self._address)
+            plan = consumer.plan(stream, state)
             if state is None:
                 plan.require_batches()
             if stream.resolved.samples_per_decode > 1 and not plan.shares_decodes(
-                stream.resolved.sibling_spacing, workers.workers
+                stream.resolved.sibling_spacing, begun.workers
             ):
                 warnings.warn(_NOT_SHARED, stacklevel=2)
-            batches = plan.batches_of_worker(workers.worker, workers.workers)[done:]
+            batches, done = begun.batches(plan), begun.done
 
             def after(batch: int, quarantine: int) -> dict[str, Any]:
-                return self._after(stream, epoch, plan, batch, quarantine).to_dict()
+                return consumer.after(stream, epoch, plan, batch, quarantine).to_dict()
 
             for batch, number in zip(deliver(connection, plan, batches, epoch, after), batches, strict=True):
                 done += 1
-                if mine == self._iterations:  # an older iterator that is still read says nothing about where we are
-                    seen = batch.resume_state["quarantine"]
-                    self._here = (
-                        self._after(stream, epoch, plan, number, seen)
-                        if loader is None
-                        else self._worker_state(stream, epoch, state, loader, done, seen)
-                    )
+                seen = batch.resume_state["quarantine"]
+                self._position.reached(
+                    begun,
+                    consumer.after(stream, epoch, plan, number, seen)
+                    if begun.loader is None
+                    else consumer.in_share(stream, begun, begun.loader, done, seen),
+                )
                 yield batch
         finally:
             connection.close()
-        if mine == self._iterations:
-            self._finish(epoch, loader)
-
-    def _finish(self, epoch: int, loader: _Loader | None) -> None:
-        if loader is None:
-            self._progress.set(epoch + 1, None)
-            self._here = None
-        else:
-            self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers, epoch)
-            self._here = ResumeState(self.stream, self._seed, epoch + 1, 0, 0, self.world_size)
-
-    def _plan(self, stream: Stream, state: ResumeState | None) -> EpochPlan:
-        origin, position = (0, 0) if state is None else (state.origin, state.position)
-        return EpochPlan(stream.sequences, self.world_size, self.rank, self._batch_size, origin, position)
-
-    def _after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
-        """The rank's state after a batch; after the last one, that is the beginning of the next epoch."""
-        if batch + 1 == plan.batches:
-            return ResumeState(stream, self._seed, epoch + 1, 0, 0, plan.world_size)
-        position = plan.position_after(batch)
-        return ResumeState(stream, self._seed, epoch, plan.origin, position, plan.world_size, quarantine=quarantine)
-
-    def _worker_state(
-        self,
-        stream: Stream | None,
-        epoch: int,
-        state: ResumeState | None,
-        loader: _Loader,
-        done: int,
-        quarantine: int | None = None,
-    ) -> ResumeState:
-        origin, position = (0, 0) if state is None else (state.origin, state.position)
-        share = LoaderShare(loader.worker, loader.workers, self._batch_size, done)
-        return ResumeState(stream, self._seed, epoch, origin, position, self.world_size, share, quarantine)
+        self._position.finish(begun, consumer)
 
 
 def _distributed() -> tuple[int, int] | None:

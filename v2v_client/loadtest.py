@@ -11,7 +11,6 @@ import json
 import math
 import sys
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,10 +21,11 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_client.batch import Batch
+from v2v_client.command import run_command
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.schedule_check import ScheduleCheck
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import SPEED_PRESETS
 
@@ -314,17 +314,7 @@ def _cpu_scope(arguments: argparse.Namespace) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
-    arguments = _parser().parse_args(argv)
-    try:
-        return run(arguments)
-    except V2VError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"v2v-loadtest: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("v2v-loadtest: interrupted", file=sys.stderr)
-        return 130
+    return run_command(_parser(), run, argv)
 
 
 if __name__ == "__main__":

@@ -28,14 +28,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from v2v_protocol.errors import RecipeError
+from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
+from v2v_protocol.recipe_fields import check_limits, coerced
 
 Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""
 
 _LARGEST_FRAMES = 1_000_001
-LARGEST_SCALE = 100.0
-_LARGEST_SIDE_PX = 16_384
-SMALLEST_PHOTORECEPTOR_HZ = 0.01
 SMALLEST_THRESHOLD_SHARE = 0.25
 """No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
 LARGEST_NORMAL = 6.56
@@ -129,28 +128,17 @@ class Recipe:
     dead_pixel_share: Range = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = _coerced(field.name, getattr(self, field.name), field.default)
-            object.__setattr__(self, field.name, value)
-        for name, (low, high) in _LIMITS.items():
-            value = getattr(self, name)
-            for end in value if isinstance(value, tuple) else (value,):
-                if not low <= end <= high:
-                    raise RecipeError(f"recipe {name} = {_shown(value)}: {end} is outside {low} .. {high}")
-        for name, words in _CHOICES.items():
-            if getattr(self, name) not in words:
-                raise RecipeError(f"recipe {name} = {getattr(self, name)!r}: choose one of {', '.join(words)}")
-        lowest, highest = self.photoreceptor_hz
-        if highest > 0.0 and lowest < SMALLEST_PHOTORECEPTOR_HZ:
-            raise RecipeError(
-                f"recipe photoreceptor_hz = {_shown(self.photoreceptor_hz)}: give 0 for no low-pass, or a range from "
-                f"{SMALLEST_PHOTORECEPTOR_HZ} upwards"
-            )
+        values = {
+            field.name: coerced(field.name, getattr(self, field.name), field.default)
+            for field in dataclasses.fields(self)
+        }
+        check_limits(values)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
         if self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
-                f"frame_stride + 1); "
-                f"the limit is {_LARGEST_FRAMES}"
+                f"frame_stride + 1); the limit is {_LARGEST_FRAMES}"
             )
         if self.most_events > LARGEST_EVENTS:
             raise RecipeError(
@@ -271,128 +259,7 @@ def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[flo
     return (change + max(abs(low), abs(high))) / min(thresholds)
 
 
-LIMITS_OF_EFFECTS: dict[str, tuple[float, float]] = {
-    "threshold_mismatch_sigma": (0.0, 1.0),
-    "shot_noise_hz": (0.0, 1e4),
-    "leak_hz": (0.0, 1e4),
-    "refractory_seconds": (0.0, 1e3),
-    "photoreceptor_hz": (0.0, 1e6),
-}
-
-_LIMITS: dict[str, tuple[float, float]] = {
-    "voxels_per_clip": (1, 1_000_000),
-    "bins": (1, 1024),
-    "frames_per_bin": (1, 1024),
-    "lead_frames": (0, 1),
-    "lead_voxels": (0, 1),
-    "frame_stride": (1, 1000),
-    "crop_height_px": (1, _LARGEST_SIDE_PX),
-    "crop_width_px": (1, _LARGEST_SIDE_PX),
-    "resize_scale": (0.01, LARGEST_SCALE),
-    "flip_probability": (0.0, 1.0),
-    "pause_probability": (0.0, 1.0),
-    "pause_stay_probability": (0.0, 1.0),
-    "contrast_probability": (0.0, 1.0),
-    "contrast_scale": (0.0, 100.0),
-    "gamma": (0.05, 20.0),
-    "log_eps": (1e-12, 1.0),
-    "threshold": (1e-6, 1e6),
-    "threshold_ratio": (1e-6, 1e6),
-    "noise_sigma": (0.0, 1e6),
-    "hot_pixel_share": (0.0, 1.0),
-    "hot_pixel_sigma": (0.0, 1e9),
-    **LIMITS_OF_EFFECTS,
-    "dead_pixel_share": (0.0, 1.0),
-}
-
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "threshold_source": ("sample", "video"),
-    "noise_unit": ("frame", "second"),
-}
-
-
-def _coerced(name: str, value: Any, default: Any) -> Any:
-    """``value`` in the type of the field's default; a single number stands for a range of equal ends."""
-    if isinstance(default, bool):
-        if not isinstance(value, bool):
-            raise RecipeError(f"recipe {name} = {value!r}: give true or false")
-        return value
-    if isinstance(default, int):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise RecipeError(f"recipe {name} = {value!r}: give a whole number")
-        return value
-    if isinstance(default, str):
-        if not isinstance(value, str):
-            raise RecipeError(f"recipe {name} = {value!r}: give a word")
-        return value
-    if isinstance(default, float):
-        return _number(name, value)
-    ends = tuple(value) if isinstance(value, list | tuple) else (value, value)
-    if len(ends) != 2:
-        raise RecipeError(f"recipe {name} = {value!r}: give one number, or a pair [lowest, highest]")
-    low, high = (_number(name, end) for end in ends)
-    if low > high:
-        raise RecipeError(f"recipe {name} = [{low}, {high}]: the lowest value comes first")
-    return low, high
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise RecipeError(f"recipe {name} = {value!r}: give a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise RecipeError(f"recipe {name} = {value!r}: give a finite number")
-    # Minus zero equals zero, but would not give the same digest.
-    return number + 0.0
-
-
-def _shown(value: Any) -> str:
-    return str(list(value)) if isinstance(value, tuple) else repr(value)
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
-
-
-DEFAULT_PRESET = "paper"
-
-PRESETS: dict[str, Recipe] = {
-    "paper": Recipe(),
-    # Ablation "-F": one draw of the thresholds per video, for ever.
-    "paper-fixed-thresholds": Recipe(threshold_source="video"),
-    # Ablation "LDR": contrast raised, then clipped.
-    "paper-contrast": Recipe(contrast_probability=0.8),
-    # EVFlowNet: the frame before the first target frame, for pseudo flow.
-    "paper-flow": Recipe(lead_frames=1),
-    # ERAFT: that frame, and one more voxel grid in front.
-    "paper-eraft": Recipe(lead_frames=1, lead_voxels=1),
-    # The paper's pixel without noise, hot pixels or pauses: for tests and for looking.
-    "noise-free": Recipe(
-        noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), hot_pixel_sigma=(0.0, 0.0), pause_probability=0.0
-    ),
-    # What v2e (Hu et al. 2021) calls `clean`: thresholds 0.2 with a deviation of 0.02, nothing else.
-    "clean": Recipe(
-        threshold=(0.2, 0.2), threshold_ratio=(1.0, 1.0), threshold_mismatch_sigma=(0.1, 0.1),
-        noise_sigma=(0.0, 0.0), hot_pixel_share=(0.0, 0.0), hot_pixel_sigma=(0.0, 0.0),
-    ),
-    # A DAVIS346 in ordinary light; where each value comes from is told in docs/effects.md.
-    "davis346": Recipe(
-        # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
-        threshold=(0.134, 0.405),
-        threshold_mismatch_sigma=(0.1, 0.25),  # 2.1 % of contrast (Lichtsteiner et al. 2008); 0.05 of 0.2 (v2e `noisy`)
-        shot_noise_hz=(0.0, 5.0),  # up to v2e's `noisy`
-        leak_hz=(0.05, 0.2),  # around v2e's 0.1; the width is a guess
-        refractory_seconds=(1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
-        photoreceptor_hz=(30.0, 300.0),  # v2e's `noisy` and its default
-        dead_pixel_share=(0.0, 1e-4),  # a guess
-        # Shot noise takes the place of the paper's noise; hot pixels of up to about a hundred events a second: a guess.
-        noise_sigma=(0.0, 0.0), noise_unit="second", hot_pixel_share=(0.0, 5e-4), hot_pixel_sigma=(0.0, 20.0),
-    ),
-}  # fmt: skip
+PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_FIELDS.items()}
 
 
 def preset(name: object) -> Recipe:
@@ -405,3 +272,8 @@ def preset(name: object) -> Recipe:
         raise RecipeError(f"unknown recipe preset {name!r}{_nearest(str(name), list(PRESETS))}; "
                           f"known: {', '.join(PRESETS)}")  # fmt: skip
     return PRESETS[name]
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

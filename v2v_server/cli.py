@@ -24,7 +24,6 @@ from v2v_protocol.spec import (
     VOXEL_DTYPES,
 )
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
-from v2v_server.process import choose_compile_cache
 
 
 def serve(argv: Sequence[str] | None = None) -> None:
@@ -78,7 +77,6 @@ def worker(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
 
     def run(arguments: argparse.Namespace) -> None:
-        choose_compile_cache()
         from v2v_server.worker import run_worker
 
         run_worker(
@@ -105,7 +103,6 @@ def simulate(argv: Sequence[str] | None = None) -> None:
     _add_spec(parser)
 
     def run(arguments: argparse.Namespace) -> None:
-        choose_compile_cache()
         from v2v_server.remake import simulate_to_file
 
         simulate_to_file(

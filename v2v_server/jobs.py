@@ -48,7 +48,6 @@ def describe(
     scene = b""
     if spec.scene != "off":
         scene = catalogue.scene(video.id).slice(sequence.start_frame, spec.recipe.frames_needed).to_bytes()
-    index = catalogue.frame_index(video.id).slice(sequence.start_frame, spec.recipe.frames_needed)
     return Lease(
         lease=number,
         reply_to=task.session,
@@ -67,7 +66,7 @@ def describe(
         frames_per_second=0.0 if math.isnan(video.frames_per_second) else video.frames_per_second,
         thresholds=thresholds,
         start_frame=sequence.start_frame,
-        frame_index=index.to_bytes(),
+        frame_index=catalogue.frame_index_bytes(video.id, sequence.start_frame, spec.recipe.frames_needed),
         candidate=task.candidate,
         quarantine=quarantine,
         refusals={"refusals": [dataclasses.asdict(refusal) for refusal in task.refusals]},

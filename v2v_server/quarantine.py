@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.video.catalogue import index_path
+from v2v_server.video.refresh import index_path
 
 VERDICTS_PER_VIDEO = 2
 

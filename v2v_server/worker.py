@@ -40,7 +40,7 @@ from v2v_server.handover import sample_message
 from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
-from v2v_server.simulation.clip import warm_up
+from v2v_server.warm_up import warm_up_in_turn
 
 CREDIT = 2
 _PING_SECONDS = 5.0
@@ -188,7 +188,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     keep_freed_memory()
     cv2.setNumThreads(1)
     # Compile or load the kernels first: a worker that has said hello can work at full speed.
-    warm_up()
+    warm_up_in_turn()
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.chaos_check import StreamOracle, Verdict, check
+from benchmarks.chaos_check import StreamOracle, Verdict, check, main
 from benchmarks.chaos_consumer import PROFILES, Profile, log_path
 from benchmarks.chaos_log import BatchLine, LifeLine, Line, LogWriter, Sighting, read_log, sighting
 from tests.clips import panned_luma, write_clip
@@ -157,15 +155,15 @@ def _place(oracle: StreamOracle, index: int) -> tuple[str, int]:
     return sequence.video.id, sequence.start_frame
 
 
-def test_the_command_says_the_same(corpus: Path, honest: list[Line], tmp_path: Path) -> None:
+def test_the_command_says_the_same(
+    corpus: Path, honest: list[Line], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     writer = LogWriter(log_path(tmp_path))
     for line in changed(honest, 1, digest="0" * 64):
         writer.append(line)
     writer.close()
     assert len(list(read_log(log_path(tmp_path)))) == len(honest)
-    command = [sys.executable, "-m", "benchmarks.chaos_check", "--videos", str(corpus), "--remakes", "50"]
-    done = subprocess.run(
-        [*command, "--cache-dir", str(tmp_path / "cache"), str(tmp_path)], capture_output=True, text=True, check=True
-    )
-    said = json.loads(done.stdout)
+    videos = ["--videos", str(corpus), "--cache-dir", str(tmp_path / "cache")]
+    assert main([*videos, "--remakes", "50", str(tmp_path)]) == 0
+    said = json.loads(capsys.readouterr().out)
     assert (said["samples"], said["lost"], said["duplicated"], said["mismatched"]) == (16, 0, 0, 1)

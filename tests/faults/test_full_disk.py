@@ -11,7 +11,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -21,6 +20,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.faults.private_mounts import mounted
 from tests.stream.conftest import SMALL_FLAGS, digest, epoch_of
+from tests.waiting import until
 from v2v_client import Batch
 from v2v_client.local_server import LocalServer
 from v2v_server.quarantine import read_quarantine
@@ -76,8 +76,7 @@ def _serving(folder: Path, command: Sequence[str], **environment: str) -> Iterat
     command = [*command, "--port-file", str(port)]
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
         try:
-            while not port.exists() and process.poll() is None:
-                time.sleep(0.05)
+            until(lambda: port.exists() or process.poll() is not None)
             assert process.poll() is None, process.communicate()[1]
             yield Served(process, port.read_text(encoding="utf-8").strip())
         finally:

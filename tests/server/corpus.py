@@ -42,6 +42,9 @@ class NamedCorpus:
             raise UsageError(f'scene = "{scene}" needs statistics')
         return self.digest
 
+    def frame_index_bytes(self, name: str, start: int, count: int) -> bytes:
+        return self.frame_index(name).slice(start, count).to_bytes()
+
     def frame_index(self, name: str) -> FrameIndex:
         """A regular index with a keyframe at every twelfth frame."""
         if name in self.unreadable:

@@ -6,14 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
+from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server import pool as pool_module
 from v2v_server.blame import Cause, Loss
@@ -46,16 +45,6 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
     yield make
     for each in pools:
         each.stop(join_seconds=0.0, terminate_seconds=0.0)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Waits for a condition without sleeping through it; a minute is long enough for anything here."""
-    deadline = time.monotonic() + 60.0
-    pause = threading.Event()
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError("the condition never came true")
-        pause.wait(0.005)
 
 
 def all_dead(pool: Pool) -> None:

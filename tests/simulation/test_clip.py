@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -12,8 +13,8 @@ import pytest
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import simulate, simulate_clip, simulate_log, warm_up
+from v2v_protocol.sample import Effects, SampleParams
+from v2v_server.simulation import simulate, simulate_clip, simulate_log
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.voxel import voxel_array
 
@@ -154,17 +155,43 @@ def test_voxel_array() -> None:
         voxel_array(1, 1, 1, 1, "uint8")
 
 
+WARM_UP_AND_COUNT = """
+import json
+from dataclasses import replace
+import numpy as np
+from tests.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
+from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, warm_up, words
+
+def count():
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects, words)]
+
+warm_up()
+seen = [count()]
+for dtype in ("int8", "int16", "float32"):
+    simulate_clip(FRAMES, PARAMS, RECIPE, dtype)
+    simulate_clip(FRAMES, replace(PARAMS, noise_sigma=0.0, hot_pixel_count=0), RECIPE, dtype)
+seen.append(count())
+for effects in EFFECTS:
+    recipe = RECIPE.replace(leak_hz=(1.0, 1.0) if effects.need_seconds else 0.0)
+    seconds = np.linspace(0.01, 0.1, 10) if effects.need_seconds else None
+    for noise_sigma in (0.0, 0.1):
+        simulate_clip(FRAMES, replace(PARAMS, noise_sigma=noise_sigma, effects=effects), recipe, "int8", seconds)
+seen.append(count())
+print(json.dumps(seen))
+"""
+
+EFFECTS = [
+    Effects(threshold_mismatch_sigma=0.03),
+    Effects(shot_noise_hz=2.0),
+    Effects(leak_hz=0.1),
+    Effects(refractory_seconds=1e-3),
+    Effects(photoreceptor_hz=100.0),
+    Effects(dead_pixel_count=3),
+    Effects(0.03, 2.0, 0.1, 1e-3, 100.0, 3),
+]
+
+
 def test_after_warm_up_nothing_is_compiled() -> None:
-    code = (
-        "import numpy as np\n"
-        "from tests.simulation.test_clip import FRAMES, PARAMS, RECIPE\n"
-        "from v2v_server.simulation import simulate_clip, warm_up\n"
-        "from v2v_server.simulation.pixel import simulate_pixels\n"
-        "warm_up()\n"
-        "known = len(simulate_pixels.signatures)\n"
-        "[simulate_clip(FRAMES, PARAMS, RECIPE, dtype) for dtype in ('int8', 'int16', 'float32')]\n"
-        "print(known, len(simulate_pixels.signatures))\n"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
-    assert run.stdout.split() == ["3", "3"]
-    warm_up()
+    command = [sys.executable, "-c", WARM_UP_AND_COUNT]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert json.loads(run.stdout) == [[3, 1, 1]] * 3

@@ -48,15 +48,14 @@ def server(clips: Path) -> Iterator[LocalServer]:
         yield running
 
 
-@pytest.fixture
-def clips_with_a_broken_one(clips: Path, tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def clips_with_a_broken_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four good clips and one with garbage in the middle, which its container does not know of."""
-    folder = tmp_path / "mixed"
-    folder.mkdir()
+    folder, aside = tmp_path_factory.mktemp("mixed"), tmp_path_factory.mktemp("aside")
     for number in range(4):
         write_clip(folder / f"good{number}.mp4", panned_luma(64, step=(1, 1 + number)), gop=16)
-    write_clip(tmp_path / "whole.mp4", panned_luma(126), gop=126)
-    damaged(tmp_path / "whole.mp4", folder / "broken.mp4", 50)
+    write_clip(aside / "whole.mp4", panned_luma(126), gop=126)
+    damaged(aside / "whole.mp4", folder / "broken.mp4", 50)
     return folder
 
 

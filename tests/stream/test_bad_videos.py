@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,13 +16,17 @@ SHARED_VIDEOS = Path(__file__).parents[3] / "shared" / "data" / "videos"
 CORRUPT = "decord_corrupted.mp4"
 
 
-def test_the_next_candidate_is_served_and_marked(clips_with_a_broken_one: Path) -> None:
-    folder = clips_with_a_broken_one
-    with LocalServer(folder, workers=2, flags=SMALL_FLAGS) as server:
+@pytest.fixture(scope="module")
+def one_worker(clips_with_a_broken_one: Path) -> Iterator[LocalServer]:
+    """A server over good clips and a broken one."""
+    with LocalServer(clips_with_a_broken_one, workers=1, flags=SMALL_FLAGS) as running:
+        yield running
+
+
+def test_the_next_candidate_is_served_and_marked(clips_with_a_broken_one: Path, one_worker: LocalServer) -> None:
+    with LocalServer(clips_with_a_broken_one, workers=2, flags=SMALL_FLAGS) as server:
         batches = [batch for epoch in range(4) for batch in epoch_of(server.address, epoch=epoch)]
-    again = []
-    with LocalServer(folder, workers=1, flags=SMALL_FLAGS) as server:
-        again = [batch for epoch in range(4) for batch in epoch_of(server.address, epoch=epoch)]
+    again = [batch for epoch in range(4) for batch in epoch_of(one_worker.address, epoch=epoch)]
     refusals = [refusal for batch in batches for item in batch.provenance for refusal in item.refusals]
     assert refusals
     assert {refusal.video for refusal in refusals} == {"broken.mp4"}
@@ -29,12 +34,9 @@ def test_the_next_candidate_is_served_and_marked(clips_with_a_broken_one: Path) 
     assert [digest(batch) for batch in batches] == [digest(batch) for batch in again]
 
 
-def test_a_consumer_may_want_to_be_told_instead(clips_with_a_broken_one: Path) -> None:
-    with (
-        LocalServer(clips_with_a_broken_one, workers=1, flags=SMALL_FLAGS) as server,
-        pytest.raises(SampleUnavailable, match=r"broken\.mp4 at frame"),
-    ):
-        _four_epochs(server.address)
+def test_a_consumer_may_want_to_be_told_instead(one_worker: LocalServer) -> None:
+    with pytest.raises(SampleUnavailable, match=r"broken\.mp4 at frame"):
+        _four_epochs(one_worker.address)
 
 
 def _four_epochs(address: str) -> None:

@@ -7,14 +7,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
@@ -29,30 +28,26 @@ def reference(clips: Path) -> list[str]:
         return [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
 
 
-@pytest.mark.parametrize("workers", [2, 4])
-def test_any_number_of_workers_gives_the_same_epochs(clips: Path, reference: list[str], workers: int) -> None:
-    with LocalServer(clips, workers=workers, flags=SMALL_FLAGS) as server:
-        batches = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
-    assert [digest(batch) for batch in batches] == reference
+@pytest.mark.parametrize("shared", [True, False])
+def test_another_number_of_workers_and_the_way_samples_travel_change_nothing(
+    server: LocalServer, reference: list[str], shared: bool
+) -> None:
+    got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, shared_memory=shared)]
+    assert got == reference
     assert len(reference) == len(set(reference))
 
 
-def test_batch_size_changes_no_sample(clips: Path) -> None:
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
-        threes = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=3)])
-        fours = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=4)])
+def test_many_workers_change_nothing(clips: Path, reference: list[str]) -> None:
+    with LocalServer(clips, workers=4, flags=SMALL_FLAGS) as many:
+        assert [digest(batch) for epoch in (0, 1) for batch in epoch_of(many.address, epoch=epoch)] == reference
+
+
+def test_batch_size_changes_no_sample(server: LocalServer) -> None:
+    threes = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=3)])
+    fours = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=4)])
     common = min(len(threes), len(fours))
     assert common >= 20
     np.testing.assert_array_equal(threes[:common], fours[:common])
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_the_way_they_travel_changes_nothing(clips: Path, reference: list[str], shared: bool) -> None:
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
-        got = [
-            digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, shared_memory=shared)
-        ]
-    assert got == reference
 
 
 def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> None:
@@ -72,26 +67,18 @@ def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None
     """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
     with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
         stopped = server_workers(server.pid)[0]
-        until_connected(stopped)
+        # Before its hello nobody would miss a worker.
+        until(lambda: stopped.net_connections(kind="unix"))
         stopped.suspend()
         got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
         stopped.wait(timeout=20)
     assert got == reference
 
 
-def until_connected(worker: psutil.Process, seconds: float = 60.0) -> None:
-    """Waits for a worker that is still loading its kernels: before its hello nobody would miss it."""
-    deadline = time.monotonic() + seconds
-    while not worker.net_connections(kind="unix"):
-        assert time.monotonic() < deadline, "the worker never found its server"
-        time.sleep(0.02)
-
-
-def test_one_process_makes_the_same_samples(clips: Path) -> None:
+def test_one_process_makes_the_same_samples(clips: Path, server: LocalServer) -> None:
+    batch = epoch_of(server.address, seed=5, epoch=2)[1]
     catalogue = open_catalogue(clips)
     try:
-        with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
-            batch = epoch_of(server.address, seed=5, epoch=2)[1]
         for row, index in enumerate(batch.indices):
             sample = remake(catalogue, StreamSpec(recipe=SMALL), seed=5, epoch=2, index=index)
             np.testing.assert_array_equal(batch.voxels[row].numpy(), sample.arrays["voxels"])
@@ -101,14 +88,13 @@ def test_one_process_makes_the_same_samples(clips: Path) -> None:
         catalogue.close()
 
 
-def test_v2v_simulate_makes_the_same_sample(clips: Path, tmp_path: Path) -> None:
+def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tmp_path: Path) -> None:
     recipe = tmp_path / "small.yaml"
     recipe.write_text("preset: paper\nvoxels_per_clip: 4\ncrop_height_px: 32\n", encoding="utf-8")
     command = [sys.executable, "-m", "v2v_server.cli", "simulate", str(clips), "--recipe", str(recipe)]
     command += ["--set", "crop_width_px=40", "--seed", "3", "--index", "7", "--out", str(tmp_path / "sample.npz")]
     subprocess.run([*command, "--picture", str(tmp_path / "sample.png")], check=True, capture_output=True)
-    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
-        batch = epoch_of(server.address)[2]
+    batch = epoch_of(server.address)[2]
     with np.load(tmp_path / "sample.npz") as sample:
         np.testing.assert_array_equal(sample["voxels"], batch.voxels[1].numpy())
         np.testing.assert_array_equal(sample["frames"], batch.frames[1].numpy())
@@ -118,16 +104,14 @@ def test_v2v_simulate_makes_the_same_sample(clips: Path, tmp_path: Path) -> None
     assert (tmp_path / "sample.png").stat().st_size > 1000
 
 
-def test_flow_is_remade_like_everything_else(clips: Path) -> None:
+def test_flow_is_remade_like_everything_else(clips: Path, server: LocalServer) -> None:
     """All arrays, with flow settings that are not the default; a paused step moves by exactly nothing."""
     arrays = ("voxels", "frames", "flow", "flow_valid")
     flow = {"flow_method": "dis-ultrafast", "flow_direction": "backward", "flow_from": 1, "flow_margin_px": 8}
     recipe = SMALL.replace(pause_probability=0.5)
+    batch = next(iter(V2VStreamDataset(server.address, 3, arrays, recipe, seed=3, **flow)))
     catalogue = open_catalogue(clips)
     try:
-        with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
-            dataset = V2VStreamDataset(server.address, 3, arrays, recipe, seed=3, **flow)
-            batch = next(iter(dataset))
         spec = StreamSpec.from_dict({"recipe": recipe, **flow})
         for row, index in enumerate(batch.indices):
             sample = remake(catalogue, spec, seed=3, epoch=0, index=index, arrays=arrays)

@@ -17,20 +17,18 @@ import zmq
 
 from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of, server_workers
+from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.messages import Hello, Ping, Pong, Refused, Want, Welcome
 from v2v_protocol.wire import decode, encode
+from v2v_server.cli import serve
 
 
 @pytest.fixture
-def raw(clips: Path) -> Iterator[tuple[zmq.Socket[bytes], str]]:
+def raw(server: LocalServer) -> Iterator[tuple[zmq.Socket[bytes], str]]:
     """A bare socket on a running server, and its address."""
-    with (
-        LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server,
-        zmq.Context() as context,
-        context.socket(zmq.DEALER) as dealer,
-    ):
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
         dealer.setsockopt(zmq.LINGER, 0)
         dealer.setsockopt(zmq.RCVTIMEO, 20_000)
         dealer.connect(server.address)
@@ -115,34 +113,52 @@ def test_workers_do_not_outlive_a_killed_server(clips: Path, tmp_path: Path) -> 
     assert not psutil.wait_procs(workers, timeout=10)[1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--videos", "{clips}/nowhere"], "nowhere: there is no such folder"),
-        (["--videos", "{empty}"], "no video found"),
-        ([], "--videos is missing"),
-        (["--videos", "{clips}", "--set", "tresholds=1"], "unknown recipe key 'tresholds' (did you mean 'threshold'?)"),
-        (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe preset 'papper' (did you mean 'paper'?)"),
-        (["--videos", "{clips}", "--set", "crop_width_px=128"], "no video gives a sequence"),
-        (["--videos", "{clips}", "--bind", "tcp://0.0.0.0:5555"], "--insecure"),
-        (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
-        (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:{taken}"], "Address already in use"),
-        (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),
-        (["--videos", "{clips}", "--rows", "middle"], "rows"),
-        (["--videos", "{clips}", "--workers", "-1"], "--workers -1"),
-        (["--videos", "{clips}", "--port-file", "{clips}/no/such/folder/port"], "--port-file"),
-    ],
-)
-def test_bad_input_is_one_clear_line_and_status_2(
+BAD_SETTINGS = [
+    ([], "--videos is missing"),
+    (["--videos", "{clips}", "--set", "tresholds=1"], "unknown recipe key 'tresholds' (did you mean 'threshold'?)"),
+    (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe preset 'papper' (did you mean 'paper'?)"),
+    (["--videos", "{clips}", "--bind", "tcp://0.0.0.0:5555"], "--insecure"),
+    (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
+    (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),
+    (["--videos", "{clips}", "--rows", "middle"], "rows"),
+    (["--videos", "{clips}", "--workers", "-1"], "--workers -1"),
+]
+BAD_SURROUNDINGS = [
+    (["--videos", "{clips}/nowhere"], "nowhere: there is no such folder"),
+    (["--videos", "{empty}"], "no video found"),
+    (["--videos", "{clips}", "--set", "crop_width_px=128"], "no video gives a sequence"),
+    (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:{taken}"], "Address already in use"),
+    (["--videos", "{clips}", "--workers", "0", "--port-file", "{clips}/no/such/folder/port"], "--port-file"),
+]
+
+
+def _filled_in(arguments: list[str], **names: object) -> list[str]:
+    small = ["--set", "voxels_per_clip=4", "--set", "crop_height_px=32"]
+    small += [] if "crop_width_px=128" in arguments else ["--set", "crop_width_px=40"]
+    return [*(part.format(**names) for part in arguments), *small]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_SETTINGS)
+def test_bad_settings_are_one_clear_line_and_status_2(
+    clips: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        serve(_filled_in(arguments, clips=clips))
+    said = capsys.readouterr().err
+    assert ended.value.code == 2, said
+    assert message in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_SURROUNDINGS)
+def test_a_start_that_cannot_be_ends_with_status_2_and_no_trace(
     clips: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        names = {"clips": clips, "empty": tmp_path, "taken": taken.getsockname()[1]}
-        small = ["--set", "voxels_per_clip=4", "--set", "crop_height_px=32"]
-        small += [] if "crop_width_px=128" in arguments else ["--set", "crop_width_px=40"]
-        command = [sys.executable, "-m", "v2v_server", *(part.format(**names) for part in arguments), *small]
+        command = [sys.executable, "-m", "v2v_server"]
+        command += _filled_in(arguments, clips=clips, empty=tmp_path, taken=taken.getsockname()[1])
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
@@ -157,7 +173,7 @@ def test_the_start_says_which_videos_give_nothing_and_what_would_admit_them(clip
     (folder / "noise.mp4").write_bytes(os.urandom(500))
     port_file = tmp_path / "port"
     flags = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32")
-    server = _start(folder, "--port-file", str(port_file), *flags)
+    server = _start(folder, "--port-file", str(port_file), "--workers", "0", *flags)
     try:
         _wait_for(server, port_file)
     finally:
@@ -181,16 +197,8 @@ def _start(videos: Path, *flags: str) -> subprocess.Popen[str]:
 
 
 def _wait_for(server: subprocess.Popen[str], port_file: Path) -> None:
-    import time
-
-    deadline = time.monotonic() + 60
-    while not port_file.exists():
-        assert server.poll() is None, server.stderr.read() if server.stderr else ""
-        assert time.monotonic() < deadline
-        try:
-            server.wait(0.05)
-        except subprocess.TimeoutExpired:
-            continue
+    until(lambda: port_file.exists() or server.poll() is not None)
+    assert server.poll() is None, server.stderr.read() if server.stderr else ""
 
 
 def _end(server: subprocess.Popen[str]) -> None:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
-from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
+from tests.video.lethal_reads import always_killed, killed_once, lethal
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
-from v2v_server.video.store import Record
-from v2v_server.video.survey import examine, survey
+from v2v_server.video.survey import survey
 
 
 @pytest.fixture(scope="module")
@@ -215,39 +214,20 @@ def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monk
     assert len(list((tmp_path / "chosen").iterdir())) == 1
 
 
-def _lethal(root: str, id: str) -> Record:
-    if "lethal" in id:
-        os.kill(os.getpid(), signal.SIGSEGV)
-    return examine(root, id)
-
-
 def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
     shutil.copy(corpus / "a.mp4", corpus / "lethal.mp4")
     names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
-    records = {record.id: record for record in survey(corpus, names, 2, _lethal)}
+    records = {record.id: record for record in survey(corpus, names, 2, lethal)}
     assert set(records) == set(names)
     assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
     assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
     assert [records[id].frames for id in ("a.mp4", "sub/b.mp4")] == [30, 30]
 
 
-def _killed_once(root: str, id: str) -> Record:
-    mark = Path(root, f"{id}.killed")
-    if not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return examine(root, id)
-
-
-def _always_killed(root: str, id: str) -> Record:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return examine(root, id)
-
-
 def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
     names = ["a.mp4", "sub/b.mp4"]
-    assert {record.id: record.problem for record in survey(corpus, names, 2, _killed_once)} == dict.fromkeys(names)
-    (record,) = survey(corpus, ["a.mp4"], 2, _always_killed)
+    assert {record.id: record.problem for record in survey(corpus, names, 2, killed_once)} == dict.fromkeys(names)
+    (record,) = survey(corpus, ["a.mp4"], 2, always_killed)
     assert "from outside or for want of memory (signal SIGKILL)" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again
 
@@ -270,3 +250,20 @@ def test_fingerprints(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(VideoError, match="cannot be read: No such file"):
         check_fingerprint(path, max(seen))
+
+
+def test_the_encoded_part_of_an_index_is_that_of_its_slice_and_the_latest_are_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        first = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert catalogue.frame_index_bytes("a.mp4", 0, 20) is first
+        for start in range(1, 100):
+            expected = catalogue.frame_index("a.mp4").slice(start, 20).to_bytes()
+            assert catalogue.frame_index_bytes("a.mp4", start, 20) == expected
+        again = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert again == first
+        assert again is not first
+        with pytest.raises(UsageError, match="asked of an index"):
+            catalogue.frame_index_bytes("a.mp4", 110, 20)

@@ -8,8 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import psutil
@@ -18,6 +17,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.video.test_prepare import opened, psnr_db, run, whole
 from tests.video.test_prepare_isolate import children
+from tests.waiting import until
 from v2v_protocol.errors import CorpusError
 from v2v_server.prepare_cli import main
 from v2v_server.video.encode import Encoding
@@ -97,26 +97,34 @@ def test_several_processes_make_the_same_files(source: Path, tmp_path: Path) -> 
     assert sorted(steps) == steps
 
 
+def _killed_in_the_middle(command: Sequence[str], cache: Path, out: Path, wanted: int) -> bool:
+    """Runs a command that is killed while it writes a file and so many new ones are done; whether it was."""
+    seen = set(inodes(out).values()) if out.exists() else set()
+
+    def due() -> bool:
+        there = list(out.rglob("*")) if out.exists() else []
+        fresh = {path.stat().st_ino for path in there if path.suffix == ".mp4"} - seen
+        return len(fresh) >= wanted and any(path.name.endswith(PARTIAL_SUFFIX) for path in there)
+
+    environment = os.environ | {"V2V_CACHE_DIR": str(cache)}
+    victim = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until(lambda: victim.poll() is not None or due())
+        below = psutil.Process(victim.pid).children(recursive=True) if victim.poll() is None else []
+    finally:
+        victim.kill()
+        victim.wait()
+    psutil.wait_procs(below, timeout=_KILLED_SECONDS)
+    return victim.returncode == -signal.SIGKILL
+
+
 @pytest.mark.parametrize("turn", [0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in (1, 2, 3))])
 def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> None:
     """Killed in the middle of a file, once a random number of others are done; again; and then finished."""
     out, rng = tmp_path / "out", random.Random(turn)
     command = [sys.executable, "-m", "v2v_server.prepare_cli", str(source), str(out), "--gop", "12", "--workers", "2"]
-    environment = os.environ | {"V2V_CACHE_DIR": str(tmp_path / "cache")}
     for _ in range(1 + turn % 2):
-        seen, limit = set(inodes(out).values()) if out.exists() else set(), time.monotonic() + _KILLED_SECONDS
-        wanted = rng.randrange(3)
-        victim = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while victim.poll() is None and time.monotonic() < limit:
-            there = list(out.rglob("*")) if out.exists() else []
-            fresh = {p.stat().st_ino for p in there if p.suffix == ".mp4"} - seen
-            if len(fresh) >= wanted and any(path.name.endswith(PARTIAL_SUFFIX) for path in there):
-                break
-        below = psutil.Process(victim.pid).children(recursive=True) if victim.poll() is None else []
-        victim.send_signal(signal.SIGKILL)
-        victim.wait()
-        psutil.wait_procs(below, timeout=_KILLED_SECONDS)
-        if victim.returncode == -signal.SIGKILL:
+        if _killed_in_the_middle(command, tmp_path / "cache", out, rng.randrange(3)):
             records = read_manifest(out).videos
             assert all(fingerprint(out / id) == record.fingerprint for id, record in records.items())
     last = run(source, out)

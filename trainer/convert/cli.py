@@ -19,7 +19,8 @@ from trainer.convert import items
 from trainer.convert.conversion import FORMS, Converted, convert, default_name
 from trainer.convert.text_events import NS_PER_UNIT
 from trainer.evaluation import layout
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_client.command import run_command
+from v2v_protocol.errors import UsageError
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -45,20 +46,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--json", metavar="FILE", help="also write a record of each recording")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
-    arguments = parser.parse_args(argv)
-    try:
-        _run(arguments)
-    except KeyboardInterrupt:
-        print("v2v-convert: interrupted; no incomplete file is left", file=sys.stderr)
-        sys.exit(130)
-    except V2VError as error:
-        if arguments.debug:
-            raise
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        sys.exit(2)
+    interrupted = "interrupted; no incomplete file is left"
+    if status := run_command(parser, _run, argv, interrupted=interrupted):
+        sys.exit(status)
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> int:
     options = items.Options(
         size=None if arguments.size is None else items.SensorSize.parse(arguments.size),
         time_unit=arguments.time_unit,
@@ -89,6 +82,7 @@ def _run(arguments: argparse.Namespace) -> None:
             Path(arguments.json).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
         except OSError as error:
             raise UsageError(f"--json {arguments.json}: cannot be written: {error.strerror or error}") from error
+    return 0
 
 
 def summary(done: Converted) -> str:

@@ -26,7 +26,8 @@ from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_client.command import run_command
+from v2v_protocol.errors import UsageError
 
 LEAST_WIDTH = 110
 """Of tables that do not go to a terminal."""
@@ -34,18 +35,8 @@ LEAST_WIDTH = 110
 
 def main(argv: Sequence[str] | None = None) -> None:
     """`v2v-eval`."""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    try:
-        _run(arguments)
-    except KeyboardInterrupt:
-        print("v2v-eval: interrupted", file=sys.stderr)
-        sys.exit(130)
-    except V2VError as error:
-        if arguments.debug:
-            raise
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        sys.exit(2)
+    if status := run_command(_parser(), _run, argv):
+        sys.exit(status)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -92,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> int:
     data = Path(arguments.data)
     if not data.exists():
         raise UsageError(f"--data {data}: no such folder or file")
@@ -119,6 +110,7 @@ def _run(arguments: argparse.Namespace) -> None:
             "reconstruction_hz": run.fps,
         }
         _write_json(Path(arguments.json), records(scores, settings))
+    return 0
 
 
 def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[Run, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -190,11 +191,18 @@ def simulate_clip(
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, every variant of the kernel that a server worker needs."""
+    """Compile, or load from the cache, every variant of the kernels that a server worker usually needs.
+
+    Those are the kernel without effects for every dtype, and the one with effects for int8 alone: each variant takes
+    seconds to compile. What is left is compiled when it is met: effects in another dtype, and float64 arithmetic.
+    """
+    frames, table, steps = np.zeros((2, 1, 1), np.uint8), _table(2.2, 1e-3, np.float32), np.ones(1)
     params = _params(0.2, 0.2, 0.1, 1, 1.0, 0)
-    frames = np.zeros((2, 1, 1), np.uint8)
     for dtype in VOXEL_DTYPES:
-        _run(frames, _table(2.2, 1e-3, np.float32), np.arange(2), params, np.ones(1), 1, 1, dtype)
+        _run(frames, table, np.arange(2), params, steps, 1, 1, dtype)
+    params = replace(params, effects=Effects(shot_noise_hz=1.0))
+    prepared = prepare(params, (2.2, 1e-3), steps, 1, np.float32, _compiled_words)
+    _run(frames, table, np.arange(2), params, steps, 1, 1, "int8", prepared=prepared)
 
 
 def _simulate_array(

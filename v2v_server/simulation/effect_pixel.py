@@ -2,8 +2,6 @@
 
 A kernel of its own, so that a camera without effects runs the code it always ran. Loops, order of operations and
 promises are those of ``pixel.py``, whose inner functions it calls.
-
-Numba's cache is keyed by the source of this file alone: after changing pixel.py, save this one too.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls

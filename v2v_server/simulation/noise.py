@@ -49,7 +49,6 @@ PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS
 MISMATCH_RADIUS, MISMATCH_ANGLE, SHOT_PIXEL_POS, SHOT_PIXEL_NEG, SHOT_STEP_POS, SHOT_STEP_NEG, DEAD_PLACE = range(9, 16)
 """What a word is for. Numbers are never reused."""
 
-# Numba's cache is keyed by the source of pixel.py alone: after changing a number below, save pixel.py too.
 GOLDEN = np.uint32(0x9E3779B9)
 SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))
 MIX_FACTORS = (np.uint32(0x21F0AAAD), np.uint32(0x735A2D97), np.uint32(0xAC4C1B51))

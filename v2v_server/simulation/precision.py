@@ -35,7 +35,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS, LIMITS_OF_EFFECTS, SMALLEST_PHOTORECEPTOR_HZ
+from v2v_protocol.recipe import LARGEST_EVENTS
+from v2v_protocol.recipe_fields import LIMITS_OF_EFFECTS, SMALLEST_PHOTORECEPTOR_HZ
 from v2v_protocol.sample import Effects
 
 AUTO = "auto"

@@ -2,8 +2,6 @@
 
 Everything here moves bits or hints at speed; nothing rounds. So a processor without the instructions named below gives
 the same bytes, later.
-
-Numba's cache is keyed by the source of pixel.py alone: after changing anything below, save pixel.py too.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,17 +13,14 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
 from v2v_server.video.index import FrameIndex, unseekable
 from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.video.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
+from v2v_server.video.refresh import Progress, index_path, up_to_date
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import Scene
 from v2v_server.video.scenes import Looking
 from v2v_server.video.store import Record, Store
-from v2v_server.video.survey import survey
 from v2v_server.video.tree import VIDEO_SUFFIXES, printable, video_files
 
-_WRITE_EVERY = 256
-
-Progress = Callable[[int, int], None]
-"""(files probed so far, files to probe)."""
+_KEPT_SLICES = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +89,7 @@ class Catalogue:
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
     _looking: Looking | None = field(repr=False, compare=False)
     _unseen: frozenset[str] = field(repr=False, compare=False)
+    _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
 
     def path(self, id: str) -> Path:
         """Where the video lies.
@@ -121,6 +118,22 @@ class Catalogue:
         if data is None:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return FrameIndex.from_bytes(data)
+
+    def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
+        """The part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
+
+        The latest are kept, because siblings ask for the same one after the other.
+
+        Raises:
+            CorpusError, VideoChanged, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
+        """
+        key = id, start, count
+        if key not in self._slices:
+            encoded = self.frame_index(id).slice(start, count).to_bytes()
+            while len(self._slices) >= _KEPT_SLICES:
+                del self._slices[next(iter(self._slices))]
+            self._slices[key] = encoded
+        return self._slices[key]
 
     def scene(self, id: str) -> Scene:
         """The statistics of a video, read from the index on disk.
@@ -210,7 +223,7 @@ def open_catalogue(
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
     looking = Looking(rows or Rows(), manifest) if scene else None
-    store, records, notes = _up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress)
+    store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress)
     try:
         return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
     except BaseException:
@@ -234,85 +247,6 @@ def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Pat
     return folder, (ListEntry(source.name),)
 
 
-def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
-    """The index file of a corpus; ``cache_dir`` as in :func:`open_catalogue`."""
-    if cache_dir is not None:
-        folder = Path(cache_dir)
-    elif chosen := os.environ.get("V2V_CACHE_DIR"):
-        folder = Path(chosen)
-    else:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
-    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
-    return folder / f"catalogue-{name}.sqlite3"
-
-
-def _up_to_date(
-    root: Path,
-    ids: Sequence[str],
-    path: Path,
-    looking: Looking | None,
-    processes: int,
-    progress: Progress | None,
-) -> tuple[Store, dict[str, Record], list[str]]:
-    """An open index that knows every id, and its records; in memory, with a note, where the file cannot serve."""
-    try:
-        return *_refreshed(path, root, ids, looking, processes, progress), []
-    except (sqlite3.Error, OSError) as error:
-        note = (
-            f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
-            "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
-            "another place with V2V_CACHE_DIR"
-        )
-        return *_refreshed(None, root, ids, looking, processes, progress), [note]
-
-
-def _refreshed(
-    path: Path | None,
-    root: Path,
-    ids: Sequence[str],
-    looking: Looking | None,
-    processes: int,
-    progress: Progress | None,
-) -> tuple[Store, dict[str, Record]]:
-    store = Store(path)
-    try:
-        known = store.records()
-        stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
-        wanted = set(ids)
-        store.forget([id for id in known if id not in wanted and not (root / id).is_file()])
-        with closing(survey(root, stale, processes)) as found:
-            for batch in _batches(found, len(stale), progress):
-                store.put(batch)
-                known.update((record.id, record) for record in batch)
-        records = {id: known[id] for id in ids}
-        if looking is not None:
-            looking.take_in(store, root, records, processes, progress)
-        return store, records
-    except BaseException:
-        store.close()
-        raise
-
-
-def _unchanged(root: Path, record: Record) -> bool:
-    try:
-        status = (root / record.id).stat()
-    except OSError:
-        return False
-    return (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns)
-
-
-def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:
-    batch: list[Record] = []
-    for done, record in enumerate(records, 1):
-        batch.append(record)
-        if progress is not None:
-            progress(done, total)
-        if len(batch) == _WRITE_EVERY:
-            yield batch
-            batch = []
-    yield batch
-
-
 def _snapshot(
     root: Path,
     rows: Rows,
@@ -326,6 +260,7 @@ def _snapshot(
 ) -> Catalogue:
     by_id = {entry.id: entry for entry in listed}
     problems = dict(refused)
+    used = []
     videos = []
     shorter = []
     absent: dict[str, PreparedVideo] = {}
@@ -338,6 +273,7 @@ def _snapshot(
         if record.problem is not None:
             problems[id] = record.problem
             continue
+        used.append(record)
         videos.append(_entry(record, entry))
         if entry.frames is not None and entry.frames > record.frames:
             shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
@@ -353,7 +289,8 @@ def _snapshot(
     digest = _digest(rows, videos)
     scene_digest, unseen = None, set(absent)
     if looking is not None:
-        videos, scene_digest = _with_runs(videos, unseen, store, looking, digest)
+        runs, scene_digest = looking.runs(store, used, unseen, digest)
+        videos = [replace(video, runs=its) for video, its in zip(videos, runs, strict=True)]
         if died := sorted(unseen - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
     return Catalogue(
@@ -371,23 +308,6 @@ def _snapshot(
         _looking=looking,
         _unseen=frozenset(unseen),
     )
-
-
-def _with_runs(
-    videos: Sequence[VideoEntry], unseen: set[str], store: Store, looking: Looking, digest: str
-) -> tuple[list[VideoEntry], str]:
-    """The videos with their runs, and the digest of all that is known of them; ``unseen`` receives the ids of those of
-    which nothing is."""
-    sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
-    seen = []
-    for video in videos:
-        data = None if video.id in unseen else store.scene(video.id, video.fingerprint, looking.key)
-        if data is None:
-            unseen.add(video.id)
-        scene = Scene.unknown() if data is None else Scene.from_bytes(data)
-        sha.update(scene.to_bytes())
-        seen.append(replace(video, runs=tuple(scene.runs(video.frames))))
-    return seen, sha.hexdigest()[:32]
 
 
 def _entry(record: Record, entry: ListEntry) -> VideoEntry:

@@ -6,9 +6,10 @@ fingerprint and the rows it was taken of.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from base64 import b64decode
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -72,6 +73,27 @@ class Looking:
                     store.put_scenes(batch)
                     batch = []
         store.put_scenes(batch)
+
+    def runs(
+        self, store: Store, records: Iterable[Record], unseen: set[str], digest: str
+    ) -> tuple[list[tuple[tuple[int, int], ...]], str]:
+        """The runs of each video, and a digest that names all that is known of them.
+
+        Args:
+            records: of the videos of a snapshot, in its order.
+            unseen: ids of videos of which nothing is known; receives those that the index has no look at.
+            digest: of the snapshot.
+        """
+        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+        runs = []
+        for record in records:
+            data = None if record.id in unseen else store.scene(record.id, record.fingerprint, self.key)
+            if data is None:
+                unseen.add(record.id)
+            scene = Scene.unknown() if data is None else Scene.from_bytes(data)
+            sha.update(scene.to_bytes())
+            runs.append(tuple(scene.runs(record.frames)))
+        return runs, sha.hexdigest()[:32]
 
     def _found(
         self, store: Store, root: Path, missing: list[Record], processes: int

@@ -1,0 +1,56 @@
+"""Named recipes: each as what it changes of the fields' own defaults, which are those of the paper.
+
+:data:`v2v_protocol.recipe.PRESETS` has them as recipes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+DEFAULT_PRESET = "paper"
+
+PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    # Ablation "-F": one draw of the thresholds per video, for ever.
+    "paper-fixed-thresholds": {"threshold_source": "video"},
+    # Ablation "LDR": contrast raised, then clipped.
+    "paper-contrast": {"contrast_probability": 0.8},
+    # EVFlowNet: the frame before the first target frame, for pseudo flow.
+    "paper-flow": {"lead_frames": 1},
+    # ERAFT: that frame, and one more voxel grid in front.
+    "paper-eraft": {"lead_frames": 1, "lead_voxels": 1},
+    # The paper's pixel without noise, hot pixels or pauses: for tests and for looking.
+    "noise-free": {
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+        "pause_probability": 0.0,
+    },
+    # What v2e (Hu et al. 2021) calls `clean`: thresholds 0.2 with a deviation of 0.02, nothing else.
+    "clean": {
+        "threshold": (0.2, 0.2),
+        "threshold_ratio": (1.0, 1.0),
+        "threshold_mismatch_sigma": (0.1, 0.1),
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+    },
+    # A DAVIS346 in ordinary light; where each value comes from is told in docs/effects.md.
+    "davis346": {
+        # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
+        "threshold": (0.134, 0.405),
+        # 2.1 % of contrast (Lichtsteiner et al. 2008); 0.05 of 0.2 (v2e `noisy`)
+        "threshold_mismatch_sigma": (0.1, 0.25),
+        "shot_noise_hz": (0.0, 5.0),  # up to v2e's `noisy`
+        "leak_hz": (0.05, 0.2),  # around v2e's 0.1; the width is a guess
+        "refractory_seconds": (1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
+        "photoreceptor_hz": (30.0, 300.0),  # v2e's `noisy` and its default
+        "dead_pixel_share": (0.0, 1e-4),  # a guess
+        # Shot noise takes the place of the paper's noise; hot pixels of up to about a hundred events a second: a guess.
+        "noise_sigma": (0.0, 0.0),
+        "noise_unit": "second",
+        "hot_pixel_share": (0.0, 5e-4),
+        "hot_pixel_sigma": (0.0, 20.0),
+    },
+}

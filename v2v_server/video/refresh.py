@@ -1,0 +1,108 @@
+"""The catalogue's index on disk, brought up to date: what is new or changed is probed, what is gone is forgotten."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from v2v_server.video.scenes import Looking
+from v2v_server.video.store import Record, Store
+from v2v_server.video.survey import survey
+
+_WRITE_EVERY = 256
+
+Progress = Callable[[int, int], None]
+"""(files probed so far, files to probe)."""
+
+
+def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+    """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.video.catalogue.open_catalogue`."""
+    if cache_dir is not None:
+        folder = Path(cache_dir)
+    elif chosen := os.environ.get("V2V_CACHE_DIR"):
+        folder = Path(chosen)
+    else:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
+    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    return folder / f"catalogue-{name}.sqlite3"
+
+
+def up_to_date(
+    root: Path,
+    ids: Sequence[str],
+    path: Path,
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
+) -> tuple[Store, dict[str, Record], list[str]]:
+    """An open index that knows every id, its records, and notes for the user.
+
+    The index is in memory, with a note, where the file cannot serve.
+
+    Args:
+        root: the folder that ids are relative to.
+        ids: of the videos to know.
+        path: of the index.
+        looking: how to look at what the videos show; None does not.
+        processes, progress: as in :func:`v2v_server.video.catalogue.open_catalogue`.
+    """
+    try:
+        return *_refreshed(path, root, ids, looking, processes, progress), []
+    except (sqlite3.Error, OSError) as error:
+        note = (
+            f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
+            "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
+            "another place with V2V_CACHE_DIR"
+        )
+        return *_refreshed(None, root, ids, looking, processes, progress), [note]
+
+
+def _refreshed(
+    path: Path | None,
+    root: Path,
+    ids: Sequence[str],
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
+) -> tuple[Store, dict[str, Record]]:
+    store = Store(path)
+    try:
+        known = store.records()
+        stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
+        wanted = set(ids)
+        store.forget([id for id in known if id not in wanted and not (root / id).is_file()])
+        with closing(survey(root, stale, processes)) as found:
+            for batch in _batches(found, len(stale), progress):
+                store.put(batch)
+                known.update((record.id, record) for record in batch)
+        records = {id: known[id] for id in ids}
+        if looking is not None:
+            looking.take_in(store, root, records, processes, progress)
+        return store, records
+    except BaseException:
+        store.close()
+        raise
+
+
+def _unchanged(root: Path, record: Record) -> bool:
+    try:
+        status = (root / record.id).stat()
+    except OSError:
+        return False
+    return (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns)
+
+
+def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:
+    batch: list[Record] = []
+    for done, record in enumerate(records, 1):
+        batch.append(record)
+        if progress is not None:
+            progress(done, total)
+        if len(batch) == _WRITE_EVERY:
+            yield batch
+            batch = []
+    yield batch
