@@ -104,10 +104,10 @@ class Link:
         """The next message; None when none came in that time, or the network was heard of instead."""
         socket = self._open(self._socket)
         try:
-            ready = dict(self._poller.poll(math.ceil(seconds * 1000)))
-            return socket.recv_multipart(flags=zmq.NOBLOCK, copy=False) if socket in ready else None
-        except zmq.Again:  # readiness is a hint
-            return None
+            message = _taken(socket)  # without asking first: when much is under way, there usually is one
+            if message is None and seconds > 0 and socket in dict(self._poller.poll(math.ceil(seconds * 1000))):
+                message = _taken(socket)
+            return message
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot receive: {error}") from error
 
@@ -125,3 +125,10 @@ class Link:
         if socket is None:
             raise ServerLost(f"{self._address}: this connection is closed")
         return socket
+
+
+def _taken(socket: zmq.Socket[bytes]) -> list[zmq.Frame] | None:
+    try:
+        return socket.recv_multipart(flags=zmq.NOBLOCK, copy=False)
+    except zmq.Again:
+        return None
