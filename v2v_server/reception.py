@@ -28,12 +28,13 @@ def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> 
 
     With K samples of a decode these are counted in blocks of ``batch_size`` clips, K samples each, because a worker
     gets the siblings of a clip at once only if all of them have been asked for: the blocks that the workers are at, two
-    clips each, and one more.
+    clips each, and one more. And an eighth of the whole, for which our client waits until it asks.
     """
     ahead = 2 * max(1, workers)
     if samples_per_decode == 1:
         return max(2 * batch_size, ahead)
-    return batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
+    under_way = batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
+    return under_way + -(-under_way // 7)
 
 
 class Reception:
