@@ -23,11 +23,12 @@ LEAVES = "import sys\nsys.exit(3)"
 
 
 @pytest.fixture(autouse=True)
-def _hangups_count() -> Iterator[None]:
-    """Under ``nohup`` they are ignored, and children inherit that."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def _hangups_and_interrupts_count() -> Iterator[None]:
+    """Under ``nohup``, or in the background of a script, they are ignored, and children inherit that."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGINT)}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
