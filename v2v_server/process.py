@@ -32,23 +32,6 @@ def keep_freed_memory() -> bool:
     )
 
 
-def run_in_long_turns() -> bool:
-    """Tells the scheduler that this process computes and nobody waits for its reactions (SCHED_BATCH, Linux).
-
-    More workers than cores then interrupt each other less, and the broker and a trainer get their turn before them.
-
-    Returns:
-        False where there is no such policy, or it may not be set: nothing was changed.
-    """
-    if not hasattr(os, "SCHED_BATCH"):
-        return False
-    try:
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    except OSError:
-        return False
-    return True
-
-
 def die_with_parent(parent_pid: int) -> None:
     """Makes the kernel kill this process when its parent dies, even by SIGKILL (Linux; elsewhere nothing happens).
 

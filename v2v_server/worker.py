@@ -38,7 +38,7 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode
 from v2v_server.clips import Clips
 from v2v_server.handover import sample_message
 from v2v_server.logbook import IDLE, note
-from v2v_server.process import die_with_parent, keep_freed_memory, run_in_long_turns
+from v2v_server.process import die_with_parent, keep_freed_memory
 from v2v_server.produce import make_sample
 from v2v_server.warm_up import warm_up_in_turn
 
@@ -186,7 +186,6 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     if not root.is_dir():
         raise CorpusError(f"--videos {root}: no such folder on this host")
     keep_freed_memory()
-    run_in_long_turns()
     cv2.setNumThreads(1)
     # Compile or load the kernels first: a worker that has said hello can work at full speed.
     warm_up_in_turn()

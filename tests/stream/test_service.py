@@ -205,10 +205,3 @@ def _end(server: subprocess.Popen[str]) -> None:
     if server.poll() is None:
         server.kill()
     server.communicate(timeout=20)
-
-
-@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="this system has no SCHED_BATCH")
-def test_workers_compute_in_long_turns_and_the_broker_does_not(server: LocalServer) -> None:
-    workers = server_workers(server.pid)
-    until(lambda: all(os.sched_getscheduler(worker.pid) == os.SCHED_BATCH for worker in workers))
-    assert os.sched_getscheduler(server.pid) == os.SCHED_OTHER
