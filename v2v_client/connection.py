@@ -12,8 +12,7 @@ Rules
 
 Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
 answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again. Workers on
-this host put them into an arena (:mod:`v2v_protocol.arena`). A sample asked for again is asked for without a slot:
-its first worker may be at it still, and has one.
+this host put them into memory that is lent to them (:mod:`v2v_client.lending`).
 
 A connection belongs to the process that made it; its ZeroMQ context is made when it is opened, never before a fork.
 """
@@ -30,13 +29,12 @@ from dataclasses import replace
 
 import zmq
 
-from v2v_client.arena import Arena, open_arena
-from v2v_client.arrival import Arrival, InMessage, InSlot, Payload
+from v2v_client.arena import open_arena
+from v2v_client.arrival import Arrival
+from v2v_client.lending import Lending
 from v2v_client.link import Link
 from v2v_client.liveness import Due, Liveness, Patience
-from v2v_client.slots import Answer, Slots
 from v2v_client.state import Stream
-from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.messages import (
     ErrorCode,
@@ -52,7 +50,7 @@ from v2v_protocol.messages import (
     Welcome,
 )
 from v2v_protocol.sample import Provenance, SampleId, array_layout
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_sample, encode, layout_of
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
@@ -106,8 +104,7 @@ class Connection:
         self._clock = clock
         self._process = os.getpid()
         self._shared_memory = shared_memory
-        self._arena: Arena | None = None
-        self._slots = Slots()
+        self._lending = Lending(None)
         self._link: Link | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._liveness = Liveness(self._patience, clock())
@@ -147,7 +144,7 @@ class Connection:
             self.layout = self._layout(self._pinned)
             largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
             self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, largest)
-            self._arena = open_arena(self.layout) if self._shared_memory else None
+            self._lending = Lending(open_arena(self.layout) if self._shared_memory else None)
             self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
         except BaseException:
@@ -184,15 +181,13 @@ class Connection:
         if os.getpid() != self._process:
             return
         link, self._link = self._link, None
-        arena, self._arena = self._arena, None
         try:
             if link is not None:
                 self._leave(link)
         finally:
             if link is not None:
                 link.close()
-            if arena is not None:
-                arena.close()
+            self._lending.close()
 
     # --- asking and receiving -----------------------------------------------------------------------------------------
 
@@ -210,15 +205,8 @@ class Connection:
         if not now:
             return
         self._asked.update(dict.fromkeys(now))
-        if self._arena is None:
-            self._send(Want(self._epoch, tuple(now)))
-            return
-        again = tuple(index for index in now if self._slots.of(index) != NO_SLOT)
-        if again:
-            self._send(Want(self._epoch, again))
-        slots = {index: self._slots.take(index) for index in now if index not in again}
-        if slots:
-            self._send(Want(self._epoch, tuple(slots), self._arena.name, tuple(slots.values())))
+        for request in self._lending.wants(self._epoch, now):
+            self._send(request)
 
     def _want_again(self) -> None:
         # In the order they were asked; after a Welcome with less credit, the rest waits its turn.
@@ -351,7 +339,7 @@ class Connection:
             raise ProtocolError(
                 f"{self._address} sent sample {header.index} of epoch {header.epoch} as {found}; asked: {self.layout}"
             )
-        arrays = self._payload(header, payload)
+        arrays = self._lending.payload(header, payload)
         if arrays is None:
             self.strays += 1
             return None
@@ -372,18 +360,6 @@ class Connection:
         self._last = header.index
         self.want(())
         return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds, header.decoded)
-
-    def _payload(self, header: SampleHeader, payload: list[zmq.Frame]) -> Payload | None:
-        """Where the arrays are; None where nobody knows: in a slot that was not named for them, or not any more."""
-        slot = self._slots.of(header.index)
-        in_message = bool(payload) or header.slot == NO_SLOT
-        arrays = decode_sample(header, [frame.buffer for frame in payload]) if in_message else {}
-        match self._slots.answered(header.index, header.slot, in_message=in_message):
-            case Answer.THERE if self._arena is not None:
-                return InSlot(self._arena, self._slots, slot)
-            case Answer.ABANDONED if self._arena is not None:
-                self._arena.free(slot)
-        return InMessage(arrays) if in_message else None
 
     # --- the link -----------------------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import zmq
 
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Goodbye, Hello, Message, Ping, Pong, Refused, Unavailable, Want, Welcome
 from v2v_protocol.recipe import Recipe
@@ -58,6 +59,7 @@ class FakeServer:
         overstated: Welcome grants this much more than is accepted.
         alter: changes the frames of a sample before they are sent.
         hellos, wants: what came, in order.
+        slots: the slots that came with them.
         most_unanswered: largest number of unanswered samples of one session.
     """
 
@@ -79,6 +81,7 @@ class FakeServer:
         self.hellos: list[Hello] = []
         self.goodbyes = 0
         self.wants: list[tuple[int, int]] = []
+        self.slots: list[int] = []
         self.most_unanswered = 0
         self.refused_for_credit = 0
         self._random = random.Random(7)
@@ -207,6 +210,7 @@ class FakeServer:
         asked = [(want.epoch, index) for index in want.indices]
         repeats = any(key in self.wants for key in asked)
         self.wants += asked
+        self.slots += want.slots or (NO_SLOT,) * len(asked)
         if any(index >= self.sequences for index in want.indices):
             self._send(identity, encode(Refused(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
             return

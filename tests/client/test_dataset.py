@@ -1,5 +1,6 @@
 import copy
 import gc
+import os
 import pickle
 import tempfile
 import threading
@@ -21,6 +22,7 @@ from v2v_client import (
     V2VStreamDataset,
 )
 from v2v_client.liveness import Patience
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Refused
 from v2v_protocol.recipe import Recipe
 
@@ -377,6 +379,18 @@ def test_lost_messages_are_asked_for_again(server):
     batches = list(dataset(server))
     assert places(batches) == epoch_places(0)
     assert server.drop == set()
+
+
+@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
+def test_what_is_asked_again_names_no_memory(server):
+    """The worker that was asked first may be writing there still."""
+    server.drop = {(0, 2), (0, 17)}
+    assert places(dataset(server)) == epoch_places(0)
+    named = {asked: slot for asked, slot in zip(server.wants, server.slots, strict=True) if slot != NO_SLOT}
+    assert len(named) == len(epoch_places(0))  # the first time, each
+    again = [slot for at, slot in enumerate(server.slots) if server.wants[at] in server.wants[:at]]
+    assert len(again) >= 2
+    assert set(again) == {NO_SLOT}
 
 
 def test_a_refusal_for_credit_after_asking_again_is_made_good(server):
