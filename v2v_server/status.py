@@ -102,10 +102,13 @@ class StatusLine:
         achieved = ""
         if 0 < counters.decodes < counters.samples:
             achieved = f"{counters.samples / counters.decodes:.1f} a decode  "
+        # Nothing where all come in messages: consumers elsewhere, or a container between worker and consumer.
+        share = counters.in_slots / counters.samples if counters.samples else 0.0
+        shared = f"{share:.0%} by shared memory  " if share else ""
         return (
             f"{self._batches.update(now, counters.batches):.2f} batches/s  "
             f"{self._samples.update(now, counters.samples):.1f} samples/s  "
-            f"{achieved}"
+            f"{achieved}{shared}"
             f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
             f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
         )
