@@ -46,6 +46,7 @@ STARTS = (0, 200)
 CROP_PX = 128
 MOST_FRAMES = STARTS[-1] + JOB_FRAMES
 """Frames of a clip that are transcoded; sizes are compared by the bytes of a frame."""
+_GOLDEN = (math.sqrt(5) - 1) / 2
 
 SOURCE = "source"
 _X264 = CODECS["h264"]
@@ -66,9 +67,11 @@ SETTINGS = (
     *(Setting(f"h264 {q}", Encoding("h264", q, 25)) for q in (12, 16, 18, 20)),
     Setting("h264 18, GOP 12", Encoding("h264", 18, 12)),
     *(Setting(f"h264 {q}, not fastdecode", Encoding("h264", q, 25), _ORDINARY) for q in (12, 18, 20)),
+    *(Setting(f"h264 18, tiles {px}", Encoding("h264", 18, 25, px)) for px in (150, 200, 300)),
     Setting("h264 18, psychovisual", Encoding("h264", 18, 25), _PSYCHOVISUAL),
     *(Setting(f"mpeg4 {q}", Encoding("mpeg4", q, 25)) for q in (2, 3)),
     Setting("mpeg4 2, GOP 12", Encoding("mpeg4", 2, 12)),
+    *(Setting(f"mpeg4 {q}, tiles 200", Encoding("mpeg4", q, 25, 200)) for q in (2, 3)),
     Setting("mpeg2 2", Encoding("mpeg2", 2, 25)),
     Setting("mjpeg 3", Encoding("mjpeg", 3, 25)),
 )
@@ -92,10 +95,12 @@ class File:
     index: FrameIndex
     window: Window
 
-    def decode(self, start: int) -> npt.NDArray[np.uint8]:
-        """[201, 128, 128] uint8: one job, as a server worker does it."""
+    def decode(self, start: int, place: float) -> npt.NDArray[np.uint8]:
+        """[201, 128, 128] uint8: one job, as a server worker does it, at ``place`` in 0 .. 1 from left to right."""
         part = self.index.slice(start, JOB_FRAMES)
-        return decode_luma(self.path, part, start, JOB_FRAMES, self.window).frames
+        top, _, height, width = self.window
+        window = (top, round(place * (self.index.width_px - width)), height, width)
+        return decode_luma(self.path, part, start, JOB_FRAMES, window).frames
 
     def decode_with(self, options: dict[str, str]) -> npt.NDArray[np.uint8]:
         """[201, 128, 128] uint8: the first job, with options of the decoder; luma in the range it is stored in."""
@@ -164,20 +169,24 @@ def prepared(clips: Sequence[tuple[File, Window]], setting: Setting, folder: Pat
 def measure(forms: dict[str, Form], seconds: float) -> list[dict[str, Any]]:
     """Decode all forms by turns for so many seconds, at least one turn; a record of each."""
     deadline = time.monotonic() + seconds
-    turns = 0
-    while turns == 0 or time.monotonic() < deadline:
+    jobs = 0
+    while jobs == 0 or time.monotonic() < deadline:
         for clip in range(len(forms[SOURCE].files)):
             for start in STARTS:
+                # Spread evenly however many jobs there will be, and the same for all forms.
+                place = jobs * _GOLDEN % 1.0
                 for form in forms.values():
-                    form.seconds.append(_seconds(lambda f=form, c=clip, s=start: f.files[c].decode(s)))  # type: ignore[misc]
-        turns += 1
+                    form.seconds.append(
+                        _seconds(lambda f=form, c=clip, s=start, at=place: f.files[c].decode(s, at))  # type: ignore[misc]
+                    )
+                jobs += 1
     source = forms[SOURCE]
     return [
         {
             "name": name,
             "kind": "prepared",
-            "speed_ratio": _median_ratio(source.seconds, form.seconds),
-            "seconds_per_job": statistics.median(form.seconds),
+            "speed_ratio": sum(source.seconds) / sum(form.seconds),
+            "seconds_per_job": statistics.mean(form.seconds),
             "size_ratio": form.bytes_per_frame / source.bytes_per_frame,
             "psnr_db": None if form is source else form.psnr_db,
             "encode_seconds_per_frame": None if form is source else form.encode_seconds_per_frame,

@@ -49,6 +49,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--gop", type=int, default=DEFAULT_GOP, metavar="N", help=f"distance of keyframes (default {DEFAULT_GOP})"
     )
     parser.add_argument(
+        "--tile-width", type=int, default=0, metavar="PX", dest="tile_px",
+        help="cut pictures into columns of about PX pixels; a crop decodes those that it touches (default 0: no cut)",
+    )  # fmt: skip
+    parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default: one a core)"
     )
     parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts SRC")
@@ -79,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _run(arguments: argparse.Namespace) -> bool:
     quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
-    encoding = Encoding(arguments.codec, quality, arguments.gop)
+    encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px)
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()

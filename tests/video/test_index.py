@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_server.video.index import NO_TIMESTAMP, FrameIndex, unseekable
+from v2v_server.video.index import MOST_TILES, NO_TIMESTAMP, FrameIndex, unseekable
 
 steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=60)
 
@@ -22,11 +22,12 @@ def indices(draw: st.DrawFn) -> FrameIndex:
     keys = np.array(sorted(draw(st.sets(st.integers(first, first + len(pts) - 1)))), np.int64)
     dts = np.array([draw(st.sampled_from([NO_TIMESTAMP, -5, 0, 2**50])) for _ in keys], np.int64)
     base = (draw(st.integers(1, 2**32 - 1)), draw(st.integers(1, 2**32 - 1)))
-    return FrameIndex(first, pts, keys, dts, base, 336, 596, seekable=True)
+    tiles = tuple(draw(st.lists(st.integers(1, 1000), min_size=2, max_size=MOST_TILES) | st.just([])))
+    return FrameIndex(first, pts, keys, dts, base, 336, sum(tiles) or 596, seekable=True, tiles=tiles)
 
 
 def assert_equal(one: FrameIndex, other: FrameIndex) -> None:
-    for name in ("first", "time_base", "height_px", "width_px", "seekable"):
+    for name in ("first", "time_base", "height_px", "width_px", "seekable", "tiles"):
         assert getattr(one, name) == getattr(other, name)
     for name in ("pts", "keyframes", "keyframe_dts"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -112,3 +113,25 @@ def test_disorder_is_refused() -> None:
     index = FrameIndex(0, np.array([0, 2, 1]), np.array([0]), np.array([0]), (1, 25), 48, 64, seekable=True)
     with pytest.raises(ProtocolError, match="do not increase"):
         FrameIndex.from_bytes(index.to_bytes())
+
+
+@pytest.mark.parametrize(
+    ("tiles", "message"),
+    [
+        ((64, 33), "do not make up a picture of 96 px"),
+        ((96, 0), "do not make up"),
+        ((96,), "1 tiles"),
+        ((1,) * 96, "96 tiles"),
+    ],
+)
+def test_tiles_that_cannot_be_are_refused(tiles: tuple[int, ...], message: str) -> None:
+    pts, none = np.arange(7), np.empty(0, np.int64)
+    index = FrameIndex(0, pts, none, none, (1, 25), 48, 96, seekable=True, tiles=tiles)
+    with pytest.raises(ProtocolError, match=message):
+        FrameIndex.from_bytes(index.to_bytes())
+
+
+def test_tiles_that_end_early_are_refused() -> None:
+    index = FrameIndex(0, np.arange(7), np.array([0]), np.array([0]), (1, 25), 48, 96, seekable=True, tiles=(64, 32))
+    with pytest.raises(ProtocolError, match="2 tiles in 3 bytes"):
+        FrameIndex.from_bytes(index.to_bytes()[:36])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import av
@@ -33,6 +33,7 @@ from v2v_server.video.index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import LumaFormat, copy_luma, range_table
 from v2v_server.video.orientation import Orientation, Window
 from v2v_server.video.source import opened, packets, reason
+from v2v_server.video.tiles import Part, parts
 
 BIT_EXACT_CODECS = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo"})
 """Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
@@ -69,6 +70,23 @@ class Cut:
 
     count: int
     window: Window | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Which frames of a file are to be decoded.
+
+    Attributes:
+        path, index, start, stride, loop_filter: see :func:`decode_cuts`; the index is that of the track.
+        track: of the file.
+    """
+
+    path: str
+    index: FrameIndex
+    start: int
+    stride: int
+    loop_filter: str
+    track: int = 0
 
 
 class _SeekFailed(Exception):
@@ -112,18 +130,13 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [Cut(cut.count, _checked(cut.window, index)) for cut in cuts]
-    stack = _Stack(os.fspath(path), index, start, checked, stride)
-    try:
-        done = _decode_quickly(stack, loop_filter)
-    except (_SeekFailed, VideoError):
-        done = False
-        stack = _Stack(os.fspath(path), index, start, checked, stride)
-    if not done:
-        _decode_plainly(stack, loop_filter)
-    exact = stack.codec in BIT_EXACT_CODECS
+    decode = _decode_tiles if index.tiles else _decode_track
+    taken, codec = decode(_Task(os.fspath(path), index, start, stride, loop_filter), checked)
     return tuple(
-        DecodedClip(grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], stack.codec, exact)
-        for grey, cut in zip(stack.grey(), checked, strict=True)
+        DecodedClip(
+            grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
+        )
+        for grey, cut in zip(taken, checked, strict=True)
     )
 
 
@@ -140,20 +153,55 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode_quickly(stack: _Stack, loop_filter: str) -> bool:
+def _window(cut: Cut) -> Window:
+    """Of a cut that was checked."""
+    assert cut.window is not None
+    return cut.window
+
+
+def _decode_tiles(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+    """The cuts of a picture in tiles: each tile that one of them touches is decoded, by itself, and no other."""
+    whole = [np.empty((cut.count, *_window(cut)[2:]), np.uint8) for cut in cuts]
+    needed: dict[int, list[tuple[int, Part]]] = {}
+    for number, cut in enumerate(cuts):
+        for part in parts(_window(cut), task.index.tiles):
+            needed.setdefault(part.track, []).append((number, part))
+    codec = ""
+    for track, wanted in needed.items():
+        tile = replace(task, index=task.index.of_tile(track), track=track)
+        taken, codec = _decode_track(tile, [Cut(cuts[number].count, part.window) for number, part in wanted])
+        for (number, part), frames in zip(wanted, taken, strict=True):
+            whole[number][:, :, part.left : part.left + frames.shape[2]] = frames
+    return whole, codec
+
+
+def _decode_track(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+    """The cuts of the pictures of one track, [count, h, w] uint8 each, and the codec's name."""
+    stack = _Stack(task, cuts)
+    try:
+        done = _decode_quickly(stack)
+    except (_SeekFailed, VideoError):
+        done = False
+        stack = _Stack(task, cuts)
+    if not done:
+        _decode_plainly(stack)
+    return list(stack.grey()), stack.codec
+
+
+def _decode_quickly(stack: _Stack) -> bool:
     """Decode from the last keyframe at or before the range, leaving out what nothing refers to; False when there is
     nothing to be saved.
 
     Raises:
         _SeekFailed, VideoError: it did not work out; decoding plainly has the last word.
     """
-    index = stack.index
-    if not index.seekable or stack.start == 0:
+    task, index = stack.task, stack.task.index
+    if not index.seekable or task.start == 0:
         return False
-    which = int(np.searchsorted(index.keyframes, stack.start, side="right")) - 1
+    which = int(np.searchsorted(index.keyframes, task.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
-    begin = int(index.pts[index.position(stack.start, 1)])
-    with opened(stack.path, loop_filter) as (container, stream):
+    begin = int(index.pts[index.position(task.start, 1)])
+    with opened(task.path, task.loop_filter, task.track) as (container, stream):
         codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
@@ -173,9 +221,10 @@ def _decode_quickly(stack: _Stack, loop_filter: str) -> bool:
     return True
 
 
-def _decode_plainly(stack: _Stack, loop_filter: str) -> None:
+def _decode_plainly(stack: _Stack) -> None:
     """Decode every frame from the beginning of the file."""
-    with opened(stack.path, loop_filter) as (container, stream):
+    task = stack.task
+    with opened(task.path, task.loop_filter, task.track) as (container, stream):
         try:
             _fill(stack, _decoded(stream, packets(container, stream)))
         except av.FFmpegError as error:
@@ -258,15 +307,14 @@ def _packets_from(container: InputContainer, stream: VideoStream, pts: int, dts:
 class _Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, path: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int) -> None:
-        self.path = path
-        self.index = index
-        self.start = start
+    def __init__(self, task: _Task, cuts: Sequence[Cut]) -> None:
+        self.task = task
+        self.index = index = task.index
         self.codec = ""
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
-        self._stride = stride
-        first, most = start - index.first, max(cut.count for cut in cuts)
+        self._stride = stride = task.stride
+        first, most = task.start - index.first, max(cut.count for cut in cuts)
         self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
         self._taken = 0
@@ -299,7 +347,7 @@ class _Stack:
 
     def _is_next(self, frame: VideoFrame, ordinal: int) -> bool:
         if not self.index.seekable:
-            return ordinal >= self.start and (ordinal - self.start) % self._stride == 0
+            return ordinal >= self.task.start and (ordinal - self.task.start) % self._stride == 0
         if frame.pts is None:
             self.refuse("the decoder delivers a frame without a time stamp")
         expected = self._expected[self._taken]
@@ -334,7 +382,7 @@ class _Stack:
                 copy_luma(frame, self._luma, stored, raw[self._taken])
 
     def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
-        window = _checked(cut.window, self.index)
+        window = _window(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
         return stored, np.empty((cut.count, *stored[2:]), np.uint8)
 
@@ -350,7 +398,7 @@ class _Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.path, self.start + self._taken * self._stride, why)
+        raise VideoError(self.task.path, self.task.start + self._taken * self._stride, why)
 
     def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
         """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""

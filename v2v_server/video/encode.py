@@ -7,6 +7,9 @@ What is written is full-range luma and nothing else, in MP4:
   to a person, where pixels that are right are wanted.
 * ``mpeg4``, ``mpeg2``, ``mjpeg``: FFmpeg's own encoders at a constant quantiser, chroma flat.
 
+Keyframes come at multiples of the GOP and nowhere else, at cuts neither: the same in all tiles of a picture, and, with
+a GOP that divides it, at the first frame of every sequence.
+
 No codec uses B-frames, so packets leave in order of presentation. The encoder runs on a clock of its own: one tick a
 frame. So its rate control treats every frame alike whatever the rate, and codecs that know only certain rates take any
 source; the source's time stamps are put onto the packets.
@@ -15,7 +18,7 @@ source; the source's time stamps are put onto the packets.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -32,6 +35,7 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.source import reason
+from v2v_server.video.tiles import MARK, NARROWEST_PX, columns, split
 
 _NOMINAL_RATE = 25
 _MIDDLE_GREY = 128
@@ -63,13 +67,15 @@ class Codec:
     limited_range: bool = False
 
 
+_NO_CUTS = (("sc_threshold", "1000000000"),)
+
 CODECS = {
     "h264": Codec(
-        "libx264", "gray", (("preset", "medium"), ("tune", "fastdecode"), ("x264-params", "no-psy=1")),
+        "libx264", "gray", (("preset", "medium"), ("tune", "fastdecode"), ("x264-params", "no-psy=1:scenecut=0")),
         True, 1, 51, 18,
     ),
-    "mpeg4": Codec("mpeg4", "yuv420p", (), False, 1, 31, 2),
-    "mpeg2": Codec("mpeg2video", "yuv420p", (), False, 1, 31, 2, limited_range=True),
+    "mpeg4": Codec("mpeg4", "yuv420p", _NO_CUTS, False, 1, 31, 2),
+    "mpeg2": Codec("mpeg2video", "yuv420p", _NO_CUTS, False, 1, 31, 2, limited_range=True),
     "mjpeg": Codec("mjpeg", "yuvj420p", (), False, 1, 31, 3),
 }  # fmt: skip
 
@@ -85,6 +91,8 @@ class Encoding:
         codec: a key of :data:`CODECS`.
         quality: see :class:`Codec`; lower is better and larger.
         gop: distance of keyframes in frames; decoding a random range begins up to so many frames early.
+        tile_px: the picture is cut into columns of about so many pixels, each in a track of its own (see
+            :mod:`v2v_server.video.tiles`); 0 leaves it whole.
 
     Raises:
         UsageError: an unknown codec, or a number outside its limits.
@@ -93,6 +101,7 @@ class Encoding:
     codec: str
     quality: int
     gop: int
+    tile_px: int = 0
 
     def __post_init__(self) -> None:
         if self.codec not in CODECS:
@@ -103,9 +112,12 @@ class Encoding:
             raise UsageError(f"quality {self.quality}: {self.codec} takes a {name} of {kind.lowest} .. {kind.highest}")
         if not 1 <= self.gop <= _LONGEST_GOP:
             raise UsageError(f"gop {self.gop}: give 1 .. {_LONGEST_GOP} frames")
+        if self.tile_px and self.tile_px < NARROWEST_PX:
+            raise UsageError(f"tiles of {self.tile_px} px: give 0 (none), or {NARROWEST_PX} and more")
 
     def __str__(self) -> str:
-        return f"{self.codec} quality {self.quality} gop {self.gop}"
+        tiles = f" tiles {self.tile_px} px" if self.tile_px else ""
+        return f"{self.codec} quality {self.quality} gop {self.gop}{tiles}"
 
 
 def encode_luma(
@@ -139,39 +151,62 @@ def encode_luma(
     container_options = {"movie_timescale": str(time_base.denominator), "movflags": "write_colr"}
     try:
         with av.open(os.fspath(path), "w", format="mp4", options=container_options) as output:
-            stream = _add_stream(output, kind, encoding, height, width)
-            stream.time_base = time_base
-            due = iter(pts)
+            widths = split(width, encoding.tile_px)
+            if widths:
+                key, value = MARK
+                output.metadata[key] = value
+            tracks = [_Track(output, kind, encoding, height, size, pts, time_base) for size in widths or (width,)]
             for number, luma in enumerate(frames):
-                frame = _frame(luma, kind)
-                frame.pts, frame.time_base = number, Fraction(1, _NOMINAL_RATE)
-                _write(output, stream.encode(frame), due, time_base)
-            _write(output, stream.encode(None), due, time_base)
+                for track, column in zip(tracks, columns(luma, widths), strict=True):
+                    track.add(number, column)
+            for track in tracks:
+                track.close()
     except (av.FFmpegError, OSError) as error:
         raise VideoError(os.fspath(path), None, f"cannot be encoded as {encoding}: {reason(error)}") from error
 
 
-def _add_stream(output: OutputContainer, kind: Codec, encoding: Encoding, height: int, width: int) -> VideoStream:
-    options = dict(kind.options)
-    if kind.constant_rate_factor:
-        options["crf"] = str(encoding.quality)
-    stream = cast(VideoStream, output.add_stream(kind.encoder, rate=_NOMINAL_RATE, options=options))
-    if not kind.constant_rate_factor:
-        # A constant quantiser; the encoders ignore an option of that name.
-        stream.codec_context.qmin = stream.codec_context.qmax = encoding.quality
-    stream.width, stream.height, stream.pix_fmt = width, height, kind.pixel_format
-    stream.gop_size, stream.max_b_frames, stream.thread_count = encoding.gop, 0, 1
-    stream.color_range = ColorRange.MPEG if kind.limited_range else ColorRange.JPEG
-    return stream
+class _Track:
+    """One track of a file, and the pictures on their way into it."""
 
+    def __init__(
+        self,
+        output: OutputContainer,
+        kind: Codec,
+        encoding: Encoding,
+        height: int,
+        width: int,
+        pts: Sequence[int],
+        time_base: Fraction,
+    ) -> None:
+        options = dict(kind.options)
+        if kind.constant_rate_factor:
+            options["crf"] = str(encoding.quality)
+        stream = cast(VideoStream, output.add_stream(kind.encoder, rate=_NOMINAL_RATE, options=options))
+        if not kind.constant_rate_factor:
+            # A constant quantiser; the encoders ignore an option of that name.
+            stream.codec_context.qmin = stream.codec_context.qmax = encoding.quality
+        stream.width, stream.height, stream.pix_fmt = width, height, kind.pixel_format
+        stream.gop_size, stream.max_b_frames, stream.thread_count = encoding.gop, 0, 1
+        stream.color_range = ColorRange.MPEG if kind.limited_range else ColorRange.JPEG
+        stream.time_base = time_base
+        self._output, self._stream, self._kind = output, stream, kind
+        self._due, self._time_base = iter(pts), time_base
 
-def _write(
-    output: OutputContainer, packets: Iterable[Packet[VideoStream]], due: Iterator[int], time_base: Fraction
-) -> None:
-    for packet in packets:
-        packet.time_base = time_base
-        packet.pts = packet.dts = next(due)
-        output.mux(packet)
+    def add(self, number: int, luma: npt.NDArray[np.uint8]) -> None:
+        """Encode the next picture."""
+        frame = _frame(luma, self._kind)
+        frame.pts, frame.time_base = number, Fraction(1, _NOMINAL_RATE)
+        self._write(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what the encoder still holds."""
+        self._write(self._stream.encode(None))
+
+    def _write(self, packets: Iterable[Packet[VideoStream]]) -> None:
+        for packet in packets:
+            packet.time_base = self._time_base
+            packet.pts = packet.dts = next(self._due)
+            self._output.mux(packet)
 
 
 def _frame(luma: npt.NDArray[np.uint8], kind: Codec) -> VideoFrame:

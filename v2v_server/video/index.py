@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,10 @@ LARGEST_FRAMES = 2**24
 
 LARGEST_SIDE_PX = 2**16 - 1
 
+MOST_TILES = 64
+
 _MAGIC = b"VFI1"
+_MAGIC_TILED = b"VFI2"  # the widths of the tiles follow the header
 _HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, seekable
 _INT64 = np.dtype("<i8")
 
@@ -38,6 +41,8 @@ class FrameIndex:
         height_px, width_px: size of the upright picture (rotation metadata applied).
         seekable: False when the time stamps are missing, not unique or not to be trusted (H.264 with B-frames in
             AVI): decoding then counts frames from the beginning of the file.
+        tiles: widths in pixels of the tracks whose pictures, side by side, make up the picture (see
+            :mod:`v2v_server.video.tiles`); empty where one track holds it. All tracks have these frames.
     """
 
     first: int
@@ -48,6 +53,7 @@ class FrameIndex:
     height_px: int
     width_px: int
     seekable: bool
+    tiles: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.pts)
@@ -83,16 +89,17 @@ class FrameIndex:
         which = int(np.searchsorted(self.keyframes, start, side="right")) - 1
         first = int(self.keyframes[which]) if which >= 0 else self.first
         kept = (self.keyframes >= first) & (self.keyframes < start + count)
-        return FrameIndex(
+        return replace(
+            self,
             first=first,
             pts=self.pts[first - self.first : start + count - self.first],
             keyframes=self.keyframes[kept],
             keyframe_dts=self.keyframe_dts[kept],
-            time_base=self.time_base,
-            height_px=self.height_px,
-            width_px=self.width_px,
-            seekable=self.seekable,
         )
+
+    def of_tile(self, track: int) -> FrameIndex:
+        """The index of one tile alone."""
+        return replace(self, width_px=self.tiles[track], tiles=())
 
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Presentation times of frames start .. start + count - 1.
@@ -112,9 +119,11 @@ class FrameIndex:
     def to_bytes(self) -> bytes:
         """A compact encoding: a few bytes a frame at a varying rate, next to nothing at a constant one."""
         head = _HEADER.pack(
-            _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
+            _MAGIC_TILED if self.tiles else _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
             self.height_px, self.width_px, self.seekable,
         )  # fmt: skip
+        if self.tiles:
+            head += struct.pack(f"<B{len(self.tiles)}H", len(self.tiles), *self.tiles)
         if not self.seekable:
             return head
         parts = (_steps(_steps(self.pts)), _steps(self.keyframes), _steps(self.keyframe_dts))
@@ -130,16 +139,17 @@ class FrameIndex:
         if len(data) < _HEADER.size:
             raise ProtocolError(f"frame index of {len(data)} bytes: shorter than its header of {_HEADER.size}")
         magic, first, frames, keys, numerator, denominator, height, width, seekable = _HEADER.unpack_from(data)
-        if magic != _MAGIC:
-            raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r}")
+        if magic not in (_MAGIC, _MAGIC_TILED):
+            raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r} or {_MAGIC_TILED!r}")
         if not 1 <= frames <= most_frames or first + frames > LARGEST_FRAMES or keys > frames:
             raise ProtocolError(f"frame index: {frames} frames from {first}, {keys} keyframes; limit {most_frames}")
         if not (numerator and denominator and height and width) or seekable > 1:
             raise ProtocolError(
                 f"frame index: time base {numerator}/{denominator}, {width}x{height} px, seekable {seekable}"
             )
+        tiles, rest = _tiles(data[_HEADER.size :], width) if magic == _MAGIC_TILED else ((), data[_HEADER.size :])
         stored = (frames + 2 * keys) * _INT64.itemsize if seekable else 0
-        values = np.frombuffer(_inflated(data[_HEADER.size :], stored), _INT64).astype(np.int64)
+        values = np.frombuffer(_inflated(rest, stored), _INT64).astype(np.int64)
         if seekable:
             pts, keyframes, dts = np.split(values, [frames, frames + keys])
             pts, keyframes, dts = np.cumsum(np.cumsum(pts)), np.cumsum(keyframes), np.cumsum(dts)
@@ -153,7 +163,7 @@ class FrameIndex:
             raise ProtocolError(
                 f"frame index: keyframes outside frames {first} .. {first + frames - 1}, or in disorder"
             )
-        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, bool(seekable))
+        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, bool(seekable), tiles)
 
 
 def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px: int) -> FrameIndex:
@@ -161,6 +171,18 @@ def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
     return FrameIndex(0, pts, none, none, time_base, height_px, width_px, seekable=False)
+
+
+def _tiles(data: bytes, width_px: int) -> tuple[tuple[int, ...], bytes]:
+    """The widths behind the header, and what follows them."""
+    count = data[0] if data else 0
+    end = 1 + 2 * count
+    if not 2 <= count <= MOST_TILES or len(data) < end:
+        raise ProtocolError(f"frame index: {count} tiles in {len(data)} bytes; 2 .. {MOST_TILES} can be")
+    widths = struct.unpack_from(f"<{count}H", data, 1)
+    if sum(widths) != width_px or not all(widths):
+        raise ProtocolError(f"frame index: tiles of {widths} px do not make up a picture of {width_px} px")
+    return widths, data[end:]
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

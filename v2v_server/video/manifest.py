@@ -34,7 +34,7 @@ class Header:
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        codec, quality, gop: see :class:`v2v_server.video.encode.Encoding`.
+        codec, quality, gop, tile_px: see :class:`v2v_server.video.encode.Encoding`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each.
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
@@ -49,14 +49,20 @@ class Header:
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
+    tile_px: int = 0
+
+    @property
+    def encoding(self) -> Encoding:
+        """How its files are encoded."""
+        return Encoding(self.codec, self.quality, self.gop, self.tile_px)
 
     def same_settings(self, other: Header) -> bool:
         """Whether videos of both may lie in one folder."""
-        return (self.rows, self.codec, self.quality, self.gop) == (other.rows, other.codec, other.quality, other.gop)
+        return (self.rows, self.encoding) == (other.rows, other.encoding)
 
     def settings(self) -> str:
-        """rows, codec, quality and gop as text."""
-        return f"rows {self.rows}, {self.codec} quality {self.quality} gop {self.gop}"
+        """rows, codec, quality, gop and tiles as text."""
+        return f"rows {self.rows}, {self.encoding}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,8 +258,9 @@ class ManifestWriter:
 
 def _line(item: Header | PreparedVideo) -> bytes:
     values = asdict(item)
-    if isinstance(item, PreparedVideo) and not item.scene:
-        del values["scene"]  # earlier versions of this program know no such field
+    for newer in ("scene", "tile_px"):  # earlier versions of this program know no such field
+        if not values.get(newer, True):
+            del values[newer]
     return json.dumps(values, allow_nan=False).encode() + b"\n"
 
 
@@ -262,7 +269,7 @@ def _header(line: bytes) -> Header:
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
     header = Header(**data)
-    Encoding(header.codec, header.quality, header.gop)
+    header.encoding  # noqa: B018 - refuses what cannot be
     Rows.parse(header.rows)
     if not _whole(header.videos, 1, math.inf):
         raise ValueError(f"{header.videos!r} videos")

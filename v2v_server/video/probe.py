@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import av
@@ -20,6 +20,7 @@ from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.source import opened, packets, pictures, reason, time_base
+from v2v_server.video.tiles import widths_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     name = os.fspath(path)
     try:
         with opened(name) as (container, stream):
+            tiles = widths_of(name, container)
             head, shown = _walk(name, container, stream)
             base = time_base(stream)
             # Read before the container is closed: the stream's fields are gone after that.
@@ -70,9 +72,15 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     except av.FFmpegError as error:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
     height, width = Orientation.of(head).size(head.height, head.width)
+    if tiles:
+        width = sum(tiles)
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
         raise VideoError(name, None, f"its picture of {width}x{height} px is larger than {LARGEST_SIDE_PX} px a side")
     index = None if reorders else _index(shown, head, base, (height, width))
+    if tiles:
+        if index is None or Orientation.of(head) != Orientation():
+            raise VideoError(name, None, "calls its tracks tiles, but they are turned or cannot be sought")
+        index = replace(index, tiles=tiles)
     if index is None:
         index = unseekable(_count_by_decoding(name), base, height, width)
     if not 1 <= len(index) <= LARGEST_FRAMES:

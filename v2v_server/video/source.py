@@ -21,17 +21,20 @@ _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], loop_filter: str = "exact") -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened(
+    path: str | os.PathLike[str], loop_filter: str = "exact", track: int = 0
+) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
-    The track is the first whose pictures are no cover art; its decoder runs in the calling thread only.
+    Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only.
 
     Args:
         path: the file.
         loop_filter: one of ``v2v_protocol.spec.LOOP_FILTERS``.
+        track: which of the video tracks: a tile, see :mod:`v2v_server.video.tiles`.
 
     Raises:
-        VideoError: the file cannot be opened, or has no video track.
+        VideoError: the file cannot be opened, or has no such video track.
     """
     name = os.fspath(path)
     try:
@@ -41,12 +44,15 @@ def opened(path: str | os.PathLike[str], loop_filter: str = "exact") -> Iterator
     except UnicodeError as error:
         raise VideoError(name, None, f"cannot be opened: its name is not valid text ({error})") from error
     try:
-        tracks = [stream for stream in container.streams.video if not stream.disposition & _STILL]
-        if not tracks:
-            raise VideoError(name, None, "has no video track")
-        stream = tracks[0]
+        tracks = picture_tracks(container)
+        if track >= len(tracks):
+            raise VideoError(name, None, f"has no video track {track}" if track else "has no video track")
+        stream = tracks[track]
         if stream.codec_context is None:
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
+        for other in tracks:
+            if other is not stream and hasattr(other, "discard"):  # PyAV 17 and later
+                other.discard = type(other.discard).all  # the demuxer need not read it
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
         if loop_filter != "exact":
@@ -54,6 +60,11 @@ def opened(path: str | os.PathLike[str], loop_filter: str = "exact") -> Iterator
         yield container, stream
     finally:
         container.close()
+
+
+def picture_tracks(container: InputContainer) -> list[VideoStream]:
+    """The video tracks that are no cover art."""
+    return [stream for stream in container.streams.video if not stream.disposition & _STILL]
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:

@@ -27,6 +27,7 @@ from v2v_server.video.orientation import Orientation, Window
 from v2v_server.video.probe import probe
 from v2v_server.video.scene import MOST_FRAMES, Scene
 from v2v_server.video.source import opened, pictures, reason
+from v2v_server.video.tiles import parts
 
 PARTIAL_SUFFIX = ".v2v-partial"
 HIGHEST_PSNR_DB = 100.0
@@ -136,9 +137,21 @@ def luma_frames(path: str | os.PathLike[str], index: FrameIndex, window: Window)
     Raises:
         VideoError: a frame is missing or damaged, or the picture's size or format is not the same all along.
     """
+    if not index.tiles:
+        yield from _track_frames(path, index, window)
+        return
+    needed = parts(window, index.tiles)
+    tiles = [_track_frames(path, index.of_tile(part.track), part.window, part.track) for part in needed]
+    for columns in zip(*tiles, strict=True):
+        yield np.concatenate(columns, axis=1)
+
+
+def _track_frames(
+    path: str | os.PathLike[str], index: FrameIndex, window: Window, track: int = 0
+) -> Iterator[npt.NDArray[np.uint8]]:
     name = os.fspath(path)
     done = 0
-    with opened(path) as (container, stream):
+    with opened(path, track=track) as (container, stream):
         try:
             for frame in pictures(container, stream):
                 if index.seekable and frame.pts is not None and frame.pts < index.pts[0]:
