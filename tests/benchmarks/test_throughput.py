@@ -48,10 +48,17 @@ def test_ratios_are_medians_of_the_ratios_within_a_turn() -> None:
     baseline, _, exact = throughput.compare(contenders, Setting(2, 12, 10.0, 0), 3)
     assert baseline["ratio_to_baseline"] == 1.0
     assert (exact["ratio_to_baseline"], exact["batches_per_second"]) == (4.0, 3.0)
+    assert (exact["ratio_to_baseline_lowest"], exact["ratio_to_baseline_highest"]) == (3.0, 4.0)
     assert exact["ratio_to_decode_limit"] == pytest.approx(0.8)
     assert exact["cpu_ratio_to_baseline"] == pytest.approx(4.0)
     said = throughput.missed([baseline, exact])
     assert said == ["exact, source: ratio_to_decode_limit 0.80, at least 0.9 was asked"]
+
+
+def test_a_form_of_a_codec_has_the_bar_of_the_codec() -> None:
+    record = {"label": "exact, mpeg4-tiles", "ratio_to_baseline": 13.0, "cpu_ratio_to_baseline": 15.0}
+    said = throughput.missed([record | {"ratio_to_decode_limit": 0.7}])
+    assert said == ["exact, mpeg4-tiles: ratio_to_baseline 13.00, at least 14 was asked"]
 
 
 def test_a_prepared_corpus_needs_a_name_and_a_preset_must_exist(capsys: pytest.CaptureFixture[str]) -> None:

@@ -169,20 +169,28 @@ def _decode_tiles(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np
     codec = ""
     for track, wanted in needed.items():
         tile = replace(task, index=task.index.of_tile(track), track=track)
-        taken, codec = _decode_track(tile, [Cut(cuts[number].count, part.window) for number, part in wanted])
-        for (number, part), frames in zip(wanted, taken, strict=True):
-            whole[number][:, :, part.left : part.left + frames.shape[2]] = frames
+        into = [whole[number][:, :, part.left : part.left + part.window[3]] for number, part in wanted]
+        taken, codec = _decode_track(tile, [Cut(cuts[number].count, part.window) for number, part in wanted], into)
+        for place, frames in zip(into, taken, strict=True):
+            if frames is not place:
+                place[...] = frames
     return whole, codec
 
 
-def _decode_track(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """The cuts of the pictures of one track, [count, h, w] uint8 each, and the codec's name."""
-    stack = _Stack(task, cuts)
+def _decode_track(
+    task: _Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]] = ()
+) -> tuple[list[npt.NDArray[np.uint8]], str]:
+    """The cuts of the pictures of one track, [count, h, w] uint8 each, and the codec's name.
+
+    Args:
+        into: arrays for the cuts, which are used where the stored picture stands upright.
+    """
+    stack = _Stack(task, cuts, into)
     try:
         done = _decode_quickly(stack)
     except (_SeekFailed, VideoError):
         done = False
-        stack = _Stack(task, cuts)
+        stack = _Stack(task, cuts, into)
     if not done:
         _decode_plainly(stack)
     return list(stack.grey()), stack.codec
@@ -307,12 +315,13 @@ def _packets_from(container: InputContainer, stream: VideoStream, pts: int, dts:
 class _Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, task: _Task, cuts: Sequence[Cut]) -> None:
+    def __init__(self, task: _Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]]) -> None:
         self.task = task
         self.index = index = task.index
         self.codec = ""
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
+        self._into = into
         self._stride = stride = task.stride
         first, most = task.start - index.first, max(cut.count for cut in cuts)
         self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
@@ -369,7 +378,7 @@ class _Stack:
         if not self._parts:
             self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
-            self._parts = [self._part(cut) for cut in self._cuts]
+            self._parts = [self._part(number, cut) for number, cut in enumerate(self._cuts)]
         if (frame.height, frame.width) != self._size:
             height, width = self._orientation.size(frame.height, frame.width)
             self.refuse(
@@ -381,9 +390,11 @@ class _Stack:
             if self._taken < len(raw):
                 copy_luma(frame, self._luma, stored, raw[self._taken])
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _part(self, number: int, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
         window = _window(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
+        if self._into and self._orientation == Orientation():
+            return stored, self._into[number]
         return stored, np.empty((cut.count, *stored[2:]), np.uint8)
 
     def close(self, codec: str) -> None:
@@ -404,6 +415,6 @@ class _Stack:
         """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
         for _, raw in self._parts:
             if self._luma.bits == 8 and not self._luma.full_range:
-                rows = raw.reshape(-1, raw.shape[-1])
-                cv2.LUT(rows, range_table(8, False), dst=rows)
-            yield self._orientation.upright(raw)
+                for rows in (raw.reshape(-1, raw.shape[-1]),) if raw.flags.c_contiguous else raw:
+                    cv2.LUT(rows, range_table(8, False), dst=rows)
+            yield self._orientation.upright(raw) if raw.flags.c_contiguous else raw
