@@ -50,7 +50,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument(
         "--tile-width", type=int, default=0, metavar="PX", dest="tile_px",
-        help="cut pictures into columns of about PX pixels; a crop decodes those that it touches (default 0: no cut)",
+        help="store pictures as tiles about PX wide; a crop decodes those that it touches (default 0: no tiles)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tile-overlap", type=int, default=0, metavar="PX", dest="tile_overlap_px",
+        help="let each tile share PX columns with the next, so that a crop no wider touches one (default 0)",
     )  # fmt: skip
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default: one a core)"
@@ -83,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _run(arguments: argparse.Namespace) -> bool:
     quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
-    encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px)
+    encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px, arguments.tile_overlap_px)
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()

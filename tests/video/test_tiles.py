@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from contextlib import closing
 from fractions import Fraction
@@ -23,16 +24,16 @@ from v2v_server.video import decode
 from v2v_server.video.catalogue import open_catalogue
 from v2v_server.video.decode import Cut, decode_cuts, decode_luma
 from v2v_server.video.encode import CODECS, Encoding, encode_luma
-from v2v_server.video.index import FrameIndex
-from v2v_server.video.luma import range_table
+from v2v_server.video.index import MOST_TILES, FrameIndex, Tile, make_up
 from v2v_server.video.manifest import read_manifest
 from v2v_server.video.probe import probe
 from v2v_server.video.rows import Rows
-from v2v_server.video.tiles import MARK, columns, parts, split
+from v2v_server.video.tiles import KEY, MARK, NARROWEST_PX, columns, parts, split
 from v2v_server.video.transcode import luma_frames
 
 FRAMES, HEIGHT, WIDTH = 30, 48, 300
 TILED = Encoding("h264", 18, 12, tile_px=96)
+OVERLAPPING = Encoding("h264", 18, 12, tile_px=140, tile_overlap_px=64)
 
 
 def write(
@@ -52,8 +53,6 @@ def by_track(path: Path) -> npt.NDArray[np.uint8]:
         with av.open(str(path)) as container:
             frames = [frame.reformat(format="gray") for frame in container.decode(video=track)]
             tiles.append(np.stack([frame.to_ndarray() for frame in frames]))
-            if frames[0].color_range == 1:
-                tiles[-1] = range_table(8, False)[tiles[-1]]
     return np.concatenate(tiles, axis=2)
 
 
@@ -63,42 +62,66 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    luma = panned_luma(FRAMES, HEIGHT, WIDTH, step=(1, 3))
+    return write(tmp_path_factory.mktemp("overlapping") / "clip.mp4", luma, OVERLAPPING)
+
+
+@pytest.fixture(scope="module")
 def oracle(clip: Path) -> npt.NDArray[np.uint8]:
     return by_track(clip)
 
 
-@given(st.integers(1, 4000), st.integers(64, 1000))
-def test_tiles_make_up_the_picture(width: int, tile: int) -> None:
-    widths = split(width, tile)
+@st.composite
+def cuttings(draw: st.DrawFn) -> tuple[int, int, int]:
+    """(width, tile, overlap) of a picture that is worth cutting."""
+    overlap = draw(st.integers(0, 300))
+    tile = overlap + draw(st.integers(NARROWEST_PX, 400))
+    return draw(st.integers(2 * tile - overlap, 4000)), tile, overlap
+
+
+@given(cuttings())
+def test_tiles_make_up_the_picture(cutting: tuple[int, int, int]) -> None:
+    width, tile, overlap = cutting
+    tiles = split(width, tile, overlap)
+    assert make_up(tiles, width)
+    assert all(each.left_px % 16 == 0 for each in tiles)
+    assert all(a.right_px - b.left_px == overlap for a, b in itertools.pairwise(tiles))
+    even = (width + (len(tiles) - 1) * overlap) / len(tiles)
+    assert all(abs(each.width_px - even) <= 16 for each in tiles)
+    assert len(tiles) == MOST_TILES or abs(even - tile) <= tile / 2
+
+
+@given(st.integers(1, 2000), st.integers(NARROWEST_PX, 1000))
+def test_what_is_not_worth_cutting_stays_whole(width: int, tile: int) -> None:
     assert split(width, 0) == ()
-    if not widths:
-        assert width < 1.5 * tile + 1
-        return
-    assert sum(widths) == width
-    assert all(size % 16 == 0 for size in widths[:-1])
-    assert all(abs(size - width / len(widths)) <= 16 for size in widths)
+    assert (split(width, tile) == ()) == (round(width / tile) < 2)
 
 
-@given(st.lists(st.integers(1, 50), min_size=2, max_size=8), st.data())
-def test_parts_make_up_the_window(widths: list[int], data: st.DataObject) -> None:
-    left = data.draw(st.integers(0, sum(widths) - 1))
-    width = data.draw(st.integers(1, sum(widths) - left))
-    picture = np.arange(7 * sum(widths)).reshape(7, -1).astype(np.uint8)
-    tiles = columns(picture, widths)
-    found = parts((2, left, 3, width), widths)
+@given(cuttings(), st.data())
+def test_parts_make_up_the_window(cutting: tuple[int, int, int], data: st.DataObject) -> None:
+    whole_width, _, overlap = cutting
+    tiles = split(*cutting)
+    left = data.draw(st.integers(0, whole_width - 1))
+    width = data.draw(st.integers(1, whole_width - left))
+    picture = np.arange(7 * whole_width).reshape(7, -1).astype(np.uint8)
+    stored = columns(picture, tiles)
+    found = parts((2, left, 3, width), tiles)
     pieces = []
     for part in found:
         top, first, height, size = part.window
         assert part.left == sum(piece.shape[1] for piece in pieces)
-        pieces.append(tiles[part.track][top : top + height, first : first + size])
+        pieces.append(stored[part.track][top : top + height, first : first + size])
         assert pieces[-1].shape == (height, size)  # nothing reaches out of its tile
     np.testing.assert_array_equal(np.concatenate(pieces, axis=1), picture[2:5, left : left + width])
     assert all(part.window[3] for part in found)  # none is touched for nothing
+    if width <= overlap:
+        assert len(found) == 1
 
 
 def test_the_picture_is_whole(clip: Path, oracle: npt.NDArray[np.uint8]) -> None:
     facts = probe(clip)
-    assert facts.index.tiles == (96, 96, 108)
+    assert facts.index.tiles == ((0, 96), (96, 96), (192, 108))
     assert (facts.frames, facts.height_px, facts.width_px) == (FRAMES, HEIGHT, WIDTH)
     assert FrameIndex.from_bytes(facts.index.to_bytes()).tiles == facts.index.tiles
     assert facts.index.slice(13, 4).tiles == facts.index.tiles
@@ -114,9 +137,8 @@ def test_every_codec(codec: str, tmp_path: Path) -> None:
     index = probe(path).index
     assert len(index.tiles) == 4
     assert index.keyframes.tolist() == (list(range(14)) if codec == "mjpeg" else [0, 5, 10])
-    np.testing.assert_array_equal(
-        decode_luma(path, index, 6, 7, (3, 50, 40, 150)).frames, whole(path)[6:13, 3:43, 50:200]
-    )
+    part = decode_luma(path, index, 6, 7, (3, 50, 40, 150)).frames
+    np.testing.assert_array_equal(part, whole(path)[6:13, 3:43, 50:200])
     assert psnr_db(whole(path), luma) > 38
 
 
@@ -140,7 +162,21 @@ def test_any_window_is_that_of_the_whole(clip: Path, oracle: npt.NDArray[np.uint
         assert got.bit_exact
 
 
-def test_only_the_tiles_that_are_touched_are_opened(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overlapping_tiles(overlapping: Path) -> None:
+    index = probe(overlapping).index
+    assert index.tiles == ((0, 144), (80, 144), (160, 140))
+    luma = panned_luma(FRAMES, HEIGHT, WIDTH, step=(1, 3))
+    assert psnr_db(whole(overlapping), luma) > 40
+    for left in range(0, WIDTH - 64, 19):
+        part = decode_luma(overlapping, index, 12, 6, (0, left, HEIGHT, 64)).frames
+        assert psnr_db(part, luma[12:18, :, left : left + 64]) > 36
+    frames = np.stack(list(luma_frames(overlapping, index, (5, 70, 20, 200))))
+    np.testing.assert_array_equal(frames, whole(overlapping)[:, 5:25, 70:270])
+
+
+def test_only_the_tiles_that_are_touched_are_opened(
+    clip: Path, overlapping: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read, opened_before = [], decode.opened
 
     def counting(path: str, loop_filter: str, track: int):  # type: ignore[no-untyped-def]
@@ -148,10 +184,19 @@ def test_only_the_tiles_that_are_touched_are_opened(clip: Path, monkeypatch: pyt
         return opened_before(path, loop_filter, track)
 
     monkeypatch.setattr(decode, "opened", counting)
-    index = probe(clip).index
-    for window, tracks in (((0, 10, 8, 80), [0]), ((0, 192, 8, 108), [2]), ((0, 90, 8, 30), [0, 1])):
+    for path, left, width, tracks in (
+        (clip, 10, 80, [0]),
+        (clip, 192, 108, [2]),
+        (clip, 90, 30, [0, 1]),
+        (clip, 0, 300, [0, 1, 2]),
+        (overlapping, 79, 64, [0]),
+        (overlapping, 81, 64, [1]),
+        (overlapping, 90, 140, [1, 2]),
+        (overlapping, 200, 64, [2]),
+    ):
+        index = probe(path).index
         read.clear()
-        decode_luma(clip, index, 12, 5, window)
+        decode_luma(path, index, 12, 5, (0, left, 8, width))
         assert read == tracks
 
 
@@ -169,26 +214,26 @@ def test_a_damaged_tile_spoils_what_touches_it(clip: Path, oracle: npt.NDArray[n
     content[place[0] + 8 : place[0] + place[1]] = np.random.default_rng(1).bytes(place[1] - 8)
     spoilt.write_bytes(content)
     index = probe(spoilt).index
-    np.testing.assert_array_equal(
-        decode_luma(spoilt, index, 10, 12, (0, 0, 48, 96)).frames, oracle[10:22, :, :96]
-    )
+    np.testing.assert_array_equal(decode_luma(spoilt, index, 10, 12, (0, 0, 48, 96)).frames, oracle[10:22, :, :96])
     with pytest.raises(VideoError) as caught:
         decode_luma(spoilt, index, 10, 12, (0, 90, 48, 20))
     assert caught.value.frame == 15
 
 
-@pytest.mark.parametrize("heights", [(48,), (48, 40), (48,) * 65])
-def test_tracks_that_do_not_fit_together_are_refused(heights: tuple[int, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("heights", "more"), [((48,), ""), ((48, 40), ""), ((48,) * 65, ""), ((48, 48), " 128"), ((48, 48), "0")]
+)
+def test_tracks_that_do_not_fit_together_are_refused(heights: tuple[int, ...], more: str, tmp_path: Path) -> None:
     path = tmp_path / "liar.mp4"
     with av.open(str(path), "w") as output:
-        output.metadata[MARK[0]] = MARK[1]
+        output.metadata[KEY] = f"{MARK} {' '.join(str(64 * number) for number in range(len(heights)))}{more}"
         tracks = [output.add_stream("mpeg4", rate=25) for _ in heights]
         for track, height in zip(tracks, heights, strict=True):
             track.width, track.height, track.pix_fmt = 64, height, "yuv420p"
         for track, height in zip(tracks, heights, strict=True):
             frame = av.VideoFrame.from_ndarray(np.zeros((height, 64), np.uint8), format="gray")
             output.mux(track.encode(frame.reformat(format="yuv420p")) + track.encode(None))
-    with pytest.raises(VideoError, match="calls its tracks tiles of one picture, but they are mpeg4 of 64x48 px"):
+    with pytest.raises(VideoError, match=r"columns of one picture, from \[0.* on, but they are mpeg4 of 64x48 px"):
         probe(path)
 
 
@@ -202,7 +247,7 @@ def _with_more_tiles(index: FrameIndex) -> bytes:
     """What a message may claim."""
     return FrameIndex(
         index.first, index.pts, index.keyframes, index.keyframe_dts, index.time_base, HEIGHT, WIDTH + 100,
-        seekable=True, tiles=(*index.tiles, 100),
+        seekable=True, tiles=(*index.tiles, Tile(WIDTH, 100)),
     ).to_bytes()  # fmt: skip
 
 
@@ -210,6 +255,12 @@ def _with_more_tiles(index: FrameIndex) -> bytes:
 def test_widths_that_cannot_be(tile: int) -> None:
     with pytest.raises(UsageError, match="or 64 and more"):
         Encoding("h264", 18, 12, tile_px=tile)
+
+
+@pytest.mark.parametrize(("tile", "overlap"), [(0, 1), (200, -1), (200, 137)])
+def test_overlaps_that_cannot_be(tile: int, overlap: int) -> None:
+    with pytest.raises(UsageError, match="leave each at least 64 of its own"):
+        Encoding("h264", 18, 12, tile, overlap)
 
 
 def test_a_prepared_corpus(tmp_path: Path) -> None:
@@ -222,7 +273,7 @@ def test_a_prepared_corpus(tmp_path: Path) -> None:
     report = run(source, target, TILED, rows=ROWS)
     assert report.complete
     assert read_manifest(target).header.tile_px == 96
-    assert probe(target / "1.mp4").index.tiles == (96, 104)
+    assert probe(target / "1.mp4").index.tiles == ((0, 96), (96, 104))
     assert probe(target / "narrow.mp4").index.tiles == ()
     with pytest.raises(CorpusError, match=r"tiles 96 px, and now .* quality 18 gop 12 is asked for"):
         run(source, target, Encoding("h264", 18, 12), rows=ROWS)

@@ -35,7 +35,7 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.source import reason
-from v2v_server.video.tiles import MARK, NARROWEST_PX, columns, split
+from v2v_server.video.tiles import KEY, NARROWEST_PX, columns, note, split
 
 _NOMINAL_RATE = 25
 _MIDDLE_GREY = 128
@@ -93,6 +93,7 @@ class Encoding:
         gop: distance of keyframes in frames; decoding a random range begins up to so many frames early.
         tile_px: the picture is cut into columns of about so many pixels, each in a track of its own (see
             :mod:`v2v_server.video.tiles`); 0 leaves it whole.
+        tile_overlap_px: of which each shares so many with the next.
 
     Raises:
         UsageError: an unknown codec, or a number outside its limits.
@@ -102,6 +103,7 @@ class Encoding:
     quality: int
     gop: int
     tile_px: int = 0
+    tile_overlap_px: int = 0
 
     def __post_init__(self) -> None:
         if self.codec not in CODECS:
@@ -114,9 +116,16 @@ class Encoding:
             raise UsageError(f"gop {self.gop}: give 1 .. {_LONGEST_GOP} frames")
         if self.tile_px and self.tile_px < NARROWEST_PX:
             raise UsageError(f"tiles of {self.tile_px} px: give 0 (none), or {NARROWEST_PX} and more")
+        if not 0 <= self.tile_overlap_px <= max(0, self.tile_px - NARROWEST_PX):
+            raise UsageError(
+                f"tiles of {self.tile_px} px that share {self.tile_overlap_px} with the next: leave each at least "
+                f"{NARROWEST_PX} of its own"
+            )
 
     def __str__(self) -> str:
         tiles = f" tiles {self.tile_px} px" if self.tile_px else ""
+        if self.tile_overlap_px:
+            tiles += f" overlap {self.tile_overlap_px} px"
         return f"{self.codec} quality {self.quality} gop {self.gop}{tiles}"
 
 
@@ -151,13 +160,13 @@ def encode_luma(
     container_options = {"movie_timescale": str(time_base.denominator), "movflags": "write_colr"}
     try:
         with av.open(os.fspath(path), "w", format="mp4", options=container_options) as output:
-            widths = split(width, encoding.tile_px)
-            if widths:
-                key, value = MARK
-                output.metadata[key] = value
-            tracks = [_Track(output, kind, encoding, height, size, pts, time_base) for size in widths or (width,)]
+            tiles = split(width, encoding.tile_px, encoding.tile_overlap_px)
+            if tiles:
+                output.metadata[KEY] = note(tiles)
+            widths = [tile.width_px for tile in tiles] or [width]
+            tracks = [_Track(output, kind, encoding, height, size, pts, time_base) for size in widths]
             for number, luma in enumerate(frames):
-                for track, column in zip(tracks, columns(luma, widths), strict=True):
+                for track, column in zip(tracks, columns(luma, tiles), strict=True):
                     track.add(number, column)
             for track in tracks:
                 track.close()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +25,28 @@ LARGEST_SIDE_PX = 2**16 - 1
 MOST_TILES = 64
 
 _MAGIC = b"VFI1"
-_MAGIC_TILED = b"VFI2"  # the widths of the tiles follow the header
+_MAGIC_TILED = b"VFI2"  # the tiles follow the header
 _HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, seekable
 _INT64 = np.dtype("<i8")
+
+
+class Tile(NamedTuple):
+    """The columns of a picture that one track holds: from ``left_px`` on, ``width_px`` of them."""
+
+    left_px: int
+    width_px: int
+
+    @property
+    def right_px(self) -> int:
+        """The column behind the last."""
+        return self.left_px + self.width_px
+
+
+def make_up(tiles: Sequence[Tile], width_px: int) -> bool:
+    """Whether tiles, from left to right, hold every column of a picture; they may overlap."""
+    if not tiles or tiles[0].left_px or tiles[-1].right_px != width_px or not all(tile.width_px > 0 for tile in tiles):
+        return False
+    return all(a.left_px < b.left_px <= a.right_px < b.right_px for a, b in itertools.pairwise(tiles))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,8 +63,8 @@ class FrameIndex:
         height_px, width_px: size of the upright picture (rotation metadata applied).
         seekable: False when the time stamps are missing, not unique or not to be trusted (H.264 with B-frames in
             AVI): decoding then counts frames from the beginning of the file.
-        tiles: widths in pixels of the tracks whose pictures, side by side, make up the picture (see
-            :mod:`v2v_server.video.tiles`); empty where one track holds it. All tracks have these frames.
+        tiles: which columns each track holds, from left to right (see :mod:`v2v_server.video.tiles`); empty where
+            one track holds the picture. All tracks have these frames.
     """
 
     first: int
@@ -53,7 +75,7 @@ class FrameIndex:
     height_px: int
     width_px: int
     seekable: bool
-    tiles: tuple[int, ...] = ()
+    tiles: tuple[Tile, ...] = ()
 
     def __len__(self) -> int:
         return len(self.pts)
@@ -99,7 +121,7 @@ class FrameIndex:
 
     def of_tile(self, track: int) -> FrameIndex:
         """The index of one tile alone."""
-        return replace(self, width_px=self.tiles[track], tiles=())
+        return replace(self, width_px=self.tiles[track].width_px, tiles=())
 
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Presentation times of frames start .. start + count - 1.
@@ -123,7 +145,7 @@ class FrameIndex:
             self.height_px, self.width_px, self.seekable,
         )  # fmt: skip
         if self.tiles:
-            head += struct.pack(f"<B{len(self.tiles)}H", len(self.tiles), *self.tiles)
+            head += struct.pack(f"<B{2 * len(self.tiles)}H", len(self.tiles), *itertools.chain(*self.tiles))
         if not self.seekable:
             return head
         parts = (_steps(_steps(self.pts)), _steps(self.keyframes), _steps(self.keyframe_dts))
@@ -173,16 +195,17 @@ def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px
     return FrameIndex(0, pts, none, none, time_base, height_px, width_px, seekable=False)
 
 
-def _tiles(data: bytes, width_px: int) -> tuple[tuple[int, ...], bytes]:
-    """The widths behind the header, and what follows them."""
+def _tiles(data: bytes, width_px: int) -> tuple[tuple[Tile, ...], bytes]:
+    """The tiles behind the header, and what follows them."""
     count = data[0] if data else 0
-    end = 1 + 2 * count
+    end = 1 + 4 * count
     if not 2 <= count <= MOST_TILES or len(data) < end:
         raise ProtocolError(f"frame index: {count} tiles in {len(data)} bytes; 2 .. {MOST_TILES} can be")
-    widths = struct.unpack_from(f"<{count}H", data, 1)
-    if sum(widths) != width_px or not all(widths):
-        raise ProtocolError(f"frame index: tiles of {widths} px do not make up a picture of {width_px} px")
-    return widths, data[end:]
+    tiles = tuple(Tile(*pair) for pair in struct.iter_unpack("<2H", data[1:end]))
+    if not make_up(tiles, width_px):
+        shown = ", ".join(f"{tile.left_px} .. {tile.right_px}" for tile in tiles)
+        raise ProtocolError(f"frame index: columns {shown} do not make up a picture of {width_px} px")
+    return tiles, data[end:]
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -34,7 +34,7 @@ class Header:
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        codec, quality, gop, tile_px: see :class:`v2v_server.video.encode.Encoding`.
+        codec, quality, gop, tile_px, tile_overlap_px: see :class:`v2v_server.video.encode.Encoding`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each.
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
@@ -50,11 +50,12 @@ class Header:
     source_digest: str
     version: int = MANIFEST_VERSION
     tile_px: int = 0
+    tile_overlap_px: int = 0
 
     @property
     def encoding(self) -> Encoding:
         """How its files are encoded."""
-        return Encoding(self.codec, self.quality, self.gop, self.tile_px)
+        return Encoding(self.codec, self.quality, self.gop, self.tile_px, self.tile_overlap_px)
 
     def same_settings(self, other: Header) -> bool:
         """Whether videos of both may lie in one folder."""
@@ -258,7 +259,7 @@ class ManifestWriter:
 
 def _line(item: Header | PreparedVideo) -> bytes:
     values = asdict(item)
-    for newer in ("scene", "tile_px"):  # earlier versions of this program know no such field
+    for newer in ("scene", "tile_px", "tile_overlap_px"):  # earlier versions of this program know no such field
         if not values.get(newer, True):
             del values[newer]
     return json.dumps(values, allow_nan=False).encode() + b"\n"

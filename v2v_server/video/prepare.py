@@ -122,7 +122,7 @@ def prepare(
     _refuse_overlap(catalogue, target)
     header = Header(
         str(catalogue.rows), encoding.codec, encoding.quality, encoding.gop, len(catalogue.videos),
-        catalogue.root.name, catalogue.digest, tile_px=encoding.tile_px,
+        catalogue.root.name, catalogue.digest, tile_px=encoding.tile_px, tile_overlap_px=encoding.tile_overlap_px,
     )  # fmt: skip
     try:
         target.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.source import opened, packets, pictures, reason, time_base
-from v2v_server.video.tiles import widths_of
+from v2v_server.video.tiles import tiles_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     name = os.fspath(path)
     try:
         with opened(name) as (container, stream):
-            tiles = widths_of(name, container)
+            tiles = tiles_of(name, container)
             head, shown = _walk(name, container, stream)
             base = time_base(stream)
             # Read before the container is closed: the stream's fields are gone after that.
@@ -73,7 +73,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
     height, width = Orientation.of(head).size(head.height, head.width)
     if tiles:
-        width = sum(tiles)
+        width = tiles[-1].right_px
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
         raise VideoError(name, None, f"its picture of {width}x{height} px is larger than {LARGEST_SIDE_PX} px a side")
     index = None if reorders else _index(shown, head, base, (height, width))

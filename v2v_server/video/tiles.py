@@ -1,14 +1,14 @@
-"""Pictures stored as tiles: columns of a prepared picture, side by side, each in a track of its own.
+"""Pictures stored as tiles: some columns of a prepared picture, in a track of their own.
 
-A crop of 128 columns out of 596 then costs the decoder the tiles that it touches instead of the whole picture, and a
-tile refers to nothing outside itself. A file says that its tracks are tiles in its metadata; its index says how wide
-they are.
+A crop of 128 columns out of 596 then costs the decoder the tiles that it touches instead of the whole picture: one,
+where tiles overlap by as much. A tile refers to nothing outside itself. A file says in its metadata that its tracks are
+tiles.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ import numpy.typing as npt
 from av.container import InputContainer
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.index import MOST_TILES
+from v2v_server.video.index import MOST_TILES, Tile, make_up
 from v2v_server.video.orientation import Window
 from v2v_server.video.source import picture_tracks
 
-MARK = ("comment", "v2v-prepare: the tracks are columns of one picture, from left to right")
-"""Key and value in the metadata of the file."""
+KEY, MARK = "comment", "v2v-prepare: each track holds columns of one picture, from"
+"""Key in the metadata of the file, and how its value begins; the first columns of the tracks follow."""
 
 NARROWEST_PX = 64
 _BLOCK_PX = 16  # codecs work in blocks of so many columns: a tile that ends within one pays for the whole
@@ -43,43 +43,56 @@ class Part:
     left: int
 
 
-def split(width_px: int, tile_px: int) -> tuple[int, ...]:
-    """The widths of the tiles of a picture, from left to right: as near ``tile_px`` as whole blocks allow.
+def split(width_px: int, tile_px: int, overlap_px: int = 0) -> tuple[Tile, ...]:
+    """The tiles of a picture, from left to right: as near ``tile_px`` wide as whole blocks allow.
 
-    Empty where the picture is not worth cutting (narrower than one and a half tiles), or ``tile_px`` is 0.
+    Each shares ``overlap_px`` columns with the next, so that a window no wider than that lies in one tile. Empty where
+    the picture is not worth cutting (less than one and a half tiles), or ``tile_px`` is 0.
     """
-    count = min(round(width_px / tile_px), MOST_TILES) if tile_px else 0
+    rest, step = width_px - overlap_px, tile_px - overlap_px
+    count = min(round(rest / step), MOST_TILES) if tile_px else 0
     if count < 2:
         return ()
-    edges = [_BLOCK_PX * round(width_px * number / count / _BLOCK_PX) for number in range(count)] + [width_px]
-    return tuple(right - left for left, right in itertools.pairwise(edges))
+    lefts = [_BLOCK_PX * round(rest * number / count / _BLOCK_PX) for number in range(count)]
+    rights = [*(left + overlap_px for left in lefts[1:]), width_px]
+    return tuple(Tile(left, right - left) for left, right in zip(lefts, rights, strict=True))
 
 
-def parts(window: Window, widths: Sequence[int]) -> list[Part]:
-    """The parts that make up a window of the whole picture, from left to right."""
+def parts(window: Window, tiles: Sequence[Tile]) -> list[Part]:
+    """The parts that make up a window of the whole picture, from left to right: no more than it takes.
+
+    Args:
+        window: inside the picture.
+        tiles: that make up the picture.
+    """
     top, left, height, width = window
-    found, begin = [], 0
-    for track, size in enumerate(widths):
-        first, last = max(left, begin), min(left + width, begin + size)
-        if first < last:
-            found.append(Part(track, (top, first - begin, height, last - first), first - left))
-        begin += size
+    found, at = [], left
+    while at < left + width:
+        track = max(number for number, tile in enumerate(tiles) if tile.left_px <= at < tile.right_px)
+        last = min(left + width, tiles[track].right_px)
+        found.append(Part(track, (top, at - tiles[track].left_px, height, last - at), at - left))
+        at = last
     return found
 
 
-def columns(picture: npt.NDArray[np.uint8], widths: Sequence[int]) -> list[npt.NDArray[np.uint8]]:
-    """A picture [h, w] as its tiles [h, width]; itself alone where there are no widths."""
-    return np.split(picture, np.cumsum(widths)[:-1].tolist(), axis=1) if widths else [picture]
+def columns(picture: npt.NDArray[np.uint8], tiles: Sequence[Tile]) -> list[npt.NDArray[np.uint8]]:
+    """A picture [h, w] as views of its tiles [h, width]; itself alone where there are none."""
+    return [picture[:, tile.left_px : tile.right_px] for tile in tiles] or [picture]
 
 
-def widths_of(path: str | os.PathLike[str], container: InputContainer) -> tuple[int, ...]:
-    """The widths of the tiles of an open file; empty for a file that holds pictures as usual.
+def note(tiles: Sequence[Tile]) -> str:
+    """What the metadata of a file say under :data:`KEY`."""
+    return " ".join([MARK, *(str(tile.left_px) for tile in tiles)])
+
+
+def tiles_of(path: str | os.PathLike[str], container: InputContainer) -> tuple[Tile, ...]:
+    """The tiles of an open file; empty for a file that holds pictures as usual.
 
     Raises:
         VideoError: the file calls its tracks tiles, and they do not fit together.
     """
-    key, value = MARK
-    if container.metadata.get(key) != value:
+    text = container.metadata.get(KEY, "")
+    if not text.startswith(MARK):
         return ()
     forms = [
         (track.codec_context.name, track.codec_context.height, track.codec_context.width)
@@ -87,8 +100,12 @@ def widths_of(path: str | os.PathLike[str], container: InputContainer) -> tuple[
         else ("unknown", 0, 0)
         for track in picture_tracks(container)
     ]
-    widths = tuple(width for _, _, width in forms)
-    if not 2 <= len(forms) <= MOST_TILES or len({form[:2] for form in forms}) != 1 or not all(widths):
+    lefts = [int(word) for word in text[len(MARK) :].split() if re.fullmatch("[0-9]{1,5}", word)]
+    tiles = tuple(Tile(left, width) for left, (_, _, width) in zip(lefts, forms, strict=False))
+    alike = len({form[:2] for form in forms}) == 1 and len(forms) == len(lefts)
+    if not (alike and 2 <= len(forms) <= MOST_TILES and make_up(tiles, tiles[-1].right_px)):
         tracks = ", ".join(f"{codec} of {width}x{height} px" for codec, height, width in forms)
-        raise VideoError(os.fspath(path), None, f"calls its tracks tiles of one picture, but they are {tracks}")
-    return widths
+        raise VideoError(
+            os.fspath(path), None, f"calls its tracks columns of one picture, from {lefts} on, but they are {tracks}"
+        )
+    return tiles
