@@ -109,7 +109,7 @@ def decode_cuts(
     stride: int = 1,
     loop_filter: str = "exact",
 ) -> tuple[DecodedClip, ...]:
-    """Several cuts of the frames from ``start`` on, from one pass of the decoder.
+    """Several cuts of the frames from ``start`` on, from one pass of the decoder (one a tile, where there are tiles).
 
     Memory: the cuts themselves (frames x height x width bytes each) and what the decoder holds.
 
