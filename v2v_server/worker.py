@@ -38,7 +38,7 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode
 from v2v_server.clips import Clips
 from v2v_server.handover import sample_message
 from v2v_server.logbook import IDLE, note
-from v2v_server.process import die_with_parent, keep_freed_memory
+from v2v_server.process import die_with_parent, keep_freed_memory, take_long_turns
 from v2v_server.produce import make_sample
 from v2v_server.warm_up import warm_up_in_turn
 
@@ -194,4 +194,6 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     gc.freeze()
     worker = Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address, logbook)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
+    # Now that ZeroMQ's threads are there, which had better come at once.
+    take_long_turns()
     worker.run()
