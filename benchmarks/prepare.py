@@ -68,10 +68,12 @@ SETTINGS = (
     Setting("h264 18, GOP 12", Encoding("h264", 18, 12)),
     *(Setting(f"h264 {q}, not fastdecode", Encoding("h264", q, 25), _ORDINARY) for q in (12, 18, 20)),
     *(Setting(f"h264 18, tiles {px}", Encoding("h264", 18, 25, px)) for px in (150, 200, 300)),
+    Setting("h264 18, tiles 284, overlap 128", Encoding("h264", 18, 25, 284, 128)),
     Setting("h264 18, psychovisual", Encoding("h264", 18, 25), _PSYCHOVISUAL),
     *(Setting(f"mpeg4 {q}", Encoding("mpeg4", q, 25)) for q in (2, 3)),
     Setting("mpeg4 2, GOP 12", Encoding("mpeg4", 2, 12)),
     *(Setting(f"mpeg4 {q}, tiles 200", Encoding("mpeg4", q, 25, 200)) for q in (2, 3)),
+    *(Setting(f"mpeg4 {q}, tiles 284, overlap 128", Encoding("mpeg4", q, 25, 284, 128)) for q in (2, 3)),
     Setting("mpeg2 2", Encoding("mpeg2", 2, 25)),
     Setting("mjpeg 3", Encoding("mjpeg", 3, 25)),
 )

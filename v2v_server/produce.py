@@ -108,10 +108,9 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decode
     path = _below(root, lease.video)
     try:
         check_fingerprint(path, lease.fingerprint)
-        frame_index = FrameIndex.from_bytes(lease.frame_index)
         clips = decode_cuts(
             path,
-            frame_index,
+            _frame_index(lease, spec.recipe.frames_needed),
             lease.start_frame,
             [draft.cut for draft in drafts],
             stride=spec.recipe.frame_stride,
@@ -198,6 +197,20 @@ def _thresholds(texts: tuple[str, ...]) -> tuple[float, float] | None:
         return None
     positive, negative = (float.fromhex(text) for text in texts)
     return positive, negative
+
+
+def _frame_index(lease: Lease, frames: int) -> FrameIndex:
+    """The index that a lease carries, of which its server may not have looked at a single byte.
+
+    Raises:
+        VideoError: it is damaged.
+    """
+    try:
+        frame_index = FrameIndex.from_bytes(lease.frame_index)
+        frame_index.position(lease.start_frame, frames)
+    except (ProtocolError, UsageError) as error:
+        raise VideoError(lease.video, None, f"the server's index of it is damaged: {error}") from error
+    return frame_index
 
 
 def _refusals(lease: Lease) -> tuple[Refusal, ...]:

@@ -13,6 +13,7 @@ import pytest
 from tests.clips import panned_luma, truncated, write_clip
 from tests.video.lethal_reads import always_killed, killed_once, lethal
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_server.video import catalogue as catalogue_module
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
@@ -252,7 +253,19 @@ def test_fingerprints(tmp_path: Path) -> None:
         check_fingerprint(path, max(seen))
 
 
-def test_the_encoded_part_of_an_index_is_that_of_its_slice_and_the_latest_are_kept(tmp_path: Path) -> None:
+def test_a_small_index_is_handed_on_as_it_is_stored(tmp_path: Path) -> None:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        whole = catalogue.frame_index("a.mp4").to_bytes()
+        assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
+
+
+def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
     folder = tmp_path / "clips"
     folder.mkdir()
     write_clip(folder / "a.mp4", panned_luma(120), gop=12)

@@ -21,6 +21,9 @@ from v2v_server.video.store import Record, Store
 from v2v_server.video.tree import VIDEO_SUFFIXES, printable, video_files
 
 _KEPT_SLICES = 64
+_SMALL_INDEX_BYTES = 4096
+"""Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
+that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,34 +109,42 @@ class Catalogue:
         Raises:
             CorpusError: no such id in this catalogue, or the index can no longer be read.
             VideoChanged: another process has catalogued a changed file under this id since.
+            ProtocolError: what the index says of this video is damaged.
         """
+        return FrameIndex.from_bytes(self._stored_index(id))
+
+    def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
+        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
+
+        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. Of the others,
+        the latest slices are kept, because siblings ask for the same one after the other.
+
+        Raises:
+            CorpusError, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
+        """
+        key = id, start, count
+        if key not in self._slices:
+            stored = self._stored_index(id)
+            if len(stored) <= _SMALL_INDEX_BYTES:
+                return stored
+            encoded = FrameIndex.from_bytes(stored).slice(start, count).to_bytes()
+            while len(self._slices) >= _KEPT_SLICES:
+                del self._slices[next(iter(self._slices))]
+            self._slices[key] = encoded
+        return self._slices[key]
+
+    def _stored_index(self, id: str) -> bytes:
         fingerprint = self._fingerprint(id)
         if id in self._absent:
             video = self._absent[id]
-            return unseekable(video.frames, (1, 1), video.height_px, video.width_px)
+            return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
         try:
             data = self._store.frame_index(id, fingerprint)
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
-        return FrameIndex.from_bytes(data)
-
-    def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
-        """The part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
-
-        The latest are kept, because siblings ask for the same one after the other.
-
-        Raises:
-            CorpusError, VideoChanged, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
-        """
-        key = id, start, count
-        if key not in self._slices:
-            encoded = self.frame_index(id).slice(start, count).to_bytes()
-            while len(self._slices) >= _KEPT_SLICES:
-                del self._slices[next(iter(self._slices))]
-            self._slices[key] = encoded
-        return self._slices[key]
+        return data
 
     def scene(self, id: str) -> Scene:
         """The statistics of a video, read from the index on disk.
