@@ -47,6 +47,9 @@ CROP_PX = 128
 MOST_FRAMES = STARTS[-1] + JOB_FRAMES
 """Frames of a clip that are transcoded; sizes are compared by the bytes of a frame."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
+_SIDES = tuple(((6 * side, y), "left" if side > 0 else "right") for y in (0, 9, -9, 18, -18, 27) for side in (1, -1))
+"""Of a point in a plot: distance in points and alignment of its name."""
+_DOT_PX = 10
 
 SOURCE = "source"
 _X264 = CODECS["h264"]
@@ -239,29 +242,47 @@ def plot(records: Sequence[dict[str, Any]], path: Path) -> None:
     colours = {"source": "black", "h264": "tab:blue", "mpeg4": "tab:orange", "mpeg2": "tab:green", "mjpeg": "tab:red"}
     figure, axes = pyplot.subplots(1, 2, figsize=(13, 5.5), sharey=True)
     shown = [record for record in records if record["kind"] == "prepared"]
+    names = []
     for axis, key, label in ((axes[0], "size_ratio", "size relative to source"), (axes[1], "psnr_db", "PSNR [dB]")):
-        for record in shown:
-            if record[key] is None:
-                continue
-            family = record["name"].split()[0]
-            hollow = "not fastdecode" in record["name"]
-            colour = colours[family]
-            axis.scatter(
-                record[key], record["speed_ratio"], color="none" if hollow else colour, edgecolors=colour, s=45
-            )
-            axis.annotate(
-                record["name"], (record[key], record["speed_ratio"]), xytext=(5, 4), textcoords="offset points",
-                fontsize=7,
-            )  # fmt: skip
+        placed = {item["name"]: (item[key], item["speed_ratio"]) for item in shown if item[key] is not None}
+        for name, point in placed.items():
+            colour = colours[name.split()[0]]
+            axis.scatter(*point, color="none" if "not fastdecode" in name else colour, edgecolors=colour, s=45)
+        names.append((axis, placed))
         axis.set_xlabel(label)
-        axis.margins(x=0.2)  # room for the names
+        axis.margins(x=0.25)  # room for the names
         axis.grid(alpha=0.3)
+        axis.set_ylim(bottom=0)
     axes[0].set_ylabel("decode speed relative to source")
-    axes[0].set_ylim(bottom=0)
     figure.suptitle(f"One crop of {JOB_FRAMES} frames from a prepared corpus (hollow: loop filter and CABAC on)")
     figure.tight_layout()
+    for axis, placed in names:
+        _write_names(axis, placed)
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
+
+
+def _write_names(axis: Any, points: dict[str, tuple[float, float]]) -> None:
+    """Beside each point, on the first side where there is no other name or point."""
+    from matplotlib.transforms import Bbox
+
+    renderer = axis.figure.canvas.get_renderer()
+    centres = {name: axis.transData.transform(point) for name, point in points.items()}
+    dots = {name: Bbox([centre - _DOT_PX / 2, centre + _DOT_PX / 2]) for name, centre in centres.items()}
+    written: list[Bbox] = []
+    for name, point in points.items():
+        taken = written + [dot for other, dot in dots.items() if other != name]
+        for offset, side in _SIDES:
+            text = axis.annotate(
+                name, point, xytext=offset, textcoords="offset points", ha=side, va="center", fontsize=7
+            )
+            box = text.get_window_extent(renderer)
+            if axis.bbox.x0 < box.x0 and box.x1 < axis.bbox.x1 and not any(map(box.overlaps, taken)):
+                break
+            text.remove()
+        else:
+            axis.add_artist(text)
+        written.append(box)
 
 
 def _seconds(job: Callable[[], object]) -> float:

@@ -63,6 +63,7 @@ def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> N
     assert got == reference
 
 
+@pytest.mark.slow
 def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None:
     """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
     with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
