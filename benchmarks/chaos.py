@@ -41,7 +41,7 @@ from rich.table import Table
 
 from benchmarks.chaos_consumer import log_path
 from benchmarks.chaos_faults import WEIGHTS, Chaos, Fault
-from benchmarks.chaos_fleet import Fleet, shared_memory
+from benchmarks.chaos_fleet import Fleet, abandoned_memory, shared_memory
 from benchmarks.chaos_log import BatchLine, Kill, read_log, recovery_seconds
 from benchmarks.corpus import webvid_like
 from benchmarks.memory import Fit, fit, rss_mib
@@ -260,7 +260,7 @@ def _torment_and_judge(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) ->
         left = fleet.stop()
     finally:
         fleet.kill()
-    left += [f"shared memory {name}" for name in sorted(shared_memory() - shared)]
+    left += [f"shared memory {name}" for name in abandoned_memory(shared)]
     try:
         slope = fit(list(run.server_rss.values()), skip_seconds=_WARM_UP_SECONDS)
     except UsageError:  # no server lived for long enough: the key is null, and the lines below say so

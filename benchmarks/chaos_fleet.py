@@ -336,6 +336,18 @@ def shared_memory() -> set[str]:
     return set(os.listdir(folder)) if folder.is_dir() else set()
 
 
+def abandoned_memory(before: set[str]) -> list[str]:
+    """Names of the shared memory that came since and that no living process maps: what others use is theirs."""
+    found = shared_memory() - before
+    for maps in Path("/proc").glob("[0-9]*/maps") if found else ():
+        try:
+            text = maps.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            continue  # not ours to look at, or gone
+        found = {name for name in found if f"/dev/shm/{name}" not in text}
+    return sorted(found)
+
+
 def _command_of(process: psutil.Process) -> str:
     try:
         return " ".join(process.cmdline())[:200]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from benchmarks import chaos
 from benchmarks.chaos_consumer import PROFILES, profile
 from benchmarks.chaos_faults import PAUSES, WEIGHTS, Fault
-from benchmarks.chaos_fleet import Fleet, free_ports
+from benchmarks.chaos_fleet import Fleet, abandoned_memory, free_ports, shared_memory
 from tests.clips import panned_luma, write_clip
 
 DEMANDED = (
@@ -78,6 +79,20 @@ def test_wrong_usage_is_status_2(tmp_path: Path, arguments: list[str], capsys: p
     assert chaos.main(["--videos", str(tmp_path), *arguments]) == 2
     assert capsys.readouterr().err.startswith("chaos: ")
     assert not [name for name in os.listdir(tmp_path) if name.startswith("v2v-chaos")]
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="this host has no /dev/shm")
+def test_shared_memory_is_left_over_once_nobody_maps_it() -> None:
+    """Another test's, say, that runs at the same time."""
+    before = shared_memory()
+    block = SharedMemory(create=True, size=100)
+    try:
+        assert block.name not in abandoned_memory(before)
+        block.close()
+        assert block.name in abandoned_memory(before)
+    finally:
+        block.unlink()
+    assert block.name not in abandoned_memory(before)
 
 
 @pytest.mark.slow
