@@ -300,8 +300,8 @@ class Connection:
                 if self._welcome_due is None:
                     self._begin_hello()
             case Refused(code=ErrorCode.CREDIT) if self._may_exceed_credit():
-                # It still makes what it had sent before we asked again. What it refused stays asked for, in our
-                # account, and goes out again with the rest at the next quiet moment.
+                # It makes again what it had sent, on the way to us, when we asked again. What it refused stays asked
+                # for, in our account, and goes out again with the rest when such a sample comes, or when all is quiet.
                 self._credit_refusals += 1
                 self._owed = True
             case Refused():
@@ -339,9 +339,11 @@ class Connection:
             raise ProtocolError(
                 f"{self._address} sent sample {header.index} of epoch {header.epoch} as {found}; asked: {self.layout}"
             )
+        again = header.index not in self._asked
         arrays = self._lending.payload(header, payload)
         if arrays is None:
             self.strays += 1
+            self._ask_on(again)
             return None
         provenance = Provenance.from_dict(header.provenance)
         identity = SampleId(
@@ -358,8 +360,15 @@ class Connection:
         self._asked.pop(header.index, None)
         self._credit_refusals = 0
         self._last = header.index
-        self.want(())
+        self._ask_on(again)
         return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds, header.decoded)
+
+    def _ask_on(self, again: bool) -> None:
+        """After a sample; one that comes again held credit that we took for free."""
+        if again and self._owed:
+            self._want_again()
+        else:
+            self.want(())
 
     # --- the link -----------------------------------------------------------------------------------------------------
 

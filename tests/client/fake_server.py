@@ -234,6 +234,12 @@ class FakeServer:
             identity, session, key = self._random.choice(waiting)
             self._answer(identity, session, *key)
 
+    def answer(self, epoch: int, index: int) -> None:
+        """Answers that sample to everybody who waits for it, held or not; under :meth:`call`."""
+        for identity, session in self._sessions.items():
+            if (epoch, index) in session.unanswered:
+                self._answer(identity, session, epoch, index)
+
     def _answer(self, identity: bytes, session: _Session, epoch: int, index: int) -> None:
         del session.unanswered[epoch, index]
         if index in self.unavailable:

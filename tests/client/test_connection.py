@@ -1,0 +1,52 @@
+"""A connection by itself, where the order of messages matters and no clock may help."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from tests.client.fake_server import SPEC, FakeServer
+from tests.waiting import until
+from v2v_client.connection import Connection
+from v2v_client.liveness import Patience
+from v2v_protocol.messages import Hello
+from v2v_protocol.sample import DEFAULT_ARRAYS
+
+NEVER_BY_THE_CLOCK = Patience(timeout_seconds=20.0, ping_seconds=1000.0, rewant_seconds=1000.0)
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with FakeServer(sequences=23, credit=4) as running:
+        yield running
+
+
+def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(server: FakeServer) -> None:
+    """Asked again while it was on its way, sample 0 is made twice, and for the server it is still due."""
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+        connection.open()
+        server.held = True
+        connection.want(range(4))
+        until(lambda: len(server.wants) == 4)
+        server.call(lambda: server.answer(0, 0))
+        connection._resume()  # the network was cut and is back: all four are asked for again
+        until(lambda: len(server.wants) == 8)
+        assert _next(connection) == 0
+        connection.want([4])
+        until(lambda: server.refused_for_credit)
+        server.call(lambda: (server.answer(0, 0), setattr(server, "held", False)))
+        assert _next(connection) == 0
+        seen = set()
+        while seen != {1, 2, 3, 4}:  # or the server is given up
+            seen.add(_next(connection))
+    assert server.refused_for_credit == 1
+
+
+def _next(connection: Connection) -> int:
+    arrival = connection.receive()
+    assert arrival is not None
+    arrival.payload.drop()
+    return arrival.index
