@@ -35,9 +35,8 @@ demo: $(READY) $(CLIPS)
 test: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow"
 
-# Most of these wait for processes and deadlines: a third runs meanwhile.
 test-slow: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
 
 $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLD_NUMPY)

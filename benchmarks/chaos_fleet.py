@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from v2v_protocol.errors import UsageError
 
 MARK = "V2V_CHAOS_RUN"
 _STOP_SECONDS = 30.0
+_LAST_WORDS_SECONDS = 5.0
 _PORTS = range(20_000, 30_000)
 """Below the ports that the kernel gives to outgoing connections. A consumer that reconnects to a dead server's port
 could else be given that very port for its own end, connect to itself and keep the address (TCP simultaneous open)."""
@@ -59,8 +61,13 @@ class Process:
         file = self.folder / "stderr"
         if not file.exists():
             return "(it was not started)"
-        lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "(it wrote nothing)"
+        return self.last_lines(1)
+
+    def last_lines(self, most: int = 30) -> str:
+        """Of what it wrote to its standard error."""
+        file = self.folder / "stderr"
+        lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines() if file.exists() else []
+        return "\n".join(lines[-most:]) or "(it wrote nothing)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +119,8 @@ class Fleet:
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
-            command = [sys.executable, "-m", "benchmarks.chaos_consumer", "--address", self._address]
+            command = [sys.executable, "-X", "faulthandler", "-m", "benchmarks.chaos_consumer"]
+            command += ["--address", self._address]
             command += ["--profile", str(number), "--folder", str(folder)]
             self.crowd.append(Process(f"consumer {number}", command, folder))
 
@@ -262,9 +270,12 @@ class Fleet:
             try:
                 status = place.process.wait(_STOP_SECONDS)
             except subprocess.TimeoutExpired:
-                left.append(f"{place.name} did not leave within {_STOP_SECONDS:g} s of SIGTERM")
+                place.process.send_signal(signal.SIGABRT)  # consumers say where they are
+                with suppress(subprocess.TimeoutExpired):
+                    place.process.wait(_LAST_WORDS_SECONDS)
                 place.process.kill()
                 place.process.wait()
+                left.append(f"{place.name} did not leave within {_STOP_SECONDS:g} s of SIGTERM: {place.last_lines()}")
                 continue
             if status not in (0, -signal.SIGTERM):
                 left.append(f"{place.name} left with status {status}: {place.last_line()}")
@@ -338,14 +349,19 @@ def shared_memory() -> set[str]:
 
 def abandoned_memory(before: set[str]) -> list[str]:
     """Names of the shared memory that came since and that no living process maps: what others use is theirs."""
-    found = shared_memory() - before
+    found: dict[str, str] = {}
+    for name in shared_memory() - before:
+        with suppress(FileNotFoundError):  # gone by now
+            found[str(os.stat(f"/dev/shm/{name}").st_ino)] = name
     for maps in Path("/proc").glob("[0-9]*/maps") if found else ():
         try:
             text = maps.read_text(encoding="utf-8", errors="replace")
         except OSError:
             continue  # not ours to look at, or gone
-        found = {name for name in found if f"/dev/shm/{name}" not in text}
-    return sorted(found)
+        for line in text.splitlines():
+            if "/dev/shm/" in line:  # by number: who made a semaphore maps it under a name that it had before
+                found.pop(line.split()[4], None)
+    return sorted(found.values())
 
 
 def _command_of(process: psutil.Process) -> str:

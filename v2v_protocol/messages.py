@@ -224,7 +224,7 @@ class Lease:
         frames_per_second: average rate, for noise stated per second; 0 where unknown.
         thresholds: (positive, negative) as float.hex() when the corpus states them for this video, else empty.
         start_frame: first frame of the sequence.
-        frame_index: ``FrameIndex.to_bytes()`` of the part of the file that is needed.
+        frame_index: ``FrameIndex.to_bytes()`` of at least the part of the file that is needed.
         candidate: which candidate of the index this is.
         refusals: candidates passed over before, as ``Refusal`` fields: {"refusals": [...]}.
         deadline_seconds: a worker silent for longer than this is taken for hung.
