@@ -89,9 +89,11 @@ class Link:
 
     def close(self) -> None:
         """Frees context and thread, after the time the socket was given to linger."""
-        self.disconnect(linger_ms=0)
-        # With whatever socket an exception (Ctrl-C in connect, say) has left open: terminating would wait for it.
-        self._context.destroy(linger=0)
+        try:
+            self.disconnect(linger_ms=0)
+        finally:
+            # And whatever a signal's exception in the midst of that has left open: terminating would wait for it.
+            self._context.destroy(linger=0)
 
     def send(self, frames: Sequence[Any]) -> None:
         """Queues a message; it is sent when the peer can be reached."""

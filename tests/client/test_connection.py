@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
+import zmq
 
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
@@ -43,6 +44,26 @@ def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(se
         while seen != {1, 2, 3, 4}:  # or the server is given up
             seen.add(_next(connection))
     assert server.refused_for_credit == 1
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("which", [1, 2])
+def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch, which: int
+) -> None:
+    """ZeroMQ's context waits for ever for a socket that nobody closed."""
+    connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
+    connection.open()
+    closing_socket, calls = zmq.Socket.close, iter(range(1, 100))
+
+    def interrupted(self: zmq.Socket[bytes], linger: int | None = None) -> None:
+        if next(calls) == which:
+            raise KeyboardInterrupt
+        closing_socket(self, linger)
+
+    monkeypatch.setattr(zmq.Socket, "close", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        connection.close()
 
 
 def _next(connection: Connection) -> int:
