@@ -286,8 +286,10 @@ class LeaseModel(RuleBasedStateMachine):
     @rule(target=numbers, number=numbers, worker=workers)
     def twin(self, number: int, worker: bytes) -> object:
         place = self.out.get(number)
-        if place is None or place.retired or place.worker == worker:
+        if place is None or place.retired:
             return multiple()
+        if worker in {other.worker for other in self.out.values() if other.task == place.task}:
+            return multiple()  # nobody is given a task that it has
         return self._granted(place.task, worker)
 
     @rule(number=numbers, worker=workers)
