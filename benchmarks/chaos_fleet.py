@@ -56,17 +56,12 @@ class Process:
         """None when it does not run."""
         return None if self.process is None or self.process.poll() is not None else self.process.pid
 
-    def last_line(self) -> str:
+    def last_lines(self, most: int = 1) -> str:
         """Of what it wrote to its standard error."""
         file = self.folder / "stderr"
         if not file.exists():
             return "(it was not started)"
-        return self.last_lines(1)
-
-    def last_lines(self, most: int = 30) -> str:
-        """Of what it wrote to its standard error."""
-        file = self.folder / "stderr"
-        lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines() if file.exists() else []
+        lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return "\n".join(lines[-most:]) or "(it wrote nothing)"
 
 
@@ -119,8 +114,15 @@ class Fleet:
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
-            command = [sys.executable, "-X", "faulthandler", "-m", "benchmarks.chaos_consumer"]
-            command += ["--address", self._address]
+            command = [
+                sys.executable,
+                "-X",
+                "faulthandler",
+                "-m",
+                "benchmarks.chaos_consumer",
+                "--address",
+                self._address,
+            ]
             command += ["--profile", str(number), "--folder", str(folder)]
             self.crowd.append(Process(f"consumer {number}", command, folder))
 
@@ -185,7 +187,7 @@ class Fleet:
             if self.failures:
                 raise UsageError(f"{self.failures[0].name} does not come up: {self.failures[0].text}")
             if time.monotonic() > deadline:
-                raise UsageError(f"no batches yet, and out of patience; the server: {self.server.last_line()}")
+                raise UsageError(f"no batches yet, and out of patience; the server: {self.server.last_lines()}")
             time.sleep(0.05)
 
     def look(self, now: float) -> None:
@@ -198,7 +200,7 @@ class Fleet:
             if status is None:
                 continue
             if not place.expected:
-                self.failures.append(Failure(place.name, status, place.last_line()))
+                self.failures.append(Failure(place.name, status, place.last_lines()))
             if place in self.further_workers:
                 self.further_workers.remove(place)
             else:
@@ -275,10 +277,10 @@ class Fleet:
                     place.process.wait(_LAST_WORDS_SECONDS)
                 place.process.kill()
                 place.process.wait()
-                left.append(f"{place.name} did not leave within {_STOP_SECONDS:g} s of SIGTERM: {place.last_lines()}")
+                left.append(f"{place.name} did not leave within {_STOP_SECONDS:g} s of SIGTERM: {place.last_lines(30)}")
                 continue
             if status not in (0, -signal.SIGTERM):
-                left.append(f"{place.name} left with status {status}: {place.last_line()}")
+                left.append(f"{place.name} left with status {status}: {place.last_lines()}")
         return left + self.traces()
 
     def kill(self) -> None:

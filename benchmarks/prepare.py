@@ -272,16 +272,12 @@ def _write_names(axis: Any, points: dict[str, tuple[float, float]]) -> None:
     written: list[Bbox] = []
     for name, point in points.items():
         taken = written + [dot for other, dot in dots.items() if other != name]
+        text = axis.annotate(name, point, textcoords="offset points", xytext=(0, 0), va="center", fontsize=7)
         for offset, side in _SIDES:
-            text = axis.annotate(
-                name, point, xytext=offset, textcoords="offset points", ha=side, va="center", fontsize=7
-            )
+            text.set(position=offset, horizontalalignment=side)
             box = text.get_window_extent(renderer)
             if axis.bbox.x0 < box.x0 and box.x1 < axis.bbox.x1 and not any(map(box.overlaps, taken)):
                 break
-            text.remove()
-        else:
-            axis.add_artist(text)
         written.append(box)
 
 

@@ -23,7 +23,8 @@ from v2v_server.produce import decode_for, draft_of
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.video.catalogue import Catalogue
-from v2v_server.video.decode import Cut, decode_cuts
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import decode_cuts
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 

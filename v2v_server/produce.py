@@ -26,7 +26,8 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.view import apply_view, source_window
-from v2v_server.video.decode import Cut, DecodedClip, decode_cuts
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import DecodedClip, decode_cuts
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.index import FrameIndex
 from v2v_server.video.rows import Rows

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video import decode
-from v2v_server.video.decode import Cut, decode_cuts, decode_luma
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import decode_cuts, decode_luma
 from v2v_server.video.luma import range_table
 from v2v_server.video.probe import VideoFacts, probe
 

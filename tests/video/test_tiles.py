@@ -22,7 +22,8 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_server.remake import remake
 from v2v_server.video import decode
 from v2v_server.video.catalogue import open_catalogue
-from v2v_server.video.decode import Cut, decode_cuts, decode_luma
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import decode_cuts, decode_luma
 from v2v_server.video.encode import CODECS, Encoding, encode_luma
 from v2v_server.video.index import MOST_TILES, FrameIndex, Tile, make_up
 from v2v_server.video.manifest import read_manifest

@@ -16,10 +16,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NoReturn
 
 import av
-import cv2
 import numpy as np
 import numpy.typing as npt
 from av.container import InputContainer
@@ -28,10 +26,10 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.video.collect import Cut, Stack, Task, window_of
 from v2v_server.video.h264 import is_unreferenced, length_bytes
 from v2v_server.video.index import NO_TIMESTAMP, FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma, range_table
-from v2v_server.video.orientation import Orientation, Window
+from v2v_server.video.orientation import Window
 from v2v_server.video.source import opened, packets, reason
 from v2v_server.video.tiles import Part, parts
 
@@ -57,36 +55,6 @@ class DecodedClip:
     seconds: npt.NDArray[np.float64]
     codec: str
     bit_exact: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """What one sample takes of a clip.
-
-    Attributes:
-        count: number of frames, at least 1; with a stride, of those that are taken.
-        window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
-    """
-
-    count: int
-    window: Window | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """Which frames of a file are to be decoded.
-
-    Attributes:
-        path, index, start, stride, loop_filter: see :func:`decode_cuts`; the index is that of the track.
-        track: of the file.
-    """
-
-    path: str
-    index: FrameIndex
-    start: int
-    stride: int
-    loop_filter: str
-    track: int = 0
 
 
 class _SeekFailed(Exception):
@@ -131,7 +99,7 @@ def decode_cuts(
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [Cut(cut.count, _checked(cut.window, index)) for cut in cuts]
     decode = _decode_tiles if index.tiles else _decode_track
-    taken, codec = decode(_Task(os.fspath(path), index, start, stride, loop_filter), checked)
+    taken, codec = decode(Task(os.fspath(path), index, start, stride, loop_filter), checked)
     return tuple(
         DecodedClip(
             grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
@@ -153,18 +121,12 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _window(cut: Cut) -> Window:
-    """Of a cut that was checked."""
-    assert cut.window is not None
-    return cut.window
-
-
-def _decode_tiles(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+def _decode_tiles(task: Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
     """The cuts of a picture in tiles: each tile that one of them touches is decoded, by itself, and no other."""
-    whole = [np.empty((cut.count, *_window(cut)[2:]), np.uint8) for cut in cuts]
+    whole = [np.empty((cut.count, *window_of(cut)[2:]), np.uint8) for cut in cuts]
     needed: dict[int, list[tuple[int, Part]]] = {}
     for number, cut in enumerate(cuts):
-        for part in parts(_window(cut), task.index.tiles):
+        for part in parts(window_of(cut), task.index.tiles):
             needed.setdefault(part.track, []).append((number, part))
     codec = ""
     for track, wanted in needed.items():
@@ -178,25 +140,25 @@ def _decode_tiles(task: _Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np
 
 
 def _decode_track(
-    task: _Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]] = ()
+    task: Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]] = ()
 ) -> tuple[list[npt.NDArray[np.uint8]], str]:
     """The cuts of the pictures of one track, [count, h, w] uint8 each, and the codec's name.
 
     Args:
         into: arrays for the cuts, which are used where the stored picture stands upright.
     """
-    stack = _Stack(task, cuts, into)
+    stack = Stack(task, cuts, into)
     try:
         done = _decode_quickly(stack)
     except (_SeekFailed, VideoError):
         done = False
-        stack = _Stack(task, cuts, into)
+        stack = Stack(task, cuts, into)
     if not done:
         _decode_plainly(stack)
     return list(stack.grey()), stack.codec
 
 
-def _decode_quickly(stack: _Stack) -> bool:
+def _decode_quickly(stack: Stack) -> bool:
     """Decode from the last keyframe at or before the range, leaving out what nothing refers to; False when there is
     nothing to be saved.
 
@@ -229,7 +191,7 @@ def _decode_quickly(stack: _Stack) -> bool:
     return True
 
 
-def _decode_plainly(stack: _Stack) -> None:
+def _decode_plainly(stack: Stack) -> None:
     """Decode every frame from the beginning of the file."""
     task = stack.task
     with opened(task.path, task.loop_filter, task.track) as (container, stream):
@@ -240,7 +202,7 @@ def _decode_plainly(stack: _Stack) -> None:
         stack.close(stream.codec_context.codec.canonical_name)
 
 
-def _fill(stack: _Stack, frames: Iterator[VideoFrame]) -> None:
+def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> None:
     for frame in frames:
         if stack.take(frame):
             return
@@ -310,111 +272,3 @@ def _packets_from(container: InputContainer, stream: VideoStream, pts: int, dts:
         if found:
             return
     raise _SeekFailed
-
-
-class _Stack:
-    """Collects the asked frames of one pass, and refuses what is not exactly that."""
-
-    def __init__(self, task: _Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]]) -> None:
-        self.task = task
-        self.index = index = task.index
-        self.codec = ""
-        self.sparse = False  # whether frames before the range are left out on purpose
-        self._cuts = cuts
-        self._into = into
-        self._stride = stride = task.stride
-        first, most = task.start - index.first, max(cut.count for cut in cuts)
-        self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
-        self._seen = 0  # frames delivered by the decoder, for files where they must be counted
-        self._taken = 0
-        self._cursor = 0  # where the next frame is expected in the index
-        self._damaged = False
-        self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
-
-    def take(self, frame: VideoFrame) -> bool:
-        """Look at the next frame that the decoder delivers; True once the last asked one is in."""
-        ordinal, self._seen = self._seen, self._seen + 1
-        # A damaged or lost frame spoils what refers to it, until decoding starts afresh.
-        lost = not self.sparse and self._after_a_gap(frame)
-        self._damaged = frame.is_corrupt or ((self._damaged or lost) and not frame.key_frame)
-        if not self._is_next(frame, ordinal):
-            return False
-        if self._damaged:
-            self.refuse("is damaged, or refers to a damaged or lost frame")
-        self._copy(frame)
-        self._taken += 1
-        return self._taken == len(self._expected)
-
-    def _after_a_gap(self, frame: VideoFrame) -> bool:
-        """Whether the decoder has left out a frame that the index lists in front of this one."""
-        pts, at = self.index.pts, self._cursor
-        if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
-            return False
-        found = at if at < len(pts) and pts[at] == frame.pts else int(np.searchsorted(pts, frame.pts))
-        self._cursor = found + 1
-        return found > at
-
-    def _is_next(self, frame: VideoFrame, ordinal: int) -> bool:
-        if not self.index.seekable:
-            return ordinal >= self.task.start and (ordinal - self.task.start) % self._stride == 0
-        if frame.pts is None:
-            self.refuse("the decoder delivers a frame without a time stamp")
-        expected = self._expected[self._taken]
-        if frame.pts == expected:
-            return True
-        if frame.pts > expected:
-            self.refuse(f"is missing: the decoder delivers time stamp {frame.pts} where {expected} should come")
-        if self._taken and not self._is_passed_over(frame.pts):
-            self.refuse(
-                f"the decoder delivers time stamp {frame.pts}, which the index does not have, before {expected}"
-            )
-        return False
-
-    def _is_passed_over(self, pts: int) -> bool:
-        """Whether a frame that presents before the next one to take is one that the stride leaves out."""
-        return self._stride > 1 and bool(np.any(self.index.pts == pts))
-
-    def _copy(self, frame: VideoFrame) -> None:
-        if not self._parts:
-            self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
-            self._size = self._orientation.size(self.index.height_px, self.index.width_px)
-            self._parts = [self._part(number, cut) for number, cut in enumerate(self._cuts)]
-        if (frame.height, frame.width) != self._size:
-            height, width = self._orientation.size(frame.height, frame.width)
-            self.refuse(
-                f"the picture is {width}x{height} px here and {self.index.width_px}x{self.index.height_px} px at first"
-            )
-        if not self._luma.describes(frame):
-            self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
-        for stored, raw in self._parts:
-            if self._taken < len(raw):
-                copy_luma(frame, self._luma, stored, raw[self._taken])
-
-    def _part(self, number: int, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
-        window = _window(cut)
-        stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
-        if self._into and self._orientation == Orientation():
-            return stored, self._into[number]
-        return stored, np.empty((cut.count, *stored[2:]), np.uint8)
-
-    def close(self, codec: str) -> None:
-        """The end of the pass: make sure that every asked frame came."""
-        if self._taken < len(self._expected):
-            self.refuse("the file ends before it")
-        self.codec = codec
-
-    def refuse(self, why: str) -> NoReturn:
-        """Blame the next frame that should have come.
-
-        Raises:
-            VideoError: always.
-        """
-        raise VideoError(self.task.path, self.task.start + self._taken * self._stride, why)
-
-    def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
-        for _, raw in self._parts:
-            if self._luma.bits == 8 and not self._luma.full_range:
-                for rows in (raw.reshape(-1, raw.shape[-1]),) if raw.flags.c_contiguous else raw:
-                    cv2.LUT(rows, range_table(8, False), dst=rows)
-            yield self._orientation.upright(raw) if raw.flags.c_contiguous else raw

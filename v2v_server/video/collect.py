@@ -1,0 +1,162 @@
+"""Collecting the asked frames of one pass of a decoder, and refusing what is not exactly that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from av.video.frame import VideoFrame
+
+from v2v_protocol.errors import VideoError
+from v2v_server.video.index import FrameIndex
+from v2v_server.video.luma import LumaFormat, copy_luma, range_table
+from v2v_server.video.orientation import Orientation, Window
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What one sample takes of a clip.
+
+    Attributes:
+        count: number of frames, at least 1; with a stride, of those that are taken.
+        window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+    """
+
+    count: int
+    window: Window | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Which frames of a file are to be decoded.
+
+    Attributes:
+        path, index, start, stride, loop_filter: see :func:`v2v_server.video.decode.decode_cuts`; the index is
+            that of the track.
+        track: of the file.
+    """
+
+    path: str
+    index: FrameIndex
+    start: int
+    stride: int
+    loop_filter: str
+    track: int = 0
+
+
+def window_of(cut: Cut) -> Window:
+    """Of a cut that was checked."""
+    assert cut.window is not None
+    return cut.window
+
+
+class Stack:
+    """Collects the asked frames of one pass, and refuses what is not exactly that."""
+
+    def __init__(self, task: Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]]) -> None:
+        self.task = task
+        self.index = index = task.index
+        self.codec = ""
+        self.sparse = False  # whether frames before the range are left out on purpose
+        self._cuts = cuts
+        self._into = into
+        self._stride = stride = task.stride
+        first, most = task.start - index.first, max(cut.count for cut in cuts)
+        self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
+        self._seen = 0  # frames delivered by the decoder, for files where they must be counted
+        self._taken = 0
+        self._cursor = 0  # where the next frame is expected in the index
+        self._damaged = False
+        self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
+
+    def take(self, frame: VideoFrame) -> bool:
+        """Look at the next frame that the decoder delivers; True once the last asked one is in."""
+        ordinal, self._seen = self._seen, self._seen + 1
+        # A damaged or lost frame spoils what refers to it, until decoding starts afresh.
+        lost = not self.sparse and self._after_a_gap(frame)
+        self._damaged = frame.is_corrupt or ((self._damaged or lost) and not frame.key_frame)
+        if not self._is_next(frame, ordinal):
+            return False
+        if self._damaged:
+            self.refuse("is damaged, or refers to a damaged or lost frame")
+        self._copy(frame)
+        self._taken += 1
+        return self._taken == len(self._expected)
+
+    def _after_a_gap(self, frame: VideoFrame) -> bool:
+        """Whether the decoder has left out a frame that the index lists in front of this one."""
+        pts, at = self.index.pts, self._cursor
+        if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
+            return False
+        found = at if at < len(pts) and pts[at] == frame.pts else int(np.searchsorted(pts, frame.pts))
+        self._cursor = found + 1
+        return found > at
+
+    def _is_next(self, frame: VideoFrame, ordinal: int) -> bool:
+        if not self.index.seekable:
+            return ordinal >= self.task.start and (ordinal - self.task.start) % self._stride == 0
+        if frame.pts is None:
+            self.refuse("the decoder delivers a frame without a time stamp")
+        expected = self._expected[self._taken]
+        if frame.pts == expected:
+            return True
+        if frame.pts > expected:
+            self.refuse(f"is missing: the decoder delivers time stamp {frame.pts} where {expected} should come")
+        if self._taken and not self._is_passed_over(frame.pts):
+            self.refuse(
+                f"the decoder delivers time stamp {frame.pts}, which the index does not have, before {expected}"
+            )
+        return False
+
+    def _is_passed_over(self, pts: int) -> bool:
+        """Whether a frame that presents before the next one to take is one that the stride leaves out."""
+        return self._stride > 1 and bool(np.any(self.index.pts == pts))
+
+    def _copy(self, frame: VideoFrame) -> None:
+        if not self._parts:
+            self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
+            self._size = self._orientation.size(self.index.height_px, self.index.width_px)
+            self._parts = [self._part(number, cut) for number, cut in enumerate(self._cuts)]
+        if (frame.height, frame.width) != self._size:
+            height, width = self._orientation.size(frame.height, frame.width)
+            self.refuse(
+                f"the picture is {width}x{height} px here and {self.index.width_px}x{self.index.height_px} px at first"
+            )
+        if not self._luma.describes(frame):
+            self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
+        for stored, raw in self._parts:
+            if self._taken < len(raw):
+                copy_luma(frame, self._luma, stored, raw[self._taken])
+
+    def _part(self, number: int, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+        window = window_of(cut)
+        stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
+        if self._into and self._orientation == Orientation():
+            return stored, self._into[number]
+        return stored, np.empty((cut.count, *stored[2:]), np.uint8)
+
+    def close(self, codec: str) -> None:
+        """The end of the pass: make sure that every asked frame came."""
+        if self._taken < len(self._expected):
+            self.refuse("the file ends before it")
+        self.codec = codec
+
+    def refuse(self, why: str) -> NoReturn:
+        """Blame the next frame that should have come.
+
+        Raises:
+            VideoError: always.
+        """
+        raise VideoError(self.task.path, self.task.start + self._taken * self._stride, why)
+
+    def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
+        """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
+        for _, raw in self._parts:
+            if self._luma.bits == 8 and not self._luma.full_range:
+                for rows in (raw.reshape(-1, raw.shape[-1]),) if raw.flags.c_contiguous else raw:
+                    cv2.LUT(rows, range_table(8, False), dst=rows)
+            yield self._orientation.upright(raw) if raw.flags.c_contiguous else raw
