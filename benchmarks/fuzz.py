@@ -169,7 +169,7 @@ def _await_batches(fleet: Fleet, count: int, seconds: float = 120.0) -> None:
     while fleet.committed()[0] < count:
         fleet.look(time.monotonic())
         if len(fleet.failures) > 3 or time.monotonic() > deadline:
-            raise UsageError(f"the healthy consumer gets no batches: {fleet.crowd[0].last_line()}")
+            raise UsageError(f"the healthy consumer gets no batches: {fleet.crowd[0].last_lines()}")
         time.sleep(0.1)
 
 
