@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -58,3 +59,30 @@ class BufferPool:
         # The finalizer holds the memory while the loan lives.
         weakref.finalize(loan, self._free.append, memory).atexit = False
         return np.asarray(loan)
+
+
+class BatchBuffers:
+    """The arrays of batches, which one iteration of a dataset leaves to the next."""
+
+    def __init__(self) -> None:
+        self._form: object = None
+        self._pools: dict[str, BufferPool] = {}
+
+    def shape(self, layout: Mapping[str, tuple[str, tuple[int, ...]]], batch_size: int, spare: int) -> None:
+        """Makes the next arrays ones for batches of that many samples; memory of another form is let go.
+
+        Args:
+            layout: dtype and shape of each array of one sample.
+            batch_size: samples of a batch.
+            spare: most batches kept while nobody uses them.
+        """
+        form = dict(layout), batch_size, spare
+        if form != self._form:
+            self._form = form
+            self._pools = {
+                name: BufferPool(dtype, (batch_size, *shape), spare) for name, (dtype, shape) in layout.items()
+            }
+
+    def take(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays for a batch, of unspecified content, by name; see :meth:`BufferPool.take`."""
+        return {name: pool.take() for name, pool in self._pools.items()}

@@ -12,6 +12,7 @@ import torch.distributed
 from torch.utils.data import IterableDataset
 
 from v2v_client.batch import Batch
+from v2v_client.buffers import BatchBuffers
 from v2v_client.connection import Connection
 from v2v_client.delivery import deliver
 from v2v_client.liveness import Patience
@@ -76,6 +77,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         received, waiting              C S           (2 C S while everything is asked for again)
         batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
         at the server, not yet sent    C S
+        between iterations             (ceil(C / batch_size) + 2) batch_size S: buffers, kept for the next
 
     Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses),
     SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream than the one begun),
@@ -142,11 +144,13 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
         self._position = Position(_whole("epoch", epoch, 0, LARGEST_EPOCH))
+        self._buffers = BatchBuffers()
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
 
     def __getstate__(self) -> dict[str, Any]:
         # A spawned loader worker knows nothing of the process group. A copy, even a shallow one, moves on by itself.
-        return self.__dict__ | {"_ambient": _distributed() or self._ambient, "_position": copy.copy(self._position)}
+        own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers()}
+        return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 
     # --- what it is ---------------------------------------------------------------------------------------------------
 
@@ -280,7 +284,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             def after(batch: int, quarantine: int) -> dict[str, Any]:
                 return consumer.after(stream, epoch, plan, batch, quarantine).to_dict()
 
-            for batch, number in zip(deliver(connection, plan, batches, epoch, after), batches, strict=True):
+            delivered = deliver(connection, plan, batches, epoch, after, self._buffers)
+            for batch, number in zip(delivered, batches, strict=True):
                 done += 1
                 seen = batch.resume_state["quarantine"]
                 self._position.reached(

@@ -11,7 +11,7 @@ import torch
 
 from v2v_client.arrival import Arrival
 from v2v_client.batch import Batch
-from v2v_client.buffers import BufferPool
+from v2v_client.buffers import BatchBuffers
 from v2v_client.connection import Connection
 from v2v_client.ordering import ReorderWindow
 from v2v_client.world import EpochPlan
@@ -41,6 +41,7 @@ def deliver(
     batches: Sequence[int],
     epoch: int,
     resume_state: Callable[[int, int], Mapping[str, Any]],
+    buffers: BatchBuffers,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Batch]:
     """The batches of an open connection, in order.
@@ -50,6 +51,7 @@ def deliver(
         batches: numbers of the batches to deliver.
         epoch: of the samples.
         resume_state: the state after a batch, by its number and the newest quarantine snapshot seen up to it.
+        buffers: for the batches.
         clock: seconds, for ``Batch.wait_seconds``.
 
     Raises:
@@ -57,10 +59,7 @@ def deliver(
     """
     window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
     most_drafts = -(-connection.credit // plan.batch_size) + 2
-    pools = {
-        name: BufferPool(dtype, (plan.batch_size, *shape), spare=most_drafts)
-        for name, (dtype, shape) in connection.layout.items()
-    }
+    buffers.shape(connection.layout, plan.batch_size, spare=most_drafts)
     drafts: dict[int, _Draft] = {}
     quarantine = 0
 
@@ -70,7 +69,7 @@ def deliver(
             sample.payload.drop()
             return
         if slot.batch not in drafts:
-            drafts[slot.batch] = _Draft({name: pool.take() for name, pool in pools.items()}, plan.batch_size)
+            drafts[slot.batch] = _Draft(buffers.take(), plan.batch_size)
         drafts[slot.batch].fill(slot.row, sample)
 
     while not window.finished:

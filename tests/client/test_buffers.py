@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2v_client.buffers import BufferPool
+from v2v_client.buffers import BatchBuffers, BufferPool
 
 
 def address(array: np.ndarray) -> int:
@@ -94,3 +94,20 @@ def test_a_buffer_outlives_its_pool():
     del pool
     gc.collect()
     assert (array == 5).all()
+
+
+def test_batches_of_another_form_get_other_memory():
+    buffers, layout = BatchBuffers(), {"voxels": ("int8", (2, 3)), "frames": ("uint8", (5,))}
+    buffers.shape(layout, 4, spare=1)
+    first = buffers.take()
+    assert {name: (str(array.dtype), array.shape) for name, array in first.items()} == {
+        "voxels": ("int8", (4, 2, 3)),
+        "frames": ("uint8", (4, 5)),
+    }
+    place = address(first["voxels"])
+    del first
+    buffers.shape(dict(layout), 4, spare=1)
+    again = buffers.take()
+    assert address(again["voxels"]) == place
+    buffers.shape(layout, 2, spare=1)
+    assert buffers.take()["voxels"].shape == (2, 2, 3)

@@ -606,6 +606,15 @@ def test_buffers_are_used_again_when_nothing_looks_at_them():
     assert len(set(addresses)) <= 4 // 2 + 3
 
 
+def test_buffers_are_handed_from_one_epoch_to_the_next(server):
+    stream = dataset(server)
+    mine, others = ({batch.voxels.data_ptr() for _ in range(4) for batch in each} for each in (stream, dataset(server)))
+    assert len(mine) <= 8 // 4 + 3
+    assert not mine & others, "two datasets that are alive share memory"
+    assert not mine & {batch.voxels.data_ptr() for batch in copy.copy(stream)}
+    pickle.dumps(stream)
+
+
 def test_recipes_may_be_given_as_objects(server):
     recipe = Recipe(voxels_per_clip=1, bins=1, crop_height_px=2, crop_width_px=2)
     assert next(iter(dataset(server, recipe=recipe))).voxels.shape == (4, 1, 1, 2, 2)
