@@ -4,25 +4,19 @@
 
 They come in by the door that all workers use (``v2v-serve --worker-bind``) and say what all workers say, so that what
 such a server does is broker and wire and nothing else. All of them are sockets of one process: the server cannot tell,
-and 64 interpreters would only be in each other's way. They send the same memory again and again, which a processor's
-cache likes better than the fresh samples of a real worker.
-"""
+and 64 interpreters would only be in each other's way."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import socket
 import sys
 import time
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
@@ -40,11 +34,11 @@ from v2v_protocol.messages import (
     Stop,
     WorkerHello,
 )
-from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
-from v2v_server.handover import sample_message
+from v2v_server.handover import room_for, sample_message
 from v2v_server.process import die_with_parent, keep_freed_memory
+from v2v_server.produce import sample_layout
 
 CREDIT = 2
 """Leases that each of them holds at a time, like a real worker."""
@@ -161,16 +155,11 @@ def answer(lease: Lease, name: str) -> list[Any]:
         decoder="none",
         quarantine=lease.quarantine,
     )
-    arrays = _arrays(lease.spec, lease.arrays)
-    return sample_message(lease, arrays, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
-
-
-@lru_cache(maxsize=4)
-def _arrays(canonical: bytes, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
-    spec = StreamSpec.from_dict(json.loads(canonical))
-    layout = array_layout(spec.recipe, spec.voxel_dtype, names)
-    # Ones: memory that nobody wrote to is one page of zeros to the kernel, and nearly free to send.
-    return {name: np.ones(shape, dtype) for name, (dtype, shape) in layout.items()}
+    room = room_for(lease, sample_layout(lease))
+    # Memory that nobody wrote to is one page of zeros to the kernel, and nearly free to send.
+    for array in room.arrays.values():
+        array.fill(1)
+    return sample_message(lease, room, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

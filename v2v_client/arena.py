@@ -1,97 +1,125 @@
-"""Memory that a consumer shares with the server's workers on its host; the rules are in :mod:`v2v_protocol.arena`.
+"""A batch's rows in memory that the server's workers on this host may write to; the rules are in
+:mod:`v2v_protocol.arena`.
 
-It is an anonymous file that is only ever read and written by calls, never mapped: nothing of it counts as a process's
-own memory, a peer cannot make a page fault fail, and it is gone with the last process that has it open.
+It is an anonymous file whose size is sealed, so that no peer can make a page fault fail. While a batch is filled, this
+process does not map it; a batch that is whole is a private mapping of it. So what its holder writes stays his, and no
+worker can see it.
 """
 
 from __future__ import annotations
 
-import ctypes
+import mmap
 import os
-from collections import deque
-from collections.abc import Mapping
+import weakref
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.arena import ArenaName, slot_bytes
-from v2v_protocol.errors import ProtocolError
-from v2v_protocol.sample import layout_bytes
+from v2v_protocol.arena import ArenaName, Slot, array_offsets
+from v2v_protocol.sample import Layout, layout_bytes
 
-_KEEP_SIZE, _PUNCH_HOLE = 1, 2  # FALLOC_FL_*, linux/falloc.h
-_MOST_ABANDONED = 256
+_POPULATE_READ = 22
+"""MADV_POPULATE_READ of Linux 5.14, asm-generic/mman-common.h: all pages at once is cheaper than one at a time."""
 
 
 class Arena:
-    """The bytes of slots for samples of one layout. Which of them are in use is :mod:`v2v_client.slots`.
-
-    Memory: slots in use at the same time x bytes of a sample, and what late writers leave in abandoned slots.
+    """Memory for the samples of one batch. It is freed when nothing refers to this, or to arrays of it, any more.
 
     Args:
-        layout: dtype and shape of each array, in the order of the headers.
+        layout: dtype and shape of each array of one sample, in the order of the headers.
+        slots: samples of the batch.
+
+    Attributes:
+        process: id of the one that made it.
 
     Raises:
         OSError: the system has no such memory.
     """
 
-    def __init__(self, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    def __init__(self, layout: Layout, slots: int) -> None:
+        self.process = os.getpid()
+        self._layout = dict(layout)
+        self._slots = slots
+        self._sizes = {name: layout_bytes({name: form}) for name, form in layout.items()}
+        *offsets, self._bytes = array_offsets(tuple(self._sizes.values()), slots)
+        self._offsets = dict(zip(layout, offsets, strict=True))
         token = os.urandom(16).hex()
-        name = ArenaName(os.getpid(), -1, token)
-        self._descriptor = _anonymous_file(name.memory_name)
-        self.name = str(ArenaName(name.pid, self._descriptor, token))
-        self._slot_bytes = slot_bytes(layout_bytes({array: form}) for array, form in layout.items())
-        # The newest only: an older one could have been written to by a worker that slept that long.
-        self._abandoned: deque[int] = deque(maxlen=_MOST_ABANDONED)
+        memory_name = ArenaName(self.process, 0, slots, token).memory_name
+        self._descriptor = _sealed_file(memory_name, self._bytes)
+        weakref.finalize(self, os.close, self._descriptor).atexit = False
+        self._name = str(ArenaName(self.process, self._descriptor, slots, token))
 
-    def free(self, slot: int) -> None:
-        """Gives the memory of an abandoned slot back to the system, and that of earlier ones, written to since."""
-        self._abandoned.append(slot)
-        for each in self._abandoned:
-            _punch(self._descriptor, each * self._slot_bytes, self._slot_bytes)
+    def slot(self, row: int) -> Slot:
+        """What a worker is told, to put a sample into that row."""
+        return Slot(self._name, row + 1)
 
-    def read(self, slot: int, rows: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Copies a sample.
+    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Copies a sample into a row.
 
         Args:
-            slot: where it is.
-            rows: C-contiguous arrays of the layout, to be filled.
-
-        Raises:
-            ProtocolError: there is less than a sample.
+            row: of the batch.
+            arrays: C-contiguous, of the layout.
         """
-        offset = slot * self._slot_bytes
-        for name, row in rows.items():
-            rest = row.reshape(-1).view(np.uint8).data
+        for name, array in arrays.items():
+            offset, rest = self._offset(name, row), array.reshape(-1).view(np.uint8).data
+            while rest:
+                written = os.pwrite(self._descriptor, rest, offset)
+                offset, rest = offset + written, rest[written:]
+
+    def get(self, row: int) -> dict[str, npt.NDArray[Any]]:
+        """A copy of the sample in a row."""
+        sample = {name: np.empty(shape, dtype) for name, (dtype, shape) in self._layout.items()}
+        for name, array in sample.items():
+            offset, rest = self._offset(name, row), array.reshape(-1).view(np.uint8).data
             while rest:
                 count = os.preadv(self._descriptor, [rest], offset)
-                if not count:
-                    raise ProtocolError(f"slot {slot} ends {len(rest)} bytes before array {name!r} is complete")
                 offset, rest = offset + count, rest[count:]
+        return sample
 
-    def close(self) -> None:
-        """Frees the memory, as far as no worker is just writing."""
-        os.close(self._descriptor)
+    def arrays(self, unused: Callable[[], object]) -> dict[str, npt.NDArray[Any]]:
+        """The rows of each array, [slots, ...], without a copy. Writing to them changes nothing here.
+
+        As long as anything looks at them, nobody may write to the arena.
+
+        Args:
+            unused: called once nothing looks at them, in whatever thread that happens.
+        """
+        mapping = mmap.mmap(self._descriptor, self._bytes, mmap.MAP_PRIVATE)
+        with suppress(OSError):  # an older kernel maps each page as it is read
+            mapping.madvise(_POPULATE_READ)
+        weakref.finalize(mapping, unused).atexit = False
+        return {
+            name: np.frombuffer(mapping, dtype, self._slots * self._sizes[name] // np.dtype(dtype).itemsize, offset)
+            .reshape(self._slots, *shape)
+            for (name, (dtype, shape)), offset in zip(self._layout.items(), self._offsets.values(), strict=True)
+        }  # fmt: skip
+
+    def _offset(self, name: str, row: int) -> int:
+        return self._offsets[name] + row * self._sizes[name]
 
 
-def open_arena(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> Arena | None:
+def open_arena(layout: Layout, slots: int) -> Arena | None:
     """An arena; None where the system has none, and samples come in messages."""
     try:
-        return Arena(layout)
+        return Arena(layout, slots)
     except OSError:
         return None
 
 
-def _anonymous_file(name: str) -> int:
-    create = getattr(os, "memfd_create", None)  # Linux only
+def _sealed_file(name: str, size: int) -> int:
+    create = getattr(os, "memfd_create", None)  # Linux only, and so is sealing
     if create is None:
         raise OSError("this system has no memfd_create")
-    descriptor: int = create(name)
+    from fcntl import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SEAL, F_SEAL_SHRINK, fcntl
+
+    descriptor: int = create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(descriptor, size)
+        fcntl(descriptor, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)
+    except BaseException:
+        os.close(descriptor)
+        raise
     return descriptor
-
-
-def _punch(descriptor: int, offset: int, length: int) -> None:
-    """Frees part of a file. Nothing depends on it but memory, so a system that cannot is left alone."""
-    fallocate = getattr(ctypes.CDLL(None), "fallocate", None)
-    if fallocate is not None:
-        fallocate(descriptor, _PUNCH_HOLE | _KEEP_SIZE, ctypes.c_int64(offset), ctypes.c_int64(length))

@@ -4,62 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy.typing as npt
 
-from v2v_client.arena import Arena
-from v2v_client.slots import Slots
 from v2v_protocol.sample import Provenance
 
-Rows = Mapping[str, npt.NDArray[Any]]
-
-
-class Payload(Protocol):
-    """Where the arrays of a sample are. One of the two is to be called, once."""
-
-    def copy_to(self, rows: Rows) -> None:
-        """Copies every array into the row of its name: the one copy between the wire and the trainer."""
-
-    def drop(self) -> None:
-        """Does without them."""
-
 
 @dataclass(frozen=True, slots=True)
-class InMessage:
-    """They came with the header: read-only views of the received message, by name."""
+class Payload:
+    """Where the arrays of a sample are.
 
-    arrays: Rows
+    Attributes:
+        arrays: read-only views of the received message, by name; None where a worker put them into their row.
+        row_is_ours: whether no worker writes to that row any more.
+    """
 
-    def copy_to(self, rows: Rows) -> None:
-        """See :class:`Payload`."""
-        for name, array in self.arrays.items():
-            rows[name][...] = array
-
-    def drop(self) -> None:
-        """See :class:`Payload`."""
-
-
-@dataclass(frozen=True, slots=True)
-class InSlot:
-    """A worker of this host put them into our memory."""
-
-    arena: Arena
-    slots: Slots
-    slot: int
-
-    def copy_to(self, rows: Rows) -> None:
-        """See :class:`Payload`.
-
-        Raises:
-            ProtocolError: the slot holds less than a sample.
-        """
-        self.arena.read(self.slot, rows)
-        self.slots.give_back(self.slot)
-
-    def drop(self) -> None:
-        """See :class:`Payload`."""
-        self.slots.give_back(self.slot)
+    arrays: Mapping[str, npt.NDArray[Any]] | None
+    row_is_ours: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,24 +1,33 @@
-"""Batch buffers that are used again, but never while anything still looks at them.
+"""Memory for batches that is used again, but never while anything still looks at it.
 
-Fresh memory costs more than the copy into it: the kernel hands out zeroed pages one fault at a time. So a buffer whose
+Fresh memory costs more than the copy into it: the kernel hands out zeroed pages one fault at a time. So memory whose
 last user is gone goes back to its pool.
 
-How the last user is known: an array of a batch does not own its memory but refers to a small *loan* object that does
-(NumPy keeps the object behind ``__array_interface__`` alive as the array's base). Whatever is made from that array
-without copying, a view, a torch tensor, a tensor's storage, another tensor or array of the same storage, keeps the
-loan alive; its finalizer puts the memory back. No reference is counted by hand, and no promise of the user is needed.
+How the last user is known, where the memory is this process's own: an array of a batch does not own its memory but
+refers to a small *loan* object that does (NumPy keeps the object behind ``__array_interface__`` alive as the array's
+base). Whatever is made from that array without copying, a view, a torch tensor, a tensor's storage, another tensor or
+array of the same storage, keeps the loan alive; its finalizer puts the memory back. No reference is counted by hand,
+and no promise of the user is needed. Arrays of an arena refer to their mapping in the same way.
+
+A process that was forked while somebody looked at an arena may look at it for as long as it likes, and nobody here
+would know: such an arena is not used again.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import weakref
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+from v2v_client.arena import Arena, open_arena
+from v2v_protocol.arena import Slot
+from v2v_protocol.sample import Layout
 
 
 class _Loan:
@@ -61,28 +70,120 @@ class BufferPool:
         return np.asarray(loan)
 
 
+class Memory(Protocol):
+    """The rows of one batch."""
+
+    def slot(self, row: int) -> Slot | None:
+        """Where a worker of this host may put the sample of that row."""
+
+    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Copies a sample into a row."""
+
+    def whole(self) -> dict[str, npt.NDArray[Any]]:
+        """All rows of each array, once they are filled. To be called once, and nothing else after it."""
+
+
+class OwnMemory:
+    """Memory that this process alone can reach.
+
+    Args:
+        arrays: with a row for each sample, by name.
+    """
+
+    def __init__(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
+        self._arrays = arrays
+
+    def slot(self, row: int) -> Slot | None:
+        """See :class:`Memory`."""
+        return None
+
+    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """See :class:`Memory`."""
+        for name, array in arrays.items():
+            self._arrays[name][row] = array
+
+    def whole(self) -> dict[str, npt.NDArray[Any]]:
+        """See :class:`Memory`."""
+        return self._arrays
+
+
+class SharedMemory:
+    """An arena, which comes back when its batch is not used any more; one whose batch never became whole does not."""
+
+    def __init__(self, arena: Arena, free: deque[Arena]) -> None:
+        self._arena = arena
+        self._free = free
+
+    def slot(self, row: int) -> Slot | None:
+        """See :class:`Memory`."""
+        return self._arena.slot(row)
+
+    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """See :class:`Memory`."""
+        self._arena.put(row, arrays)
+
+    def get(self, row: int) -> dict[str, npt.NDArray[Any]]:
+        """A copy of what is in a row."""
+        return self._arena.get(row)
+
+    def whole(self) -> dict[str, npt.NDArray[Any]]:
+        """See :class:`Memory`."""
+        arena, free, forks = self._arena, self._free, _forks
+
+        def unused() -> None:
+            if forks == _forks:
+                free.append(arena)
+
+        return arena.arrays(unused)
+
+
 class BatchBuffers:
-    """The arrays of batches, which one iteration of a dataset leaves to the next."""
+    """The memory of a dataset's batches, which one iteration leaves to the next."""
 
     def __init__(self) -> None:
         self._form: object = None
         self._pools: dict[str, BufferPool] = {}
+        self._arenas: deque[Arena] = deque()
+        self._layout: Layout = {}
+        self._batch_size = 0
 
-    def shape(self, layout: Mapping[str, tuple[str, tuple[int, ...]]], batch_size: int, spare: int) -> None:
-        """Makes the next arrays ones for batches of that many samples; memory of another form is let go.
+    def shape(self, layout: Layout, batch_size: int, spare: int) -> None:
+        """What is taken from now on is for batches of that many samples; memory of another form is let go.
 
         Args:
-            layout: dtype and shape of each array of one sample.
+            layout: of one sample.
             batch_size: samples of a batch.
             spare: most batches kept while nobody uses them.
         """
         form = dict(layout), batch_size, spare
         if form != self._form:
-            self._form = form
+            self._form, self._layout, self._batch_size = form, layout, batch_size
+            self._arenas = deque(maxlen=spare)
             self._pools = {
                 name: BufferPool(dtype, (batch_size, *shape), spare) for name, (dtype, shape) in layout.items()
             }
 
-    def take(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays for a batch, of unspecified content, by name; see :meth:`BufferPool.take`."""
-        return {name: pool.take() for name, pool in self._pools.items()}
+    def own(self) -> OwnMemory:
+        """Memory for a batch, of unspecified content, that no other process can reach."""
+        return OwnMemory({name: pool.take() for name, pool in self._pools.items()})
+
+    def shared(self) -> SharedMemory | None:
+        """The same, with slots for the workers of this host; None where the system has no such memory."""
+        while self._arenas:
+            arena = self._arenas.pop()
+            if arena.process == os.getpid():  # otherwise the process that this one was forked from may go on with it
+                return SharedMemory(arena, self._arenas)
+        opened = open_arena(self._layout, self._batch_size)
+        return None if opened is None else SharedMemory(opened, self._arenas)
+
+
+_forks = 0
+
+
+def _note_fork() -> None:
+    global _forks
+    _forks += 1
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_note_fork)

@@ -12,7 +12,7 @@ Rules
 
 Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
 answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again. Workers on
-this host put them into memory that is lent to them (:mod:`v2v_client.lending`).
+this host put them into slots that are lent to them (:mod:`v2v_client.lending`).
 
 A connection belongs to the process that made it; its ZeroMQ context is made when it is opened, never before a fork.
 """
@@ -23,18 +23,18 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
 import zmq
 
-from v2v_client.arena import open_arena
 from v2v_client.arrival import Arrival
 from v2v_client.lending import Lending
 from v2v_client.link import Link
 from v2v_client.liveness import Due, Liveness, Patience
 from v2v_client.state import Stream
+from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.messages import (
     ErrorCode,
@@ -49,14 +49,13 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
 )
-from v2v_protocol.sample import Provenance, SampleId, array_layout
+from v2v_protocol.sample import Layout, Provenance, SampleId, array_layout
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
 _MOST_CREDIT_REFUSALS = 3
-
-Layout = dict[str, tuple[str, tuple[int, ...]]]
+_NO_SLOTS: Mapping[int, Slot] = {}
 
 
 class Connection:
@@ -69,7 +68,6 @@ class Connection:
         pinned: the stream that the server must offer; None takes what it offers.
         pinned_by: what pinned it, in words, for the message of a mismatch.
         patience: when to ping, to ask again and to give up.
-        shared_memory: whether workers on this host may put samples into memory of this process.
         clock: seconds, never going back.
 
     Attributes:
@@ -91,7 +89,6 @@ class Connection:
         pinned: Stream | None = None,
         pinned_by: str = "this dataset",
         patience: Patience | None = None,
-        shared_memory: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._address = address
@@ -103,8 +100,7 @@ class Connection:
         self._patience = patience or Patience()
         self._clock = clock
         self._process = os.getpid()
-        self._shared_memory = shared_memory
-        self._lending = Lending(None)
+        self._lending = Lending()
         self._link: Link | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._liveness = Liveness(self._patience, clock())
@@ -144,7 +140,6 @@ class Connection:
             self.layout = self._layout(self._pinned)
             largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
             self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, largest)
-            self._lending = Lending(open_arena(self.layout) if self._shared_memory else None)
             self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
         except BaseException:
@@ -176,28 +171,31 @@ class Connection:
         link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
 
     def close(self) -> None:
-        """Leaves the server and frees socket, context, thread and arena. May be called again, and in a forked child,
-        where it does nothing."""
+        """Leaves the server and frees socket, context and thread. May be called again, and in a forked child, where it
+        does nothing."""
         if os.getpid() != self._process:
             return
         link, self._link = self._link, None
-        try:
-            if link is not None:
+        if link is not None:
+            try:
                 self._leave(link)
-        finally:
-            if link is not None:
+            finally:
                 link.close()
-            self._lending.close()
 
     # --- asking and receiving -----------------------------------------------------------------------------------------
 
-    def want(self, indices: Iterable[int]) -> None:
+    def want(self, indices: Iterable[int], slots: Mapping[int, Slot] = _NO_SLOTS) -> None:
         """Asks for samples, as soon as the credit allows.
+
+        Args:
+            indices: of the samples.
+            slots: where some of them may come to lie, if they were never asked for before.
 
         Raises:
             ServerLost: this connection was closed.
         """
         self._queued.extend(indices)
+        self._lending.offer(slots)
         if self._welcome_due is not None:
             return
         room = self.credit - len(self._asked)
@@ -330,18 +328,18 @@ class Connection:
         self._welcome_due = None
         self._want_again()
 
-    def _sample(self, header: SampleHeader, payload: list[zmq.Frame]) -> Arrival | None:
+    def _sample(self, header: SampleHeader, frames: list[zmq.Frame]) -> Arrival | None:
         if header.epoch != self._epoch:
             self.strays += 1
             return None
-        found = layout_of(header)
-        if list(found.items()) != list(self.layout.items()):  # in a slot, the order says which is which
+        layout = layout_of(header)
+        if list(layout.items()) != list(self.layout.items()):  # in a slot, the order says which is which
             raise ProtocolError(
-                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {found}; asked: {self.layout}"
+                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {layout}; asked: {self.layout}"
             )
         again = header.index not in self._asked
-        arrays = self._lending.payload(header, payload)
-        if arrays is None:
+        found = self._lending.payload(header, frames)
+        if found is None:
             self.strays += 1
             self._ask_on(again)
             return None
@@ -361,7 +359,7 @@ class Connection:
         self._credit_refusals = 0
         self._last = header.index
         self._ask_on(again)
-        return Arrival(header.index, arrays, provenance, header.worker, header.cpu_seconds, header.decoded)
+        return Arrival(header.index, found, provenance, header.worker, header.cpu_seconds, header.decoded)
 
     def _ask_on(self, again: bool) -> None:
         """After a sample; one that comes again held credit that we took for free."""

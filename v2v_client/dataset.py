@@ -79,6 +79,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         at the server, not yet sent    C S
         between iterations             (ceil(C / batch_size) + 2) batch_size S: buffers, kept for the next
 
+    Where workers on this host put samples into memory of this process, the first and the third are next to nothing.
+
     Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses),
     SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream than the one begun),
     ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a loader worker,
@@ -265,7 +267,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
             patience=self._patience,
-            shared_memory=self._shared_memory,
         )
         try:
             connection.open()
@@ -284,7 +285,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
             def after(batch: int, quarantine: int) -> dict[str, Any]:
                 return consumer.after(stream, epoch, plan, batch, quarantine).to_dict()
 
-            delivered = deliver(connection, plan, batches, epoch, after, self._buffers)
+            delivered = deliver(
+                connection, plan, batches, epoch, after, self._buffers, shared_memory=self._shared_memory
+            )
             for batch, number in zip(delivered, batches, strict=True):
                 done += 1
                 seen = batch.resume_state["quarantine"]

@@ -11,28 +11,60 @@ import torch
 
 from v2v_client.arrival import Arrival
 from v2v_client.batch import Batch
-from v2v_client.buffers import BatchBuffers
+from v2v_client.buffers import BatchBuffers, Memory, SharedMemory
 from v2v_client.connection import Connection
 from v2v_client.ordering import ReorderWindow
 from v2v_client.world import EpochPlan
+from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.sample import Provenance
 
 
 class _Draft:
-    """A batch being filled."""
+    """A batch being filled.
 
-    def __init__(self, arrays: dict[str, npt.NDArray[Any]], samples: int) -> None:
-        self.arrays = arrays
+    Workers may put samples into the slots of its memory. Where a sample came otherwise, and a worker may still write to
+    its slot, the batch moves to memory of its own.
+    """
+
+    def __init__(self, buffers: BatchBuffers, samples: int, *, shared: bool) -> None:
+        self._buffers = buffers
+        self._memory: Memory = (buffers.shared() if shared else None) or buffers.own()
+        self._left: SharedMemory | None = None
         self.provenance: list[Provenance | None] = [None] * samples
         self.cpu_seconds = 0.0
         self.decodes = 0
+        self.in_place = 0  # samples that a worker put into their row
+
+    def slot(self, row: int) -> Slot | None:
+        """For the sample of a row, when it is asked for."""
+        return self._memory.slot(row)
 
     def fill(self, row: int, sample: Arrival) -> None:
-        sample.payload.copy_to({name: array[row] for name, array in self.arrays.items()})
+        payload = sample.payload
+        if not payload.row_is_ours:
+            self._leave()
+        if payload.arrays is not None:
+            self._memory.put(row, payload.arrays)
+        else:
+            self.in_place += 1
+            if self._left is not None:
+                self._memory.put(row, self._left.get(row))
         self.provenance[row] = sample.provenance
         self.cpu_seconds += sample.cpu_seconds
         self.decodes += sample.decoded
+
+    def _leave(self) -> None:
+        left = self._memory
+        if isinstance(left, SharedMemory):
+            self._left, self._memory = left, self._buffers.own()
+            for row, there in enumerate(self.provenance):
+                if there is not None:
+                    self._memory.put(row, left.get(row))
+
+    def whole(self) -> dict[str, npt.NDArray[Any]]:
+        """All of it; to be called once."""
+        return self._memory.whole()
 
 
 def deliver(
@@ -42,6 +74,8 @@ def deliver(
     epoch: int,
     resume_state: Callable[[int, int], Mapping[str, Any]],
     buffers: BatchBuffers,
+    *,
+    shared_memory: bool = True,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Batch]:
     """The batches of an open connection, in order.
@@ -52,6 +86,7 @@ def deliver(
         epoch: of the samples.
         resume_state: the state after a batch, by its number and the newest quarantine snapshot seen up to it.
         buffers: for the batches.
+        shared_memory: whether workers of this host may put samples into memory of this process.
         clock: seconds, for ``Batch.wait_seconds``.
 
     Raises:
@@ -61,31 +96,39 @@ def deliver(
     most_drafts = -(-connection.credit // plan.batch_size) + 2
     buffers.shape(connection.layout, plan.batch_size, spare=most_drafts)
     drafts: dict[int, _Draft] = {}
-    quarantine = 0
+    quarantine, lend = 0, shared_memory
+
+    def ask() -> None:
+        asked, slots = window.ask(), {}
+        for index in asked:
+            place = window.place(index)
+            if place.batch not in drafts:
+                drafts[place.batch] = _Draft(buffers, plan.batch_size, shared=lend)
+            slot = drafts[place.batch].slot(place.row)
+            if slot is not None:
+                slots[index] = slot
+        connection.want(asked, slots)
 
     def accept(sample: Arrival) -> None:
-        slot = window.receive(sample.index)
-        if slot is None:
-            sample.payload.drop()
-            return
-        if slot.batch not in drafts:
-            drafts[slot.batch] = _Draft(buffers.take(), plan.batch_size)
-        drafts[slot.batch].fill(slot.row, sample)
+        place = window.receive(sample.index)
+        if place is not None:
+            drafts[place.batch].fill(place.row, sample)
 
     while not window.finished:
         began = clock()
-        connection.want(window.ask())
+        ask()
         # What came while the trainer was busy; asking for more before it is busy again keeps the server at work.
         while (sample := connection.receive(wait=False)) is not None:
             accept(sample)
-            connection.want(window.ask())
+            ask()
         while (number := window.take()) is None:
             if (sample := connection.receive()) is not None:
                 accept(sample)
-                connection.want(window.ask())
-        connection.want(window.ask())
+                ask()
+        ask()
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
         draft = drafts.pop(number)
+        lend = lend and draft.in_place > 0  # workers elsewhere have no use for it, and a message is cheaper without
         quarantine = max([quarantine, *(item.quarantine for item in draft.provenance if item is not None)])
         yield _finished(draft, plan.indices(number), epoch, resume_state(number, quarantine), clock() - began)
 
@@ -96,7 +139,7 @@ def _finished(
     provenance = tuple(item for item in draft.provenance if item is not None)
     if len(provenance) != len(indices):
         raise ProtocolError(f"a batch of {len(indices)} samples has {len(provenance)}: the reorder window is at fault")
-    tensors = {name: torch.from_numpy(array) for name, array in draft.arrays.items()}
+    tensors = {name: torch.from_numpy(array) for name, array in draft.whole().items()}
     return Batch(
         voxels=tensors.get("voxels"),
         frames=tensors.get("frames"),

@@ -23,7 +23,7 @@ _REQUESTS_A_CREDIT = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
+class Place:
     """Where a sample belongs: its batch, and the row in it."""
 
     batch: int
@@ -59,7 +59,7 @@ class ReorderWindow:
         self._asking = 0  # place in ``batches`` of the batch being asked for
         self._unasked: list[int] = []  # the rest of that batch, next one last
         self._taken = 0  # batches delivered
-        self._slots: dict[int, Slot] = {}  # samples asked for, until their batch is taken
+        self._places: dict[int, Place] = {}  # samples asked for, until their batch is taken
         self._outstanding: dict[int, None] = {}  # of those, the ones not received, in the order asked
         self._missing: dict[int, int] = {}  # batch -> rows not received
         self.duplicates = 0
@@ -84,7 +84,7 @@ class ReorderWindow:
         asked: list[int] = []
         room = min(
             self._credit - len(self._outstanding),
-            self._credit + self._batch_size - len(self._slots),
+            self._credit + self._batch_size - len(self._places),
         )
         if room < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
             return ()
@@ -93,7 +93,7 @@ class ReorderWindow:
                 break
             index = self._unasked.pop()
             batch = self._batches[self._asking - 1]
-            self._slots[index] = Slot(batch, self._batch_size - len(self._unasked) - 1)
+            self._places[index] = Place(batch, self._batch_size - len(self._unasked) - 1)
             self._outstanding[index] = None
             asked.append(index)
         return tuple(asked)
@@ -107,20 +107,24 @@ class ReorderWindow:
         self._asking += 1
         return True
 
-    def receive(self, index: int) -> Slot | None:
+    def place(self, index: int) -> Place:
+        """Where a sample belongs that was asked for."""
+        return self._places[index]
+
+    def receive(self, index: int) -> Place | None:
         """A sample arrived: the place of its bytes, or None when it is to be dropped."""
         if index not in self._outstanding:
             # A sample of a batch that left is a second copy too, but remembering all of those would cost memory
             # without end; it counts as one that nobody asks for.
-            if index in self._slots:
+            if index in self._places:
                 self.duplicates += 1
             else:
                 self.strays += 1
             return None
         del self._outstanding[index]
-        slot = self._slots[index]
-        self._missing[slot.batch] -= 1
-        return slot
+        place = self._places[index]
+        self._missing[place.batch] -= 1
+        return place
 
     def take(self) -> int | None:
         """The number of the next batch, if it is complete; it leaves the window."""
@@ -131,6 +135,6 @@ class ReorderWindow:
             return None
         del self._missing[batch]
         for index in self._indices(batch):
-            del self._slots[index]
+            del self._places[index]
         self._taken += 1
         return batch

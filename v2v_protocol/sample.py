@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,8 @@ LARGEST_INDEX = 2**48 - 1
 ARRAYS = ("voxels", "frames", "flow", "flow_valid")
 """Arrays a consumer may ask for."""
 DEFAULT_ARRAYS = ("voxels", "frames")
+Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
+"""dtype and shape of each array of one sample, by name, in the order of the headers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +226,7 @@ def _fields(item: Any) -> dict[str, Any]:
     return {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
 
 
-def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> dict[str, tuple[str, tuple[int, ...]]]:
+def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> Layout:
     """dtype and shape of each asked array of one sample (no batch dimension).
 
     voxels [T + lead_voxels, bins, H, W] in ``voxel_dtype``; frames [T + lead_frames, 1, H, W] uint8; flow [T, 2, H, W]
@@ -248,7 +250,7 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> d
     return {name: known[name] for name in arrays}
 
 
-def layout_bytes(layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> int:
+def layout_bytes(layout: Layout) -> int:
     """Bytes of one sample of that layout."""
     return sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
 

@@ -46,6 +46,7 @@ LARGEST_HEADER_BYTES = 1 << 20
 LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
+_DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _MOST_ARRAYS = 8
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
@@ -113,14 +114,14 @@ def encode_sample(
     """
     shapes: list[int] = []
     for name, array in arrays.items():
-        if array.dtype.name not in ARRAY_DTYPES or not array.flags.c_contiguous:
+        if array.dtype not in _DTYPE_NAMES or not array.flags.c_contiguous:
             raise LimitExceeded(f"array {name}: dtype {array.dtype} (allowed: {', '.join(ARRAY_DTYPES)}), C-contiguous")
         shapes += [array.ndim, *array.shape]
     header = SampleHeader(
         epoch=epoch,
         index=index,
         names=tuple(arrays),
-        dtypes=tuple(array.dtype.name for array in arrays.values()),
+        dtypes=tuple(_DTYPE_NAMES[array.dtype] for array in arrays.values()),
         shapes=tuple(shapes),
         provenance=provenance,
         worker=worker,
@@ -224,8 +225,10 @@ Check: TypeAlias = Callable[[str, Any], Any]
 def _check_nesting(fields: dict[Any, Any]) -> None:
     level: list[Any] = [fields]
     for _ in range(_DEEPEST_NESTING):
-        inner = (item for outer in level for item in (outer.values() if type(outer) is dict else outer))
-        level = [item for item in inner if type(item) in (dict, list)]
+        inner: list[Any] = []
+        for outer in level:
+            inner.extend(outer.values() if type(outer) is dict else outer)
+        level = [item for item in inner if type(item) is dict or type(item) is list]
         if not level:
             return
     raise LimitExceeded(f"a header nested more than {_DEEPEST_NESTING} deep")

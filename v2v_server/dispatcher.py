@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.arena import LARGEST_SLOT, ArenaName, Slot
+from v2v_protocol.arena import ArenaName, Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
@@ -368,9 +368,9 @@ def _slots(want: Want) -> list[Slot]:
     """
     if not want.slots:
         return []
-    ArenaName.parse(want.arena)
-    if len(want.slots) != len(want.indices) or not all(0 < number <= LARGEST_SLOT for number in want.slots):
-        raise ProtocolError(f"want.slots: {len(want.slots)} for {len(want.indices)} indices, each 1 to {LARGEST_SLOT}")
+    most = ArenaName.parse(want.arena).slots
+    if len(want.slots) != len(want.indices) or not all(0 < number <= most for number in want.slots):
+        raise ProtocolError(f"want.slots: {len(want.slots)} for {len(want.indices)} indices, each 1 to {most}")
     return [Slot(want.arena, number) for number in want.slots]
 
 

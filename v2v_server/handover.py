@@ -1,91 +1,143 @@
-"""The worker's end of a slot: a finished sample goes into its consumer's memory, or where that fails, into the message.
+"""The worker's end of a slot: a sample is made in its consumer's memory, or where that cannot be reached, in its own.
 
-The arena is opened anew for each sample, which takes some microseconds: nothing is kept that would hold the memory of a
-consumer that is gone, or have to be tidied up after a worker that is killed.
+The arena is opened and mapped anew for each sample, which takes a fifth of a millisecond: nothing is kept that would
+hold the memory of a consumer that is gone, or have to be tidied up after a worker that is killed.
 """
 
 from __future__ import annotations
 
+import mmap
 import os
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.arena import NO_SLOT, ArenaName, slot_bytes
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
+from v2v_protocol.sample import Layout, layout_bytes
 from v2v_protocol.wire import Frames, encode_sample
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Where a sample is made.
+
+    Attributes:
+        arrays: C-contiguous, of its layout, of unspecified content. Memory of another process is let go with them.
+        in_slot: whether they are the slot that the lease names.
+    """
+
+    arrays: Mapping[str, npt.NDArray[Any]]
+    in_slot: bool
+
+
+def room_for(lease: Lease, layout: Layout) -> Room:
+    """The lease's slot, where it names one that can be reached; fresh memory otherwise.
+
+    Args:
+        lease: what was asked.
+        layout: of its sample.
+    """
+    if lease.slot != NO_SLOT:
+        there = slot_arrays(Slot(lease.arena, lease.slot), layout)
+        if there is not None:
+            return Room(there, in_slot=True)
+    return Room({name: np.empty(shape, dtype) for name, (dtype, shape) in layout.items()}, in_slot=False)
 
 
 def sample_message(
     lease: Lease,
-    arrays: Mapping[str, npt.NDArray[Any]],
+    room: Room,
     *,
     provenance: Mapping[str, Any],
     worker: str,
     cpu_seconds: float,
     decoded: bool = True,
 ) -> Frames:
-    """The frames of a lease's sample; its arrays are in the slot that the lease names, where that can be reached.
+    """The frames of a lease's sample. Who sends them writes to the room no more.
 
     Args:
         lease: what was asked.
-        arrays: of the sample, C-contiguous.
+        room: where its sample was made.
         provenance, worker, cpu_seconds, decoded: see :class:`v2v_protocol.messages.SampleHeader`.
     """
     return encode_sample(
         epoch=lease.epoch,
         index=lease.indices[0],
-        arrays=arrays,
+        arrays=room.arrays,
         provenance=provenance,
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
         slot=lease.slot,
-        in_slot=lease.slot != NO_SLOT and put(lease.arena, lease.slot, arrays),
+        in_slot=room.in_slot,
     )
 
 
-def put(arena: str, slot: int, arrays: Mapping[str, npt.NDArray[Any]]) -> bool:
-    """Writes the arrays into a slot, one after the other.
+def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | None:
+    """The slot's arrays, mapped.
 
     Returns:
-        False where that was not possible: the arena is not on this host, not this user's, gone, or memory ran out.
+        None where that is not possible: the arena is not on this host, not this user's, gone, of another size, or could
+        be cut short by its owner while we write.
     """
     try:
-        name = ArenaName.parse(arena)
-        with closing(_Arena(name)) as opened:
-            opened.write(slot * slot_bytes(array.nbytes for array in arrays.values()), arrays)
+        name = ArenaName.parse(slot.arena)
+        if not 0 < slot.number <= name.slots:
+            return None
+        sizes = {array: layout_bytes({array: form}) for array, form in layout.items()}
+        *offsets, total = array_offsets(tuple(sizes.values()), name.slots)
+        with closing(_Arena(name, total)) as arena:
+            return {
+                array: arena.map(offset + (slot.number - 1) * sizes[array], sizes[array]).view(dtype).reshape(shape)
+                for (array, (dtype, shape)), offset in zip(layout.items(), offsets, strict=True)
+            }
     except (OSError, ProtocolError):
-        return False
-    return True
+        return None
 
 
 class _Arena:
     """An open arena.
 
     Raises:
-        OSError: it is not there.
+        OSError: it is not there, not of that many bytes, or its size is not sealed.
     """
 
-    def __init__(self, name: ArenaName) -> None:
+    def __init__(self, name: ArenaName, size: int) -> None:
         # The link is read first: opening something else, a device or a pipe, may have effects of its own.
         if os.readlink(name.path) != name.link:
             raise FileNotFoundError(name.path)
-        self._descriptor = os.open(name.path, os.O_WRONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        if os.readlink(f"/proc/self/fd/{self._descriptor}") != name.link:
+        self._descriptor = os.open(name.path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
+            if os.readlink(f"/proc/self/fd/{self._descriptor}") != name.link:
+                raise FileNotFoundError(name.path)
+            _require_sealed(self._descriptor, size)
+        except BaseException:
             self.close()
-            raise FileNotFoundError(name.path)
+            raise
 
-    def write(self, offset: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        for array in arrays.values():
-            rest = array.reshape(-1).view(np.uint8).data
-            while rest:
-                written = os.pwrite(self._descriptor, rest, offset)
-                offset, rest = offset + written, rest[written:]
+    def map(self, offset: int, size: int) -> npt.NDArray[np.uint8]:
+        """Bytes of the arena; unmapped when nothing refers to them any more."""
+        begin = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
+        # All pages at once: taken one by one as they are written, they cost more than copying the sample.
+        flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
+        mapping = mmap.mmap(self._descriptor, offset - begin + size, flags, offset=begin)
+        return np.frombuffer(mapping, np.uint8, size, offset - begin)
 
     def close(self) -> None:
         os.close(self._descriptor)
+
+
+def _require_sealed(descriptor: int, size: int) -> None:
+    """A page beyond the end of a file cannot be written to: that would be the end of this process."""
+    from fcntl import F_GET_SEALS, F_SEAL_SHRINK, fcntl  # of Linux, like arenas
+
+    if not fcntl(descriptor, F_GET_SEALS) & F_SEAL_SHRINK:
+        raise OSError("its size is not sealed")
+    if os.fstat(descriptor).st_size != size:
+        raise OSError(f"it is not of {size} bytes")

@@ -6,7 +6,7 @@ Server workers and `v2v-simulate` both come through here, which is why a sample 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams
+from v2v_protocol.sample import Layout, Provenance, Refusal, Sample, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.scene_choice import FlowPlan, plan_flow
@@ -123,8 +123,26 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decode
     return tuple(Decoded(draft, clip) for draft, clip in zip(drafts, clips, strict=True))
 
 
-def make_sample(lease: Lease, decoded: Decoded) -> Sample:
+def sample_layout(lease: Lease) -> Layout:
+    """dtype and shape of each array of a lease's sample.
+
+    Raises:
+        ProtocolError: the lease asks for an array that nobody makes.
+    """
+    spec = _spec(lease.spec)
+    try:
+        return array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
+    except UsageError as error:
+        raise ProtocolError(f"lease {lease.lease}: {error}") from error
+
+
+def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
     """Makes a lease's sample of what was decoded for it: view, flow, simulation.
+
+    Args:
+        lease: the work.
+        decoded: what was decoded for it.
+        into: C-contiguous arrays for the sample, of :func:`sample_layout`; None makes them.
 
     Raises:
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
@@ -144,26 +162,26 @@ def make_sample(lease: Lease, decoded: Decoded) -> Sample:
         if not lease.frames_per_second:
             raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe needs seconds")
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    if into is None:
+        into = {name: np.empty(shape, dtype) for name, (dtype, shape) in sample_layout(lease).items()}
     saturated = 0
-    for name in lease.arrays:
+    for name, array in into.items():
         if name == "voxels":
             try:
-                arrays[name], saturated = simulate_clip(view, params, recipe, draft.spec.voxel_dtype, seconds)
+                saturated = simulate_clip(view, params, recipe, draft.spec.voxel_dtype, seconds, array).saturated_bins
             except UsageError as error:
                 # The recipe was checked; what is left is what the corpus says of the video: thresholds, time stamps.
                 raise VideoError(lease.video, None, f"cannot be simulated: {error}") from error
         elif name == "frames":
-            arrays[name] = view[source[list(recipe.target_steps)], None]
+            # These indices are those of frames that are there; checking them once more would cost a copy.
+            np.take(view, source[list(recipe.target_steps)], axis=0, out=array[:, 0], mode="clip")
         elif name == "flow" and flow is not None:
-            arrays[name] = flow.flow
+            array[...] = flow.flow
         elif name == "flow_valid" and flow is not None and flow.valid is not None:
-            arrays[name] = flow.valid
-        else:
-            raise ProtocolError(f"lease {lease.lease} asks for an array {name!r} that this worker does not make")
+            array[...] = flow.valid
     codec = decoded.clip.codec
     return Sample(
-        arrays=arrays,
+        arrays=into,
         provenance=Provenance(
             id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
             video=lease.video,

@@ -36,10 +36,10 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode
 from v2v_server.clips import Clips
-from v2v_server.handover import sample_message
+from v2v_server.handover import room_for, sample_message
 from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, keep_freed_memory, take_long_turns
-from v2v_server.produce import make_sample
+from v2v_server.produce import make_sample, sample_layout
 from v2v_server.warm_up import warm_up_in_turn
 
 CREDIT = 2
@@ -108,9 +108,8 @@ class Worker:
     def _receive(self, wait_seconds: float) -> None:
         """Takes every message that is there, waiting for the first one at most this long."""
         timeout = int(wait_seconds * 1000)
-        if not self._socket.poll(timeout):
-            if timeout:
-                self._send(encode(Ping()))
+        if timeout and not self._socket.poll(timeout):
+            self._send(encode(Ping()))
             return
         while self._socket.poll(0):
             frames = self._socket.recv_multipart()
@@ -138,23 +137,25 @@ class Worker:
         note(self._logbook, lease.lease)
         self._send(encode(Begun(lease.lease)))
         self._make(lease)
-        # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to Python's
-        # collector, which waits for many, but each holds pictures.
-        gc.collect()
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
 
     def _make(self, lease: Lease) -> None:
+        room = room_for(lease, sample_layout(lease))
         started = time.process_time()
         try:
             clip, decoded = self._clips.take(lease)
-            sample = make_sample(lease, clip)
+            if decoded:
+                # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
+                # Python's collector, which waits for many, but each holds pictures.
+                gc.collect()
+            sample = make_sample(lease, clip, room.arrays)
         except VideoError as error:
             self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
             return
         cpu_seconds = time.process_time() - started
         frames = sample_message(
             lease,
-            sample.arrays,
+            room,
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=cpu_seconds,

@@ -40,12 +40,14 @@ def test_a_codec_that_is_not_installed_is_skipped_with_the_reason(monkeypatch: p
     [(0.05, 0.10, 0), (0.051, 0.10, 1), (0.04, 0.11, 1), (0.06, 0.2, 2), (0.04, None, 0)],
 )
 def test_bars(exact: float, fastest: float | None, missed: int) -> None:
-    assert len(transport.missed_bars({"share_of_exact": exact, "share_of_fastest": fastest})) == missed
+    records = [{"name": "fast, at work", "preset": "fast", "share": fastest}] if fastest is not None else []
+    records += [{"name": "exact, at work", "preset": "exact", "share": exact}, {"name": "message"}]
+    assert len(transport.missed_bars(records)) == missed
 
 
 @pytest.mark.slow
 def test_what_arrives_on_each_route(tmp_path: Path) -> None:
-    _, samples = transport.production(clips(tmp_path / "clips"), "full", RECIPE, 0.01, keep=3)
+    samples = transport.some_samples(clips(tmp_path / "clips"), "full", RECIPE, 3)
     whole = 3 * sum(array.nbytes for array in samples[0].arrays.values())
     for route in transport.ROUTES:
         if route.codec and route.codec not in HERE:
@@ -64,7 +66,7 @@ def test_what_arrives_on_each_route(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
-    _, samples = transport.production(clips(tmp_path / "clips"), "full", RECIPE, 0.01, keep=1)
+    samples = transport.some_samples(clips(tmp_path / "clips"), "full", RECIPE, 1)
     with pytest.raises(UsageError, match="the sender ended with status 1"):
         travel(Route("broken", codec="none of them"), samples, batch_size=3, seconds=0.1)
 
@@ -78,13 +80,16 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert transport.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) in (0, 1)
     found = records(out)
     assert [record["name"] for record in found] == [
-        transport.STANDING,
-        transport.IN_MESSAGES,
+        "exact, at work",
+        "fast, at work",
+        transport.NULL_SHARED,
+        transport.NULL_MESSAGES,
         "message",
         "shared memory",
     ]
-    assert all(record["share_of_exact"] > 0 for record in found)
-    assert found[2]["wire_bytes_per_batch"] == 3 * (4 * 5 + 4) * 32 * 40
+    assert all(0 < record["share"] < 1 and record["making_cpu_seconds_per_batch"] > 0 for record in found[:2])
+    assert all(record["cpu_seconds_per_batch"] > 0 for record in found)
+    assert found[4]["wire_bytes_per_batch"] == 3 * (4 * 5 + 4) * 32 * 40
     assert is_picture(picture)
 
 

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import zmq
 
-from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Goodbye, Hello, Message, Ping, Pong, Refused, Unavailable, Want, Welcome
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, encode, encode_sample
+from v2v_server.handover import slot_arrays
 
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=2, bins=2, crop_height_px=4, crop_width_px=6))
 _IDLE_MS = 5
@@ -41,6 +42,7 @@ class _Session:
         self.hello = hello
         self.spec = spec
         self.unanswered: dict[tuple[int, int], None] = {}
+        self.slots: dict[tuple[int, int], Slot] = {}
 
 
 class FakeServer:
@@ -58,8 +60,12 @@ class FakeServer:
         refuse_repeat: refuses, once and for credit, a request that repeats an index.
         overstated: Welcome grants this much more than is accepted.
         alter: changes the frames of a sample before they are sent.
+        workers: where they are: "here" they put samples into the slots that are lent, "elsewhere" they cannot and send
+            them, "many" is both, and some samples are made by a second worker, which knows of no slot.
         hellos, wants: what came, in order.
         slots: the slots that came with them.
+        arenas: of those, in the order in which they were first named, again where another came in between.
+        lost: slots of dropped samples.
         most_unanswered: largest number of unanswered samples of one session.
     """
 
@@ -78,10 +84,13 @@ class FakeServer:
         self.refuse_repeat = False
         self.overstated = 0
         self.alter: Callable[[list[Any]], list[Any]] = lambda frames: frames
+        self.workers = "here"
         self.hellos: list[Hello] = []
         self.goodbyes = 0
         self.wants: list[tuple[int, int]] = []
         self.slots: list[int] = []
+        self.arenas: list[str] = []
+        self.lost: list[Slot] = []
         self.most_unanswered = 0
         self.refused_for_credit = 0
         self._random = random.Random(7)
@@ -211,6 +220,9 @@ class FakeServer:
         repeats = any(key in self.wants for key in asked)
         self.wants += asked
         self.slots += want.slots or (NO_SLOT,) * len(asked)
+        if want.arena and self.arenas[-1:] != [want.arena]:
+            self.arenas.append(want.arena)
+        session.slots |= {key: Slot(want.arena, number) for key, number in zip(asked, want.slots, strict=False)}
         if any(index >= self.sequences for index in want.indices):
             self._send(identity, encode(Refused(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
             return
@@ -242,25 +254,43 @@ class FakeServer:
 
     def _answer(self, identity: bytes, session: _Session, epoch: int, index: int) -> None:
         del session.unanswered[epoch, index]
+        slot = session.slots.pop((epoch, index), None)
         if index in self.unavailable:
             self._send(identity, encode(Unavailable(epoch, index, "a.mp4 at frame 3: truncated")))
             return
         if (epoch, index) in self.drop:
             self.drop.remove((epoch, index))
+            self.lost += [] if slot is None else [slot]
             return
-        frames = self.alter(self.sample(session, epoch, index))
+        frames = self.alter(self.sample(session, epoch, index, slot))
         for _ in range(2 if (epoch, index) in self.twice else 1):
             self._send(identity, frames)
 
-    def sample(self, session: _Session, epoch: int, index: int) -> list[Any]:
+    def sample(self, session: _Session, epoch: int, index: int, slot: Slot | None) -> list[Any]:
         seed = session.hello.seed
+        arrays = {name: expected(name, seed, epoch, index, session.spec) for name in session.hello.arrays}
+        place = self._random.randrange(3) if self.workers == "many" else ("here", "elsewhere").index(self.workers)
+        in_slot = slot is not None and place == 0 and _put(slot, arrays, session)
+        if slot is not None and place == 2:
+            _put(slot, {name: np.full_like(array, 101) for name, array in arrays.items()}, session)  # the first worker
+            slot = None
         identity = SampleId(session.spec.digest, self.catalogue, 1, seed, epoch, index)
         provenance = Provenance(identity, "a.mp4", "7:00", 0, 0, (), _PARAMS, 0, 0, "h264 exact")
         return encode_sample(
             epoch=epoch,
             index=index,
-            arrays={name: expected(name, seed, epoch, index, session.spec) for name in session.hello.arrays},
+            arrays=arrays,
             provenance=provenance.to_dict(),
             worker="fake",
             cpu_seconds=0.25,
+            slot=NO_SLOT if slot is None else slot.number,
+            in_slot=in_slot,
         )
+
+
+def _put(slot: Slot, arrays: dict[str, np.ndarray[Any, Any]], session: _Session) -> bool:
+    there = slot_arrays(slot, array_layout(session.spec.recipe, session.spec.voxel_dtype, tuple(arrays)))
+    for name, array in arrays.items():
+        if there is not None:
+            there[name][...] = array
+    return there is not None

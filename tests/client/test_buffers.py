@@ -1,10 +1,12 @@
 import gc
+import os
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
 
-from v2v_client.buffers import BatchBuffers, BufferPool
+from v2v_client.buffers import BatchBuffers, BufferPool, Memory, SharedMemory
 
 
 def address(array: np.ndarray) -> int:
@@ -96,18 +98,128 @@ def test_a_buffer_outlives_its_pool():
     assert (array == 5).all()
 
 
-def test_batches_of_another_form_get_other_memory():
-    buffers, layout = BatchBuffers(), {"voxels": ("int8", (2, 3)), "frames": ("uint8", (5,))}
-    buffers.shape(layout, 4, spare=1)
-    first = buffers.take()
-    assert {name: (str(array.dtype), array.shape) for name, array in first.items()} == {
+LAYOUT = {"voxels": ("int8", (2, 3)), "frames": ("uint8", (5,))}
+
+
+def shaped(batch_size: int = 4) -> BatchBuffers:
+    buffers = BatchBuffers()
+    buffers.shape(LAYOUT, batch_size, spare=2)
+    return buffers
+
+
+def sample(value: int) -> dict[str, np.ndarray]:
+    return {name: np.full(shape, value, dtype) for name, (dtype, shape) in LAYOUT.items()}
+
+
+def filled(memory: Memory) -> dict[str, np.ndarray]:
+    for row in range(4):
+        memory.put(row, sample(row))
+    return memory.whole()
+
+
+def arena_of(memory: SharedMemory) -> str:
+    return memory.slot(0).arena
+
+
+@pytest.mark.parametrize("kind", ["own", "shared"])
+def test_a_batch_has_the_rows_that_were_put(kind):
+    whole = filled(getattr(shaped(), kind)())
+    assert {name: (str(array.dtype), array.shape) for name, array in whole.items()} == {
         "voxels": ("int8", (4, 2, 3)),
         "frames": ("uint8", (4, 5)),
     }
-    place = address(first["voxels"])
-    del first
-    buffers.shape(dict(layout), 4, spare=1)
-    again = buffers.take()
-    assert address(again["voxels"]) == place
-    buffers.shape(layout, 2, spare=1)
-    assert buffers.take()["voxels"].shape == (2, 2, 3)
+    assert all((array[row] == row).all() for array in whole.values() for row in range(4))
+
+
+def test_memory_of_another_form_is_let_go():
+    buffers = shaped()
+    place = address(buffers.own().whole()["voxels"])
+    buffers.shape(dict(LAYOUT), 4, spare=2)
+    assert address(buffers.own().whole()["voxels"]) == place
+    buffers.shape(LAYOUT, 2, spare=2)
+    assert buffers.own().whole()["voxels"].shape == (2, 2, 3)
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_an_arena_is_not_used_again_while_anything_looks_at_its_batch(hold):
+    buffers = shaped()
+    memory = buffers.shared()
+    name, whole = arena_of(memory), filled(memory)
+    held = hold(whole["voxels"].reshape(4, 6))
+    del memory, whole
+    gc.collect()
+    others = [buffers.shared() for _ in range(3)]
+    assert name not in map(arena_of, others)
+    del held
+    gc.collect()
+    assert arena_of(buffers.shared()) == name
+
+
+def test_an_arena_whose_batch_never_became_whole_is_not_used_again():
+    buffers = shaped()
+    memory = buffers.shared()
+    name = arena_of(memory)
+    del memory
+    gc.collect()
+    assert arena_of(buffers.shared()) != name
+
+
+@contextmanager
+def forked(check):
+    """A process that was forked before the block, checks after it, and is to succeed."""
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            os.close(writing)
+            os.read(reading, 1)
+            check()
+            status = 0
+        finally:
+            os._exit(status)
+    os.close(reading)
+    try:
+        yield
+    finally:
+        os.close(writing)
+        _, status = os.waitpid(pid, 0)
+    assert status == 0
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
+    buffers = shaped()
+    memory = buffers.shared()
+    name, mine = arena_of(memory), filled(memory)
+
+    def still_there():
+        assert len(mine) == 2
+        assert all((array[row] == row).all() for array in mine.values() for row in range(4))
+
+    with forked(still_there):
+        mine.clear()
+        del memory
+        gc.collect()
+        for _ in range(3):
+            memory = buffers.shared()
+            assert arena_of(memory) != name
+            memory.put(2, sample(99))
+            memory.whole()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_does_not_use_the_arenas_of_its_parent():
+    buffers = shaped()
+    memory = buffers.shared()
+    name = arena_of(memory)
+    filled(memory)
+    del memory
+    gc.collect()
+
+    def uses_another():
+        assert arena_of(buffers.shared()) != name
+
+    with forked(uses_another):
+        pass
+    assert arena_of(buffers.shared()) == name

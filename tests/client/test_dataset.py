@@ -25,6 +25,8 @@ from v2v_client.liveness import Patience
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Refused
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import array_layout
+from v2v_server.handover import slot_arrays
 
 SEED = 5
 QUICK = Patience(ping_seconds=0.05, rewant_seconds=0.2)
@@ -483,13 +485,13 @@ GARBAGE = {
 
 @pytest.mark.parametrize("damage", GARBAGE.values(), ids=GARBAGE.keys())
 def test_what_no_server_of_ours_sends_is_refused(server, damage):
-    server.alter = damage
+    server.alter, server.workers = damage, "elsewhere"
     with pytest.raises(ProtocolError):
         next(iter(dataset(server)))
 
 
 def test_a_frame_larger_than_the_layout_allows_never_reaches_memory(server):
-    server.alter = lambda frames: [frames[0], bytes(2 << 20), frames[2]]
+    server.alter, server.workers = lambda frames: [frames[0], bytes(2 << 20), frames[2]], "elsewhere"
     with pytest.raises(ServerLost):
         next(iter(dataset(server, timeout_seconds=1.0)))
 
@@ -607,12 +609,57 @@ def test_buffers_are_used_again_when_nothing_looks_at_them():
 
 
 def test_buffers_are_handed_from_one_epoch_to_the_next(server):
-    stream = dataset(server)
-    mine, others = ({batch.voxels.data_ptr() for _ in range(4) for batch in each} for each in (stream, dataset(server)))
-    assert len(mine) <= 8 // 4 + 3
-    assert not mine & others, "two datasets that are alive share memory"
-    assert not mine & {batch.voxels.data_ptr() for batch in copy.copy(stream)}
+    stream = dataset(server, shared_memory=False)
+    used = {batch.voxels.data_ptr() for _ in range(4) for batch in stream}
+    assert len(used) <= 8 // 4 + 3
+    assert copy.copy(stream)._buffers is not stream._buffers
     pickle.dumps(stream)
+
+
+def test_arenas_are_handed_from_one_epoch_to_the_next(server):
+    stream = dataset(server)
+    for _ in range(4):
+        assert sum(1 for _ in stream) == 5
+    assert NO_SLOT not in server.slots
+    assert len(set(server.arenas)) <= 8 // 4 + 3
+
+
+@pytest.mark.parametrize("workers", ["here", "elsewhere", "many"])
+@pytest.mark.parametrize("shared_memory", [True, False])
+def test_wherever_workers_are_the_bytes_are_those_of_each_sample(server, workers, shared_memory):
+    server.workers, server.shuffled = workers, True
+    stream = dataset(server, shared_memory=shared_memory)
+    kept = [batch for _ in range(3) for batch in stream]
+    assert places(kept) == [place for epoch in range(3) for place in epoch_places(epoch)]
+    for batch in kept:
+        assert_true_bytes(batch)
+    assert (set(server.slots) == {NO_SLOT}) is not shared_memory
+
+
+def test_memory_is_lent_no_more_once_a_whole_batch_came_in_messages(server):
+    server.workers = "elsewhere"
+    list(dataset(server, batch_size=2))
+    lent = [slot != NO_SLOT for slot in server.slots]
+    assert lent == sorted(lent, reverse=True)
+    assert 0 < sum(lent) <= 8 + 2 * 2
+
+
+def test_a_batch_does_not_change_when_a_given_up_worker_writes_late(server):
+    """Index 1 is lost with its worker, is asked for again, and comes from another one; then the first wakes."""
+    server.drop = {(0, 1)}
+    stream = iter(dataset(server))
+    batch = next(stream)
+    assert_true_bytes(batch)
+    layout = array_layout(SPEC.recipe, SPEC.voxel_dtype, ("voxels", "frames"))
+    (slot,) = server.lost
+    there = slot_arrays(slot, layout)
+    if there is not None:
+        for array in there.values():
+            array[...] = 101
+    assert_true_bytes(batch)
+    for later in stream:
+        assert_true_bytes(later)
+    assert slot.arena not in server.arenas[server.arenas.index(slot.arena) + 1 :]
 
 
 def test_recipes_may_be_given_as_objects(server):

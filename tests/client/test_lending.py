@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-
-import pytest
 import zmq
 
-from tests.client.test_arena import LAYOUT, rows, sample
-from v2v_client.arena import Arena
+from tests.client.test_arena import LAYOUT, sample
+from v2v_client.arrival import Payload
 from v2v_client.lending import Lending
-from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import SampleHeader, Want
-from v2v_server.handover import put
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
-
-
-@pytest.fixture
-def lending() -> Iterator[Lending]:
-    opened = Lending(Arena(LAYOUT))
-    yield opened
-    opened.close()
+A, B = "arena a", "arena b"
 
 
-def slots(requests: list[Want]) -> dict[int, int]:
-    return {
-        index: slot
-        for request in requests
-        for index, slot in zip(request.indices, request.slots or (NO_SLOT,) * len(request.indices), strict=True)
-    }
+def lending(*indices: int) -> Lending:
+    """With a slot on offer for each."""
+    opened = Lending()
+    opened.offer({index: Slot(A, index + 1) for index in indices})
+    return opened
 
 
 def answer(index: int, slot: int = NO_SLOT) -> SampleHeader:
@@ -39,42 +26,53 @@ def answer(index: int, slot: int = NO_SLOT) -> SampleHeader:
     return SampleHeader(0, index, tuple(LAYOUT), dtypes, shapes, {}, "worker", 0.1, slot=slot)
 
 
-def test_every_request_has_a_slot_of_its_own(lending: Lending) -> None:
-    first, second = slots(lending.wants(0, [3, 1])), slots(lending.wants(0, [2]))
-    assert NO_SLOT not in {*first.values(), *second.values()}
-    assert len({*first.values(), *second.values()}) == 3
+def frames() -> list[zmq.Frame]:
+    return [zmq.Frame(array.tobytes()) for array in sample(5).values()]
 
 
-def test_what_is_asked_again_is_asked_without_a_slot(lending: Lending) -> None:
+def test_requests_name_the_slots_that_were_offered_one_request_an_arena() -> None:
+    lent = lending(3, 1)
+    lent.offer({2: Slot(B, 7), 9: Slot(B, 8)})
+    assert lent.wants(4, [3, 2, 1, 5]) == [Want(4, (5,)), Want(4, (3, 1), A, (4, 2)), Want(4, (2,), B, (7,))]
+
+
+def test_what_is_asked_again_is_asked_without_a_slot() -> None:
     """The first worker may be writing to the one that was named."""
-    slots(lending.wants(0, [3, 1]))
-    again = slots(lending.wants(0, [1, 7]))
-    assert again[1] == NO_SLOT
-    assert again[7] != NO_SLOT
+    lent = lending(3, 1, 7)
+    lent.wants(0, [3, 1])
+    assert lent.wants(0, [1, 7]) == [Want(0, (1,)), Want(0, (7,), A, (8,))]
 
 
-def test_a_slot_is_lent_again_once_its_sample_was_read(lending: Lending) -> None:
-    (request,) = lending.wants(0, [5])
-    assert put(request.arena, request.slots[0], sample(5))
-    payload = lending.payload(answer(5, request.slots[0]), [])
+def test_a_sample_in_its_slot() -> None:
+    lent = lending(5)
+    lent.wants(0, [5])
+    assert lent.payload(answer(5, 6), []) == Payload(None, row_is_ours=True)
+    assert lent.payload(answer(5, 6), []) is None  # once
+
+
+def test_a_worker_that_could_not_reach_the_slot_writes_there_no_more() -> None:
+    lent = lending(5)
+    lent.wants(0, [5])
+    payload = lent.payload(answer(5, 6), frames())
     assert payload is not None
-    assert slots(lending.wants(0, [6]))[6] != request.slots[0]  # not yet read
-    into = rows()
-    payload.copy_to(into)
-    assert all((into[name] == array).all() for name, array in sample(5).items())
-    assert slots(lending.wants(0, [8]))[8] == request.slots[0]
+    assert payload.row_is_ours
+    assert payload.arrays is not None
+    assert all((payload.arrays[name] == array).all() for name, array in sample(5).items())
 
 
-def test_a_slot_whose_sample_lies_elsewhere_is_never_lent_again(lending: Lending) -> None:
-    (request,) = lending.wants(0, [5])
-    assert lending.payload(answer(5, request.slots[0] + 1), []) is None  # in another's slot: nobody may read that
-    frames = [zmq.Frame(array.tobytes()) for array in sample(5).values()]
-    assert lending.payload(answer(5), frames) is not None  # made without a slot, for instance by a second worker
-    assert request.slots[0] not in slots(lending.wants(0, [6, 7, 8])).values()
+def test_a_sample_made_by_another_worker_leaves_its_row_to_the_first() -> None:
+    lent = lending(5)
+    lent.wants(0, [5])
+    assert lent.payload(answer(5, 7), []) is None  # in another's slot: nobody may read that
+    payload = lent.payload(answer(5), frames())
+    assert payload is not None
+    assert not payload.row_is_ours
 
 
-def test_without_an_arena_nothing_is_lent() -> None:
-    lending = Lending(None)
-    assert lending.wants(2, [4, 5]) == [Want(2, (4, 5))]
-    assert lending.payload(answer(4, 1), []) is None
-    lending.close()
+def test_where_nothing_is_offered_nothing_is_lent() -> None:
+    lent = Lending()
+    assert lent.wants(2, [4, 5]) == [Want(2, (4, 5))]
+    assert lent.payload(answer(4, 1), []) is None
+    payload = lent.payload(answer(4), frames())
+    assert payload is not None
+    assert payload.row_is_ours

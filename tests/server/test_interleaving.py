@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
 from v2v_client.slots import Answer, Slots
-from v2v_protocol.arena import NO_SLOT, ArenaName
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.messages import ErrorCode, Goodbye, JobFailed, Lease, Ping, Refused, Result, SampleHeader, Unavailable
 from v2v_server.blame import Cause, runs_alone
 
@@ -319,31 +319,43 @@ TestInterleavingOfSiblings.settings = settings(max_examples=40, stateful_step_co
 
 class WithSlots(Interleaving):
     """The same with consumers that lend slots, and workers that may write to what they were ever lent until they have
-    answered: no consumer ever reads anything but its sample."""
+    answered: no consumer ever reads anything but its sample, nor lends an arena again that anybody may write to."""
 
     def __init__(self) -> None:
         super().__init__()
         self.slots: dict[bytes, Slots] = {}
         self.memory: dict[tuple[str, int], tuple[int, int, int]] = {}
         self.lent: dict[int, Lease] = {}  # the lease of each worker that may still write, by number
+        self.expected: dict[str, set[int]] = {}  # slots of each arena that were named and not given back
+        self.unused: list[str] = []
+        self.arenas = 0
         self.read_there = 0
         self.abandoned = 0
+        self.used_again = 0
 
-    def _arena(self, identity: bytes) -> str:
-        return str(ArenaName(ord(identity), 3, identity.hex() * 16))
+    def _arena(self) -> str:
+        if self.unused:
+            self.used_again += 1
+            return self.unused.pop()
+        self.arenas += 1
+        return str(ArenaName(1, self.arenas, 20, "0123456789abcdef" * 2))
 
     def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
         slots = self.slots.setdefault(identity, Slots())
         session = self.at.dispatcher.sessions.get(identity)
         keys = {epoch * 1000 + index: index for index in indices}
-        fresh = {key: index for key, index in keys.items() if slots.of(key) == NO_SLOT}
+        fresh = {key: index for key, index in keys.items() if slots.of(key) is None}
         if session is None or len(session.unanswered | {(epoch, index) for index in indices}) > session.credit:
             super().want(identity, epoch, indices)  # refused as a whole, which no client of ours lets happen
             return
         super().want(identity, epoch, [index for key, index in keys.items() if key not in fresh])
         if fresh:
-            lent = [slots.take(key) for key in fresh]
-            self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=self._arena(identity), slots=lent)
+            arena = self._arena()
+            numbers = list(range(1, len(fresh) + 1))
+            self.expected[arena] = set(numbers)
+            for key, number in zip(fresh, numbers, strict=True):
+                slots.name(key, Slot(arena, number))
+            self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=arena, slots=numbers)
 
     def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         slots = self.slots[identity]
@@ -353,11 +365,16 @@ class WithSlots(Interleaving):
         assert answer is not Answer.NOWHERE
         self.abandoned += answer is Answer.ABANDONED
         if answer is Answer.THERE:
+            assert slot is not None
             self.read_there += 1
-            place = (self._arena(identity), slot)
+            place = (slot.arena, slot.number)
             assert place not in {(lease.arena, lease.slot) for lease in self.lent.values()}, "it may change as we read"
             assert self.memory[place] == (header.epoch, header.index, self.seed[identity])
-            slots.give_back(slot)
+        if slot is not None and answer is not Answer.ABANDONED:
+            self.expected[slot.arena].discard(slot.number)
+            if not self.expected[slot.arena]:
+                assert slot.arena not in {lease.arena for lease in self.lent.values()}, "its next batch may change"
+                self.unused.append(slot.arena)
 
     def _note_leases(self) -> None:
         for held in self.at.leases.values():
@@ -447,6 +464,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
     if isinstance(model, WithSlots):
         seen["read in slots"] = model.read_there
         seen["abandoned slots"] = model.abandoned
+        seen["arenas used again"] = model.used_again
     model.teardown()
     return seen
 
@@ -459,5 +477,5 @@ def test_long_walks_reach_what_is_rare_and_keep_the_promise() -> None:
         seen += walk(seed, 150, OfSiblings)
         seen += walk(seed, 150, WithSlots)
     least = {"lone at work": 10, "lone waiting": 3, "twins": 5, "verdicts": 20, "samples": 500}
-    least |= {"read in slots": 40, "abandoned slots": 5}
+    least |= {"read in slots": 40, "abandoned slots": 5, "arenas used again": 10}
     assert {state: seen[state] for state in least if seen[state] < least[state]} == {}

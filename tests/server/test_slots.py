@@ -7,11 +7,11 @@ import dataclasses
 import pytest
 
 from tests.server.peers import DEADLINE, Peers, answer_to, peers
-from v2v_protocol.arena import LARGEST_SLOT, NO_SLOT
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import ErrorCode, Result, SampleHeader
 from v2v_protocol.wire import Buffer, decode, encode
 
-ARENA = f"17:9:{'0123456789abcdef' * 2}"
+ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
 
 
 def at_work(*, workers: int = 1) -> Peers:
@@ -94,7 +94,7 @@ def test_an_index_that_is_asked_again_keeps_its_first_slot() -> None:
     [
         (ARENA, [1, 2]),
         (ARENA, [0]),
-        (ARENA, [LARGEST_SLOT + 1]),
+        (ARENA, [13]),
         ("", [1]),
         ("17:9:short", [1]),
         ("../../etc/passwd", [1]),

@@ -144,6 +144,7 @@ def simulate_clip(
     recipe: Recipe,
     voxel_dtype: str,
     step_seconds: npt.NDArray[np.float64] | None = None,
+    out: npt.NDArray[Any] | None = None,
 ) -> Voxels:
     """Simulate one drawn sample.
 
@@ -153,6 +154,7 @@ def simulate_clip(
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
         step_seconds: [steps] duration of each step (``timing.py``); given exactly when ``recipe.needs_seconds``.
+        out: C-contiguous array for the voxels, of their shape and dtype; None makes one.
 
     Returns:
         voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
@@ -186,7 +188,7 @@ def simulate_clip(
         prepared = prepare(params, intensity, step_seconds, frames[0].size, real, _compiled_words)
     return _run(
         frames, _table(*intensity, real), source_index, params, noise_durations,
-        recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared,
+        recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared, out=out,
     )  # fmt: skip
 
 
@@ -295,11 +297,12 @@ def _run(
     dtype: str,
     start_residual: float | None = None,
     prepared: Prepared | None = None,
+    out: npt.NDArray[Any] | None = None,
 ) -> Voxels:
     """``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: None without effects."""
     _, height, width = frames.shape
     steps, pixels, real = len(noise_durations), height * width, table.dtype.type
-    voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype)
+    voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype, out)
     # Noise of independent increments: its variance, not its deviation, grows with time.
     noise_scale = params.noise_sigma * np.sqrt(noise_durations) if params.noise_sigma > 0.0 else np.empty(0)
     hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0

@@ -45,12 +45,19 @@ def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
     return min(max(2.0**-21, smaller * 2.0**-19), smaller * 2.0**-4)
 
 
-def voxel_array(voxels: int, bins: int, height: int, width: int, dtype: str) -> npt.NDArray[Any]:
-    """An uninitialised voxel array [voxels, bins, height, width].
+def voxel_array(
+    voxels: int, bins: int, height: int, width: int, dtype: str, out: npt.NDArray[Any] | None = None
+) -> npt.NDArray[Any]:
+    """An uninitialised voxel array [voxels, bins, height, width]: ``out``, where it is given.
 
     Raises:
-        UsageError: the dtype is not one of int8, int16, float32.
+        UsageError: the dtype is not one of int8, int16, float32, or ``out`` is not such an array.
     """
     if dtype not in LARGEST_COUNT:
         raise UsageError(f"voxel dtype {dtype!r}: choose one of {', '.join(VOXEL_DTYPES)}")
-    return np.empty((voxels, bins, height, width), np.dtype(dtype))
+    shape = voxels, bins, height, width
+    if out is None:
+        return np.empty(shape, np.dtype(dtype))
+    if out.shape != shape or out.dtype.name != dtype or not out.flags.c_contiguous:
+        raise UsageError(f"out {out.dtype}{list(out.shape)}: give {dtype}{list(shape)}, C-contiguous")
+    return out
