@@ -19,7 +19,6 @@ A connection belongs to the process that made it; its ZeroMQ context is made whe
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections import deque
@@ -49,7 +48,7 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
 )
-from v2v_protocol.sample import Layout, Provenance, SampleId, array_layout
+from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
@@ -79,6 +78,7 @@ class Connection:
 
     stream: Stream
     layout: Layout
+    _form: Form
 
     def __init__(
         self,
@@ -138,8 +138,8 @@ class Connection:
                 self._leave(self._link)
             self._hello = replace(self._hello, spec=self._pinned.spec)
             self.layout = self._layout(self._pinned)
-            largest = max(math.prod(shape) * _item_bytes(dtype) for dtype, shape in self.layout.values())
-            self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, largest)
+            self._form = Form.of(self.layout)
+            self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, *self._form.sizes)
             self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
         except BaseException:
@@ -332,10 +332,11 @@ class Connection:
         if header.epoch != self._epoch:
             self.strays += 1
             return None
-        layout = layout_of(header)
-        if list(layout.items()) != list(self.layout.items()):  # in a slot, the order says which is which
+        form = self._form
+        if (header.names, header.dtypes, header.shapes) != (form.names, form.dtypes, form.shapes):
             raise ProtocolError(
-                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {layout}; asked: {self.layout}"
+                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {layout_of(header)}; "
+                f"asked: {self.layout}"
             )
         again = header.index not in self._asked
         found = self._lending.payload(header, frames)
@@ -386,7 +387,3 @@ class Connection:
             f"{self._address}: nothing heard for {self._liveness.silence(now):.0f} s; {last}; start v2v-serve there, "
             f"or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
         )
-
-
-def _item_bytes(dtype: str) -> int:
-    return {"int8": 1, "uint8": 1, "int16": 2, "float16": 2, "float32": 4}[dtype]

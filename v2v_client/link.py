@@ -107,10 +107,11 @@ class Link:
         """The next message; None when none came in that time, or the network was heard of instead."""
         socket = self._open(self._socket)
         try:
-            message = _taken(socket)
-            if message is None and seconds > 0 and socket in dict(self._poller.poll(math.ceil(seconds * 1000))):
-                message = _taken(socket)
-            return message
+            if socket in dict(self._poller.poll(math.ceil(seconds * 1000))):
+                return socket.recv_multipart(flags=zmq.NOBLOCK, copy=False)
+            return None
+        except zmq.Again:
+            return None  # a connection that just ended took its messages with it
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot receive: {error}") from error
 
@@ -128,9 +129,3 @@ class Link:
         if socket is None:
             raise ServerLost(f"{self._address}: this connection is closed")
         return socket
-
-
-def _taken(socket: zmq.Socket[bytes]) -> list[zmq.Frame] | None:
-    if not socket.poll(0):  # trying would cost an exception, twice as much
-        return None
-    return socket.recv_multipart(flags=zmq.NOBLOCK, copy=False)

@@ -256,6 +256,31 @@ def layout_bytes(layout: Layout) -> int:
 
 
 @dataclass(frozen=True, slots=True)
+class Form:
+    """What the arrays of a sample must be.
+
+    Attributes:
+        names, dtypes, shapes: as a SampleHeader states them.
+        sizes: bytes of each array.
+    """
+
+    names: tuple[str, ...]
+    dtypes: tuple[str, ...]
+    shapes: tuple[int, ...]
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, layout: Layout) -> Form:
+        """The form of samples whose arrays have these dtypes and shapes (``array_layout``)."""
+        return cls(
+            names=tuple(layout),
+            dtypes=tuple(dtype for dtype, _ in layout.values()),
+            shapes=tuple(extent for _, shape in layout.values() for extent in (len(shape), *shape)),
+            sizes=tuple(layout_bytes({name: layout[name]}) for name in layout),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Sample:
     """One simulated clip.
 

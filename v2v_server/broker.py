@@ -25,7 +25,6 @@ from v2v_server.quarantine import Verdict
 
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``reception.MOST_CREDIT``)."""
-_BATCH = 64
 _TICK_SECONDS = 0.1
 
 
@@ -112,12 +111,11 @@ class Broker:
         while not stopping():
             ready = dict(poller.poll(int(_TICK_SECONDS * 1000)))
             now = time.monotonic()
-            if self._workers in ready:
-                for identity, frames in self._drain(self._workers):
-                    carry_out(dispatcher.from_worker(identity, frames, now))
-            if self._consumers in ready:
-                for identity, frames in self._drain(self._consumers):
-                    carry_out(dispatcher.from_consumer(identity, frames, now))
+            # One message of each side a turn, so that neither can shut the other out.
+            if self._workers in ready and (message := _receive(self._workers)) is not None:
+                carry_out(dispatcher.from_worker(*message, now))
+            if self._consumers in ready and (message := _receive(self._consumers)) is not None:
+                carry_out(dispatcher.from_consumer(*message, now))
             if now >= next_tick:
                 next_tick = now + _TICK_SECONDS
                 carry_out(dispatcher.tick(now))
@@ -133,16 +131,15 @@ class Broker:
         """Closes both sockets; what was not sent is dropped."""
         self._context.destroy(linger=0)
 
-    def _drain(self, router: zmq.Socket[bytes]) -> list[tuple[bytes, list[Any]]]:
-        """Up to one batch of messages that are already there, so that neither side can shut the other out.
 
-        The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
-        """
-        messages: list[tuple[bytes, list[Any]]] = []
-        while len(messages) < _BATCH and router.poll(0):  # trying would cost an exception, twice as much
-            identity, *frames = router.recv_multipart(zmq.NOBLOCK, copy=False)
-            messages.append((identity.bytes, [*(frame.bytes for frame in frames[:1]), *frames[1:]]))
-        return messages
+def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
+    """A message that is there, and who sent it. The header is copied out as bytes; what follows stays in ZeroMQ's own
+    frames."""
+    try:
+        identity, *frames = router.recv_multipart(zmq.NOBLOCK, copy=False)
+    except zmq.Again:
+        return None  # a connection that just ended took it along
+    return identity.bytes, [*(frame.bytes for frame in frames[:1]), *frames[1:]]
 
 
 def _send(router: zmq.Socket[bytes], identity: bytes, frames: Sequence[Any]) -> bool:

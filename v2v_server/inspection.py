@@ -6,41 +6,15 @@ small header is read; the arrays are only measured, and not even that where they
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Result, SampleHeader
-from v2v_protocol.sample import layout_bytes
+from v2v_protocol.sample import Form
 from v2v_protocol.wire import decode
 from v2v_server.leases import Task
-
-
-@dataclass(frozen=True, slots=True)
-class Form:
-    """What the arrays of a sample must be.
-
-    Attributes:
-        names, dtypes, shapes: as a SampleHeader states them.
-        sizes: bytes of each array.
-    """
-
-    names: tuple[str, ...]
-    dtypes: tuple[str, ...]
-    shapes: tuple[int, ...]
-    sizes: tuple[int, ...]
-
-    @classmethod
-    def of(cls, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> Form:
-        """The form of samples whose arrays have these dtypes and shapes (``array_layout``)."""
-        return cls(
-            names=tuple(layout),
-            dtypes=tuple(dtype for dtype, _ in layout.values()),
-            shapes=tuple(extent for _, shape in layout.values() for extent in (len(shape), *shape)),
-            sizes=tuple(layout_bytes({name: layout[name]}) for name in layout),
-        )
 
 
 def flaw(result: Result, payload: Sequence[Any], task: Task, form: Form) -> str | None:

@@ -19,10 +19,9 @@ from dataclasses import dataclass, field
 
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import LimitExceeded
-from v2v_protocol.sample import array_layout
+from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.blame import runs_alone
-from v2v_server.inspection import Form
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
 

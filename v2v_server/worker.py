@@ -80,6 +80,8 @@ class Worker:
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
             raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
 
     def stop(self) -> None:
         """Finishes the lease in work, gives the others back and leaves. May be called from a signal handler."""
@@ -108,10 +110,10 @@ class Worker:
     def _receive(self, wait_seconds: float) -> None:
         """Takes every message that is there, waiting for the first one at most this long."""
         timeout = int(wait_seconds * 1000)
-        if timeout and not self._socket.poll(timeout):
+        if timeout and not self._poller.poll(timeout):
             self._send(encode(Ping()))
             return
-        while self._socket.poll(0):
+        while self._poller.poll(0):
             frames = self._socket.recv_multipart()
             try:
                 self._handle(decode(frames[0]))

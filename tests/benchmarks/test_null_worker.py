@@ -12,9 +12,9 @@ from tests.benchmarks.small import FLAGS, RECIPE
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
 from v2v_protocol.messages import Result, SampleHeader
-from v2v_protocol.sample import DEFAULT_ARRAYS, Provenance, SampleId, array_layout
+from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode, decode_sample
-from v2v_server.inspection import Form, flaw
+from v2v_server.inspection import flaw
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
