@@ -203,8 +203,8 @@ class Connection:
         if not now:
             return
         self._asked.update(dict.fromkeys(now))
-        for request in self._lending.wants(self._epoch, now):
-            self._send(request)
+        # In one message: siblings are decoded together only if they are asked for together.
+        self._send(self._lending.want(self._epoch, now))
 
     def _want_again(self) -> None:
         # In the order they were asked; after a Welcome with less credit, the rest waits its turn.

@@ -27,22 +27,23 @@ class Lending:
         """Where samples may come to lie that were never asked for yet, by index."""
         self._offered.update(slots)
 
-    def wants(self, epoch: int, indices: Sequence[int]) -> list[Want]:
-        """Requests for samples, each with the slot that was offered for it.
+    def want(self, epoch: int, indices: Sequence[int]) -> Want:
+        """A request for samples, each with the slot that was offered for it.
 
         One that was asked for before is asked for without: its first worker may be at it still, and has one.
         """
-        alone = tuple(index for index in indices if index not in self._offered)
-        requests = [Want(epoch, alone)] if alone else []
-        of_arena: dict[str, dict[int, int]] = {}
-        for index in indices:
-            slot = self._offered.pop(index, None)
+        slots = [self._offered.pop(index, None) for index in indices]
+        for index, slot in zip(indices, slots, strict=True):
             if slot is not None:
                 self._slots.name(index, slot)
-                of_arena.setdefault(slot.arena, {})[index] = slot.number
-        return requests + [
-            Want(epoch, tuple(numbers), arena, tuple(numbers.values())) for arena, numbers in of_arena.items()
-        ]
+        if not any(slots):
+            return Want(epoch, tuple(indices))
+        return Want(
+            epoch,
+            tuple(indices),
+            tuple("" if slot is None else slot.arena for slot in slots),
+            tuple(NO_SLOT if slot is None else slot.number for slot in slots),
+        )
 
     def payload(self, header: SampleHeader, frames: Sequence[zmq.Frame]) -> Payload | None:
         """Where a sample's arrays are; None where nobody knows: in a slot not named for it, or not any more.

@@ -63,13 +63,13 @@ class Want:
 
     Attributes:
         epoch, indices: which samples.
-        arena: memory that workers of the same host may put them into, see :mod:`v2v_protocol.arena`; empty: none.
-        slots: the slot for each index, or none at all.
+        arenas, slots: for each index, memory that a worker of the same host may put its sample into, see
+            :mod:`v2v_protocol.arena`; "" and 0 where there is none. Empty: none for any.
     """
 
     epoch: int
     indices: tuple[int, ...]
-    arena: str = ""
+    arenas: tuple[str, ...] = ()
     slots: tuple[int, ...] = ()
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.arena import ArenaName, Slot
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
@@ -360,18 +360,21 @@ def _only(frames: Sequence[Buffer]) -> Message:
     return decode(frames[0])
 
 
-def _slots(want: Want) -> list[Slot]:
+def _slots(want: Want) -> list[Slot | None]:
     """Where the samples may be put.
 
     Raises:
         ProtocolError: that is nowhere.
     """
-    if not want.slots:
-        return []
-    most = ArenaName.parse(want.arena).slots
-    if len(want.slots) != len(want.indices) or not all(0 < number <= most for number in want.slots):
-        raise ProtocolError(f"want.slots: {len(want.slots)} for {len(want.indices)} indices, each 1 to {most}")
-    return [Slot(want.arena, number) for number in want.slots]
+    if not len(want.arenas) == len(want.slots) in (0, len(want.indices)):
+        raise ProtocolError(f"want: {len(want.arenas)} arenas, {len(want.slots)} slots for {len(want.indices)} indices")
+    most = {arena: ArenaName.parse(arena).slots for arena in set(want.arenas) - {""}} | {"": NO_SLOT}
+    places: list[Slot | None] = []
+    for arena, number in zip(want.arenas, want.slots, strict=True):
+        if not (arena != "") <= number <= most[arena]:
+            raise ProtocolError(f"want.slots: {number}; {arena!r:.80} has {most[arena]}")
+        places.append(Slot(arena, number) if arena else None)
+    return places
 
 
 def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:

@@ -100,7 +100,7 @@ class Sessions:
         if self._sessions.pop(identity, None) is not None:
             self._turns.remove(identity)
 
-    def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot] = ()) -> None:
+    def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
         """The consumer asks for samples. Those it is already waiting for are not made twice, and keep their slots.
 
         Args:

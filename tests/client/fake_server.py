@@ -220,9 +220,11 @@ class FakeServer:
         repeats = any(key in self.wants for key in asked)
         self.wants += asked
         self.slots += want.slots or (NO_SLOT,) * len(asked)
-        if want.arena and self.arenas[-1:] != [want.arena]:
-            self.arenas.append(want.arena)
-        session.slots |= {key: Slot(want.arena, number) for key, number in zip(asked, want.slots, strict=False)}
+        for key, arena, number in zip(asked, want.arenas, want.slots, strict=False):
+            if arena:
+                session.slots[key] = Slot(arena, number)
+                if self.arenas[-1:] != [arena]:
+                    self.arenas.append(arena)
         if any(index >= self.sequences for index in want.indices):
             self._send(identity, encode(Refused(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
             return

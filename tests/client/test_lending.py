@@ -30,29 +30,30 @@ def frames() -> list[zmq.Frame]:
     return [zmq.Frame(array.tobytes()) for array in sample(5).values()]
 
 
-def test_requests_name_the_slots_that_were_offered_one_request_an_arena() -> None:
+def test_a_request_names_the_slots_that_were_offered() -> None:
     lent = lending(3, 1)
     lent.offer({2: Slot(B, 7), 9: Slot(B, 8)})
-    assert lent.wants(4, [3, 2, 1, 5]) == [Want(4, (5,)), Want(4, (3, 1), A, (4, 2)), Want(4, (2,), B, (7,))]
+    assert lent.want(4, [3, 2, 1, 5]) == Want(4, (3, 2, 1, 5), (A, B, A, ""), (4, 7, 2, NO_SLOT))
 
 
 def test_what_is_asked_again_is_asked_without_a_slot() -> None:
     """The first worker may be writing to the one that was named."""
     lent = lending(3, 1, 7)
-    lent.wants(0, [3, 1])
-    assert lent.wants(0, [1, 7]) == [Want(0, (1,)), Want(0, (7,), A, (8,))]
+    lent.want(0, [3, 1])
+    assert lent.want(0, [1, 7]) == Want(0, (1, 7), ("", A), (NO_SLOT, 8))
+    assert lent.want(0, [1, 7]) == Want(0, (1, 7))
 
 
 def test_a_sample_in_its_slot() -> None:
     lent = lending(5)
-    lent.wants(0, [5])
+    lent.want(0, [5])
     assert lent.payload(answer(5, 6), []) == Payload(None, row_is_ours=True)
     assert lent.payload(answer(5, 6), []) is None  # once
 
 
 def test_a_worker_that_could_not_reach_the_slot_writes_there_no_more() -> None:
     lent = lending(5)
-    lent.wants(0, [5])
+    lent.want(0, [5])
     payload = lent.payload(answer(5, 6), frames())
     assert payload is not None
     assert payload.row_is_ours
@@ -62,7 +63,7 @@ def test_a_worker_that_could_not_reach_the_slot_writes_there_no_more() -> None:
 
 def test_a_sample_made_by_another_worker_leaves_its_row_to_the_first() -> None:
     lent = lending(5)
-    lent.wants(0, [5])
+    lent.want(0, [5])
     assert lent.payload(answer(5, 7), []) is None  # in another's slot: nobody may read that
     payload = lent.payload(answer(5), frames())
     assert payload is not None
@@ -71,7 +72,7 @@ def test_a_sample_made_by_another_worker_leaves_its_row_to_the_first() -> None:
 
 def test_where_nothing_is_offered_nothing_is_lent() -> None:
     lent = Lending()
-    assert lent.wants(2, [4, 5]) == [Want(2, (4, 5))]
+    assert lent.want(2, [4, 5]) == Want(2, (4, 5))
     assert lent.payload(answer(4, 1), []) is None
     payload = lent.payload(answer(4), frames())
     assert payload is not None

@@ -172,7 +172,7 @@ class Peers:
     def want(
         self, *indices: int, identity: bytes = b"c", epoch: int = 0, arena: str = "", slots: Sequence[int] = ()
     ) -> list[Message]:
-        return self.consumer_says(identity, Want(epoch, indices, arena, tuple(slots)))
+        return self.consumer_says(identity, Want(epoch, indices, (arena,) * len(slots), tuple(slots)))
 
     def join(self, identity: bytes = b"w", credit: int = CREDIT) -> None:
         self.leases[identity] = deque()
