@@ -4,7 +4,8 @@
 
 They come in by the door that all workers use (``v2v-serve --worker-bind``) and say what all workers say, so that what
 such a server does is broker and wire and nothing else. All of them are sockets of one process: the server cannot tell,
-and 64 interpreters would only be in each other's way."""
+and 64 interpreters would only be in each other's way.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.arena import ArenaName, Slot, array_offsets
-from v2v_protocol.sample import Layout, layout_bytes
+from v2v_protocol.sample import Form, Layout, new_arrays
 
 _POPULATE_READ = 22
 """MADV_POPULATE_READ of Linux 5.14, asm-generic/mman-common.h: all pages at once is cheaper than one at a time."""
@@ -43,8 +43,9 @@ class Arena:
         self.process = os.getpid()
         self._layout = dict(layout)
         self._slots = slots
-        self._sizes = {name: layout_bytes({name: form}) for name, form in layout.items()}
-        *offsets, self._bytes = array_offsets(tuple(self._sizes.values()), slots)
+        sizes = Form.of(layout).sizes
+        self._sizes = dict(zip(layout, sizes, strict=True))
+        *offsets, self._bytes = array_offsets(sizes, slots)
         self._offsets = dict(zip(layout, offsets, strict=True))
         token = os.urandom(16).hex()
         memory_name = ArenaName(self.process, 0, slots, token).memory_name
@@ -71,7 +72,7 @@ class Arena:
 
     def get(self, row: int) -> dict[str, npt.NDArray[Any]]:
         """A copy of the sample in a row."""
-        sample = {name: np.empty(shape, dtype) for name, (dtype, shape) in self._layout.items()}
+        sample = new_arrays(self._layout)
         for name, array in sample.items():
             offset, rest = self._offset(name, row), array.reshape(-1).view(np.uint8).data
             while rest:

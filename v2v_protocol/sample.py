@@ -255,6 +255,11 @@ def layout_bytes(layout: Layout) -> int:
     return sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
 
 
+def new_arrays(layout: Layout) -> dict[str, npt.NDArray[Any]]:
+    """Arrays for one sample of that layout, of unspecified content."""
+    return {name: np.empty(shape, dtype) for name, (dtype, shape) in layout.items()}
+
+
 @dataclass(frozen=True, slots=True)
 class Form:
     """What the arrays of a sample must be.

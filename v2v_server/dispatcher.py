@@ -368,13 +368,13 @@ def _slots(want: Want) -> list[Slot | None]:
     """
     if not len(want.arenas) == len(want.slots) in (0, len(want.indices)):
         raise ProtocolError(f"want: {len(want.arenas)} arenas, {len(want.slots)} slots for {len(want.indices)} indices")
-    most = {arena: ArenaName.parse(arena).slots for arena in set(want.arenas) - {""}} | {"": NO_SLOT}
-    places: list[Slot | None] = []
+    numbers = {arena: (1, ArenaName.parse(arena).slots) for arena in set(want.arenas) - {""}}
+    numbers[""] = NO_SLOT, NO_SLOT
     for arena, number in zip(want.arenas, want.slots, strict=True):
-        if not (arena != "") <= number <= most[arena]:
-            raise ProtocolError(f"want.slots: {number}; {arena!r:.80} has {most[arena]}")
-        places.append(Slot(arena, number) if arena else None)
-    return places
+        least, most = numbers[arena]
+        if not least <= number <= most:
+            raise ProtocolError(f"want.slots: {number} of arena {arena!r:.80}; it has {least} to {most}")
+    return [Slot(arena, number) if arena else None for arena, number in zip(want.arenas, want.slots, strict=True)]
 
 
 def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:

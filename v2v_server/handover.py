@@ -1,6 +1,6 @@
 """The worker's end of a slot: a sample is made in its consumer's memory, or where that cannot be reached, in its own.
 
-The arena is opened and mapped anew for each sample, which takes a fifth of a millisecond: nothing is kept that would
+The arena is opened and mapped anew for each sample, which takes less than a millisecond: nothing is kept that would
 hold the memory of a consumer that is gone, or have to be tidied up after a worker that is killed.
 """
 
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Layout, layout_bytes
+from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_protocol.wire import Frames, encode_sample
 
 
@@ -47,7 +47,7 @@ def room_for(lease: Lease, layout: Layout) -> Room:
         there = slot_arrays(Slot(lease.arena, lease.slot), layout)
         if there is not None:
             return Room(there, in_slot=True)
-    return Room({name: np.empty(shape, dtype) for name, (dtype, shape) in layout.items()}, in_slot=False)
+    return Room(new_arrays(layout), in_slot=False)
 
 
 def sample_message(
@@ -90,12 +90,12 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
         name = ArenaName.parse(slot.arena)
         if not 0 < slot.number <= name.slots:
             return None
-        sizes = {array: layout_bytes({array: form}) for array, form in layout.items()}
-        *offsets, total = array_offsets(tuple(sizes.values()), name.slots)
+        sizes = Form.of(layout).sizes
+        *offsets, total = array_offsets(sizes, name.slots)
         with closing(_Arena(name, total)) as arena:
             return {
-                array: arena.map(offset + (slot.number - 1) * sizes[array], sizes[array]).view(dtype).reshape(shape)
-                for (array, (dtype, shape)), offset in zip(layout.items(), offsets, strict=True)
+                array: arena.map(offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
+                for (array, (dtype, shape)), size, offset in zip(layout.items(), sizes, offsets, strict=True)
             }
     except (OSError, ProtocolError):
         return None

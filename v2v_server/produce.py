@@ -18,7 +18,7 @@ import numpy.typing as npt
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Layout, Provenance, Refusal, Sample, SampleId, SampleParams, array_layout
+from v2v_protocol.sample import Layout, Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.scene_choice import FlowPlan, plan_flow
@@ -163,7 +163,7 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe needs seconds")
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     if into is None:
-        into = {name: np.empty(shape, dtype) for name, (dtype, shape) in sample_layout(lease).items()}
+        into = new_arrays(sample_layout(lease))
     saturated = 0
     for name, array in into.items():
         if name == "voxels":

@@ -95,6 +95,7 @@ class FakeServer:
         self.refused_for_credit = 0
         self._random = random.Random(7)
         self._sessions: dict[bytes, _Session] = {}
+        self._waiting: list[Future[None]] = []  # for the sessions to end
         self._commands: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
         self._context: zmq.Context[Any] = zmq.Context()
         self._wake = self._context.socket(zmq.PAIR)
@@ -148,9 +149,15 @@ class FakeServer:
         """Forgets all sessions, as a server does with silent ones."""
         self.call(self._sessions.clear)
 
-    @property
-    def sessions(self) -> int:
-        return self.call(lambda: len(self._sessions))
+    def until_all_left(self) -> None:
+        """Returns once no session is left without Goodbye; a last one may be on its way.
+
+        Raises:
+            TimeoutError: one is left.
+        """
+        everybody_left: Future[None] = Future()
+        self.call(lambda: self._waiting.append(everybody_left))
+        everybody_left.result(20.0)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
@@ -162,6 +169,8 @@ class FakeServer:
         wake = self._context.socket(zmq.PAIR)
         wake.connect("inproc://wake")
         while self._running:
+            while self._waiting and not self._sessions:
+                self._waiting.pop().set_result(None)
             poller = zmq.Poller()
             poller.register(wake, zmq.POLLIN)
             poller.register(self._socket, zmq.POLLIN)

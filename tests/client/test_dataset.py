@@ -4,7 +4,6 @@ import os
 import pickle
 import tempfile
 import threading
-import time
 
 import numpy as np
 import psutil
@@ -242,10 +241,7 @@ def test_leaving_early_and_iterating_again_repeats_the_epoch(server):
     stream.set_epoch(7)
     assert places(stream) == epoch_places(7)
     gc.collect()
-    deadline = time.monotonic() + 20
-    while server.sessions and time.monotonic() < deadline:  # the last Goodbye may still be on its way
-        time.sleep(0.005)
-    assert server.sessions == 0, "a session was left without Goodbye"
+    server.until_all_left()
 
 
 def test_an_epoch_without_a_whole_global_batch_is_refused(server):

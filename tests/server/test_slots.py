@@ -8,7 +8,7 @@ import pytest
 
 from tests.server.peers import DEADLINE, Peers, answer_to, peers
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.messages import ErrorCode, Result, SampleHeader
+from v2v_protocol.messages import ErrorCode, Result, SampleHeader, Want
 from v2v_protocol.wire import Buffer, decode, encode
 
 ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
@@ -35,6 +35,16 @@ def test_a_lease_names_the_slot_and_its_header_goes_alone() -> None:
     assert [len(frames) for frames in at.frames[b"c"]] == [1, 1]
     counters = at.dispatcher.counters
     assert (counters.in_slots, counters.bytes) == (1, 2 * 2 * 8 * 8)
+
+
+def test_each_index_of_a_request_has_its_own_arena_or_none() -> None:
+    at, other = peers(), ARENA.replace("17:9", "17:10")
+    at.hello()
+    at.consumer_says(b"c", Want(0, (0, 1, 2), (ARENA, "", other), (5, NO_SLOT, 5)))
+    at.join(b"w")
+    at.join(b"w2")
+    leases = {lease.indices[0]: (lease.arena, lease.slot) for held in at.leases.values() for lease in held}
+    assert leases == {0: (ARENA, 5), 1: ("", NO_SLOT), 2: (other, 5)}
 
 
 def test_a_worker_that_cannot_reach_it_sends_the_arrays_and_says_that_the_slot_is_free() -> None:
