@@ -9,13 +9,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch.distributed
-from torch.utils.data import IterableDataset
+from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
 from v2v_client.buffers import BatchBuffers
 from v2v_client.connection import Connection
 from v2v_client.delivery import deliver
 from v2v_client.liveness import Patience
+from v2v_client.loader_exit import send_before_exit
 from v2v_client.options import Options
 from v2v_client.position import Consumer, Iteration, Position
 from v2v_client.state import ResumeState, Stream
@@ -248,6 +249,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
     # --- iteration ----------------------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[Batch]:
+        if get_worker_info() is not None:
+            send_before_exit()
         return self._iterate(self._position.begin(self._consumer))
 
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:

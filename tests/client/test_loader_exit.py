@@ -1,0 +1,44 @@
+"""A process that ends takes the batches in its queue's thread along."""
+
+from __future__ import annotations
+
+import atexit
+import multiprocessing
+import multiprocessing.queues
+import threading
+import time
+from typing import Any
+
+from v2v_client.loader_exit import send_before_exit
+
+_the_end_has_come = threading.Event()
+
+
+class Ponderous:
+    """A batch whose pickling, as that of tensors, takes longer than its process has left to live."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        _the_end_has_come.wait()
+        time.sleep(0.2)
+        return str, ("arrived",)
+
+
+def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
+    """As a loader worker does whose trainer left early (torch.utils.data._utils.worker)."""
+    send_before_exit()
+    send_before_exit()
+    atexit.register(_the_end_has_come.set)  # the last to be registered is the first to be called
+    queue.put(Ponderous())
+    queue.cancel_join_thread()
+    queue.close()
+
+
+def test_a_spawned_process_sends_what_it_handed_over() -> None:
+    spawn = multiprocessing.get_context("spawn")
+    queue = spawn.Queue()
+    process = spawn.Process(target=hand_over_and_leave, args=(queue,))
+    process.start()
+    assert queue.get(timeout=30) == "arrived"
+    process.join()
+    assert process.exitcode == 0
+    queue.close()
