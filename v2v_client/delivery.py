@@ -94,7 +94,8 @@ def deliver(
     """
     window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
     most_drafts = -(-connection.credit // plan.batch_size) + 2
-    buffers.shape(connection.layout, plan.batch_size, spare=most_drafts)
+    # And the one that the trainer has: all of them are free when an epoch ends.
+    buffers.shape(connection.layout, plan.batch_size, spare=most_drafts + 1)
     drafts: dict[int, _Draft] = {}
     quarantine, lend = 0, shared_memory
 
