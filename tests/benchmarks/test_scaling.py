@@ -13,12 +13,13 @@ from tests.benchmarks.small import FLAGS, RECIPE, clips, is_picture, one_line, r
 MB = 1_000_000
 
 
-def workers(count: int, speed: float, ratio: float | None = None) -> dict[str, Any]:
+def workers(count: int, speed: float, ratio: float | None = None, of_two: float | None = None) -> dict[str, Any]:
     return {
         "measure": "workers",
         "workers": count,
         "batches_per_second": speed,
         "ratio_to_one_worker": ratio,
+        "ratio_to_two_workers": of_two,
         "workers_cpu_seconds_per_batch": 2.0,
         "broker_peak_rss_bytes": 100 * MB,
     }
@@ -36,7 +37,13 @@ def broker(count: int, bytes_per_second: float, peak: int = 100 * MB, window: in
     }
 
 
-GOOD = [workers(1, 1.0, 1.0), workers(2, 1.75, 1.75), workers(8, 1.75, 1.75), broker(1, 0.5e9), broker(8, 1e9)]
+GOOD = [
+    workers(1, 1.0, 1.0, 0.57),
+    workers(2, 1.75, 1.75, 1.0),
+    workers(8, 1.74, 1.76, 1.0),  # a median of turns, and one of ratios within them
+    broker(1, 0.5e9),
+    broker(8, 1e9),
+]
 
 
 def test_bars_that_are_kept_are_not_mentioned() -> None:
@@ -47,7 +54,7 @@ def test_bars_that_are_kept_are_not_mentioned() -> None:
     ("record", "words"),
     [
         (workers(2, 1.75, 1.74), "1.74 times as fast"),
-        (workers(8, 1.74, 1.74), "8 workers make 1.74"),
+        (workers(8, 1.8, 1.8, 0.99), "8 workers are 0.990 times as fast as 2"),
         (broker(8, 0.99e9), "0.99 GB/s"),
         (broker(8, 1e9, peak=201 * MB), "the broker had 201 MB; the bar is 200"),
     ],
@@ -60,7 +67,7 @@ def test_each_bar_is_missed_by_itself(record: dict[str, Any], words: str) -> Non
 
 
 def test_eight_workers_are_held_to_two_only_where_cores_are_few() -> None:
-    slow = [workers(1, 1.0, 1.0), workers(2, 2.0, 2.0), workers(8, 1.9, 1.9)]
+    slow = [workers(1, 1.0, 1.0, 0.5), workers(2, 2.0, 2.0, 1.0), workers(8, 1.9, 1.9, 0.95)]
     assert scaling.missed_bars(slow, cores=2)
     assert not scaling.missed_bars(slow, cores=16)
 
@@ -93,7 +100,10 @@ def test_a_short_run(tmp_path: Path) -> None:
     sample = (4 * 5 + 4) * 32 * 40
     assert scaling.sample_bytes(RECIPE) == sample
     assert found[-1]["credit_window_bytes"] == 6 * sample
-    assert found[0]["ratio_to_one_worker"] == 1.0
+    one, two = found[:2]
+    assert one["ratio_to_one_worker"] == two["ratio_to_two_workers"] == 1.0
+    assert two["batches_per_second_by_turn"] == [two["batches_per_second"]]
+    assert two["ratio_to_one_worker"] == two["batches_per_second"] / one["batches_per_second"]
     assert is_picture(picture)
 
 
