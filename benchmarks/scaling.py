@@ -12,7 +12,7 @@ Last it says how many real workers would keep one broker's core busy. That is ar
 here, not a measurement.
 
 Exit status: 1 where a bar is missed: two workers less than 1.75 times one; eight slower than two (where there are no
-more than four cores); a broker below 1 GB/s; a broker above 150 MB plus its credit window.
+more than four cores), both within a turn; a broker below 1 GB/s; a broker above 150 MB plus its credit window.
 """
 
 from __future__ import annotations

@@ -133,8 +133,10 @@ class Broker:
 
 
 def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
-    """A message that is there, and who sent it. The header is copied out as bytes; what follows stays in ZeroMQ's own
-    frames."""
+    """A message that is there, and who sent it.
+
+    The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
+    """
     try:
         identity, *frames = router.recv_multipart(zmq.NOBLOCK, copy=False)
     except zmq.Again:
