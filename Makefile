@@ -35,8 +35,9 @@ demo: $(READY) $(CLIPS)
 test: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow"
 
+# These start servers and wait for them: three at a time keep two cores busy.
 test-slow: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow
 
 $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLD_NUMPY)

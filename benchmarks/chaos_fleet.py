@@ -83,6 +83,7 @@ class Fleet:
         workers: of the server's own.
         consumers: how many.
         lease_deadline_seconds: for the server.
+        server_module: what is run as the server.
 
     Attributes:
         failures: processes that ended unasked.
@@ -94,6 +95,7 @@ class Fleet:
     workers: int
     consumers: int
     lease_deadline_seconds: float
+    server_module: str = "v2v_server"
     failures: list[Failure] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
@@ -158,7 +160,8 @@ class Fleet:
 
     def _server_command(self) -> list[str]:
         return [
-            *(sys.executable, "-m", "v2v_server", "--videos", str(self.videos), "--workers", str(self.workers)),
+            *(sys.executable, "-m", self.server_module, "--videos", str(self.videos)),
+            *("--workers", str(self.workers)),
             *("--bind", self._address, "--worker-bind", self._worker_address, "--port-file", str(self.port_file)),
             *("--cache-dir", str(self.cache), "--lease-deadline-seconds", str(self.lease_deadline_seconds)),
             # The server's own recipe only has to fit the corpus: every consumer states its own.
