@@ -33,7 +33,7 @@ demo: $(READY) $(CLIPS)
 	$(BIN)/python -m examples.demo --videos $(CLIPS) --picture out/demo.png
 
 test: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "not slow"
 
 # These start servers and wait for them: three at a time keep two cores busy.
 test-slow: $(READY) $(CLIPS)

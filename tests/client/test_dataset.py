@@ -444,7 +444,7 @@ def test_asking_again_for_what_is_only_slow_is_harmless(server):
 
 
 def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
-    stream = dataset(server, timeout_seconds=0.5)
+    stream = dataset(server, timeout_seconds=2.0)
     batches = iter(stream)
     next(batches)
     server.call(lambda: setattr(server, "mute", True))

@@ -95,7 +95,7 @@ def test_a_server_restarted_over_other_videos_is_refused_naming_both(clips: Path
 def test_a_server_that_is_gone_for_good_is_given_up_naming_the_last_sample(clips: Path) -> None:
     with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
         address = server.address
-        with iterating(address, timeout_seconds=1.5) as (client, go_on):
+        with iterating(address, timeout_seconds=3.5) as (client, go_on):
             kill(server)
             go_on.set()
             expected = rf"{address}: nothing heard for \d+ s; last sample: epoch 0, index \d+; start v2v-serve there"

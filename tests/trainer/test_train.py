@@ -231,7 +231,7 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
             return frames
 
         server.alter = silent_from_the_third_batch
-        message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=0.5)
+        message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=2.0)
     assert "nothing heard" in message
     assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
     assert (tmp_path / "run" / METRICS).is_file()
