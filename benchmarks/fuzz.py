@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import random
 import resource
 import shutil
@@ -49,6 +50,7 @@ MOST_DECODE_SECONDS = 1.0
 _SHOWN_BYTES = 400
 _TRIM_SECONDS = 0.5
 _SETTLE_SECONDS = 30.0
+_UNCHANGED = 4
 
 
 def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
@@ -130,10 +132,13 @@ def fuzz_live(videos: Path, messages: int, seed: int, folder: Path, remakes: int
     try:
         fleet.start()
         pid = fleet.server.pid or 0
-        before = _held_mib(pid)
-        with Attack(*fleet.addresses, random.Random(seed)) as attack:
+        # What the first messages need (arenas of Python and of threads, caches) is not what a leak would be.
+        with Attack(*fleet.addresses, random.Random(seed)) as warm_up:
+            warm_up.send(max(1, messages // 10))
+        before = _settled_mib(pid)
+        with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up")) as attack:
             began, committed = time.monotonic(), fleet.committed()[0]
-            attack.send(messages)
+            attack.send(messages - messages // 10)
             longest = attack.longest_seconds
             seconds = time.monotonic() - began
             under_attack = fleet.committed()[0] - committed
@@ -161,25 +166,24 @@ def fuzz_live(videos: Path, messages: int, seed: int, folder: Path, remakes: int
         "longest_seconds": longest,
         "rss_before_mib": before,
         "rss_after_mib": after,
-        **{f"sent_{form.replace('-', '_')}": count for form, count in sorted(attack.sent.items())},
+        **{f"sent_{form.replace('-', '_')}": count for form, count in sorted((warm_up.sent + attack.sent).items())},
     }
 
 
-def _held_mib(pid: int) -> float:
-    """Resident memory of a trimming server once it has trimmed; 0 when it is gone."""
-    with suppress(psutil.NoSuchProcess):
-        psutil.Process(pid).send_signal(signal.SIGUSR2)
-        time.sleep(_TRIM_SECONDS)
-    return rss_mib(pid) or 0.0
-
-
-def _settled_mib(pid: int, limit_mib: float) -> float:
-    """What a trimming server holds after an attack, when it has read what was still on its way: as soon as that is no
-    more than the limit, or when the time is up."""
+def _settled_mib(pid: int, limit_mib: float = math.inf) -> float:
+    """Resident memory of a trimming server (0 when it is gone) that has read what was on its way to it: once that is
+    within the limit and has not fallen for a while, or when the time is up."""
     deadline = time.monotonic() + _SETTLE_SECONDS
-    while (held := _held_mib(pid)) > limit_mib and time.monotonic() < deadline:
-        pass
-    return held
+    lowest, unchanged = math.inf, 0
+    while True:
+        with suppress(psutil.NoSuchProcess):
+            psutil.Process(pid).send_signal(signal.SIGUSR2)
+            time.sleep(_TRIM_SECONDS)
+        held = rss_mib(pid) or 0.0
+        unchanged = 0 if held < lowest - 1.0 else unchanged + 1
+        lowest = min(lowest, held)
+        if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _UNCHANGED):
+            return held
 
 
 def _await_batches(fleet: Fleet, count: int, seconds: float = 120.0) -> None:
