@@ -47,6 +47,7 @@ from benchmarks.corpus import webvid_like
 from benchmarks.memory import Fit, fit, rss_mib
 from v2v_client.loadtest import percentile
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.records import write_json
 from v2v_server.video.tree import VIDEO_SUFFIXES
 
 _LOOK_SECONDS = 0.05
@@ -274,7 +275,7 @@ def _torment_and_judge(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) ->
     for failure in fleet.failures[:20]:
         print(f"ended unasked: {failure.name}, status {failure.status}: {failure.text}")
     if asked.json is not None:
-        asked.json.write_text(json.dumps([record], indent=1) + "\n", encoding="utf-8")
+        write_json(asked.json, [record])
     return 1 if any(record[key] for key in FAILING) or record["unrecovered"] else 0
 
 

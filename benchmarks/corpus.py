@@ -9,7 +9,6 @@ medium, three B-frames), with one encoder thread so that the bytes depend on not
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ import numpy as np
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.records import write_json
 from v2v_server.video.probe import probe
 from v2v_server.video.source import opened, pictures
 
@@ -152,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for clip in made:
         print(f"{clip.path}  {clip.frames} frames  {clip.bits_per_second / 1e3:.0f} kb/s  from {clip.source}")
     if asked.json is not None:
-        asked.json.write_text(json.dumps([asdict(clip) for clip in made], indent=1) + "\n")
+        write_json(asked.json, [asdict(clip) for clip in made])
     return 0
 
 

@@ -8,13 +8,14 @@ Each row (``extreme_rows.py``) is a check that can fail; the exit status is 1 wh
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.extreme_rows import Row, rows
+from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
 
 
 def measure(chosen: Sequence[Row]) -> list[dict[str, Any]]:
@@ -74,10 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(report(records))
     try:
         if asked.json is not None:
-            asked.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+            write_json(asked.json, records)
         if asked.plot is not None:
             plot(records, asked.plot)
-    except OSError as error:
+    except (UsageError, OSError) as error:
         print(f"v2v-bench extremes: {error}", file=sys.stderr)
         return 2
     failed = [r["row"] for r in records if not r["passed"]]

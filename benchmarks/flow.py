@@ -12,7 +12,6 @@ are CPU time of one thread.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +27,7 @@ import numpy.typing as npt
 from benchmarks.known_motion import PHOTOGRAPHS, Grey, Scene, photograph, scenes
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import preset
+from v2v_protocol.records import write_json
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
@@ -379,7 +379,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ratio = cost_ratio(records, number, default)
             print(f"a sample with {number} steps of flow costs {ratio:.2f} times that without")
     if asked.json is not None:
-        asked.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        write_json(asked.json, records)
     if asked.plot is not None:
         plot(records, asked.plot)
     missed = missed_bars(records, still_px)

@@ -16,7 +16,6 @@ Exit status: 0 nothing gave way, 1 something did, 2 wrong usage.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import random
 import resource
@@ -39,6 +38,7 @@ from benchmarks.fuzz_frames import MESSAGE_TYPES, FrameFuzzer
 from benchmarks.fuzz_peers import Attack
 from benchmarks.memory import MIB, rss_mib
 from v2v_protocol.errors import ProtocolError, UsageError, V2VError
+from v2v_protocol.records import write_json
 from v2v_protocol.wire import decode, decode_sample
 
 MOST_GROWTH_MIB = 16.0
@@ -237,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 if asked.keep is None:
                     shutil.rmtree(folder)
         if asked.json is not None:
-            asked.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+            write_json(asked.json, records)
     except (V2VError, OSError) as error:
         print(f"fuzz: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

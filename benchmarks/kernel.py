@@ -15,7 +15,6 @@ as slow as without.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import statistics
@@ -30,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.released import simulate_steps
+from v2v_protocol.records import write_json
 from v2v_server.process import keep_freed_memory
 from v2v_server.simulation import simulate
 
@@ -130,7 +130,7 @@ def main() -> int:
             f"{record['median_ratio_to_released']:8.1f} x"
         )
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        write_json(arguments.json, records)
     by_name = {record["name"]: record for record in records}
     ratio = by_name["kernel"]["ratio_to_released"]
     slower = by_name["kernel_all_effects"]["cpu_seconds_per_sample"] / by_name["kernel"]["cpu_seconds_per_sample"]

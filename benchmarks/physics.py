@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from benchmarks.physics_report import MOTION_PX, Records, plot, tables
 from benchmarks.recorded import compare, read_recording
 from benchmarks.scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.records import write_json
 from v2v_server.flow.methods import METHODS
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -226,7 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         records = [*analytic(), *moved_photographs(), *film, *recorded]
         print("\n".join(tables(records)))
         if asked.json is not None:
-            asked.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+            write_json(asked.json, records)
         if asked.plot is not None:
             plot(records, asked.plot)
     except (V2VError, OSError) as error:

@@ -13,7 +13,6 @@ the inverse transform open, in FFmpeg's bit-exact mode. There, speed is relative
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import sys
@@ -30,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.records import write_json
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.encode import CODECS, Codec, Encoding, encode_luma
 from v2v_server.video.index import FrameIndex
@@ -339,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print()
     _print(decoders)
     if asked.json is not None:
-        asked.json.write_text(json.dumps(records + decoders, indent=1) + "\n", encoding="utf-8")
+        write_json(asked.json, records + decoders)
     if asked.plot is not None:
         plot(records, asked.plot)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import signal
 import sys
@@ -18,6 +17,7 @@ from rich.table import Table
 from v2v_client import loadtest
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 
 Record = Mapping[str, Any]
@@ -114,7 +114,7 @@ def _cell(value: Any, form: str, factor: float) -> str:
 def write(records: Sequence[Record], file: Path | None) -> None:
     """Writes the records as a JSON list, where a file is given."""
     if file is not None:
-        file.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        write_json(file, records)
 
 
 def say_missed(missed: Sequence[str]) -> int:

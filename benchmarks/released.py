@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import os
 import statistics
 import sys
@@ -30,6 +29,7 @@ from torch.utils.data import Dataset, default_collate
 
 from v2v_protocol.errors import CorpusError, UsageError, V2VError, VideoError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.records import write_json
 from v2v_server.video.rows import Rows
 
 BATCH_SIZE = 12
@@ -243,7 +243,7 @@ def main() -> int:
         print(f"{stage:8s}{value * 1e3:8.1f} ms per sample")
     print(f"{'all':8s}{sum(seconds.values()) * 1e3:8.1f} ms per sample")
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        write_json(arguments.json, records)
     return 0
 
 

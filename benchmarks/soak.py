@@ -13,7 +13,6 @@ Exit status: 0 no process grows, 1 one does, or a sample was lost or came twice,
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -32,6 +31,7 @@ from v2v_client.loadtest import recipe_of
 from v2v_client.local_server import LocalServer
 from v2v_client.schedule_check import ScheduleCheck
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.records import write_json
 
 _POINT_SECONDS = 1.0
 _WARM_UP_SHARE = 0.2
@@ -191,7 +191,7 @@ def run(asked: argparse.Namespace) -> int:
     records = records_of(seen, fits, asked)
     _show(records, fits, seen, warm_up)
     if asked.json is not None:
-        asked.json.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        write_json(asked.json, records)
     if asked.plot is not None:
         plot(asked.plot, seen.memory, fits, warm_up)
     return 1 if not seen.faultless or any(record["grows"] for record in records) else 0

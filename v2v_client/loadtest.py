@@ -7,7 +7,6 @@ The first ``--warmup-batches`` are received and checked, but not timed.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -26,6 +25,7 @@ from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.schedule_check import ScheduleCheck
 from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import SPEED_PRESETS
 
@@ -297,12 +297,7 @@ def run(arguments: argparse.Namespace) -> int:
         "between asking for and having a batch; CPU: " + _cpu_scope(arguments)
     )
     if arguments.json:
-        try:
-            with open(arguments.json, "w", encoding="utf-8") as file:
-                json.dump(records, file, indent=2)
-                file.write("\n")
-        except OSError as error:
-            raise UsageError(f"--json {arguments.json}: {error.strerror}") from error
+        write_json(arguments.json, records)
     return 0 if all(check.faultless for _, check in results) else 1
 
 

@@ -166,13 +166,29 @@ def _add_spec(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(
-    parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], None], argv: Sequence[str] | None
+    parser: argparse.ArgumentParser,
+    run: Callable[[argparse.Namespace], None],
+    argv: Sequence[str] | None,
+    *,
+    interrupted: str = "",
 ) -> None:
-    """Runs a command; an error of ours becomes one line on stderr and an exit status."""
+    """Runs a command; an error of ours becomes one line on stderr and an exit status.
+
+    Args:
+        parser: from :func:`new_parser`.
+        run: does the work.
+        argv: the command line; None takes that of the process.
+        interrupted: what to say of a Ctrl-C; nothing if empty.
+
+    Raises:
+        SystemExit: 1 after an error, 2 after one of usage (argparse's too), 130 after a Ctrl-C.
+    """
     arguments = parser.parse_args(argv)
     try:
         run(arguments)
     except KeyboardInterrupt:
+        if interrupted:
+            print(f"{parser.prog}: {interrupted}", file=sys.stderr)
         sys.exit(130)
     except V2VError as error:
         if arguments.debug:

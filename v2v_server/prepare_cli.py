@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import statistics
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
+from v2v_server.cli import new_parser, run_command
 from v2v_server.progress import catalogue_progress
 from v2v_server.video import prepare
 from v2v_server.video.catalogue import open_catalogue
@@ -33,9 +33,8 @@ _SHOWN = 20
 
 def main(argv: Sequence[str] | None = None) -> None:
     """`v2v-prepare`."""
-    parser = argparse.ArgumentParser(
-        prog="v2v-prepare",
-        description="Transcode a corpus once to what training needs: chosen rows, grey, fast decode.",
+    parser = new_parser(
+        "v2v-prepare", "Transcode a corpus once to what training needs: chosen rows, grey, fast decode."
     )
     defaults = ", ".join(f"{name} {codec.default}" for name, codec in CODECS.items())
     parser.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
@@ -69,20 +68,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     parser.add_argument("--json", metavar="FILE", help="also write a record of each video")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
-    arguments = parser.parse_args(argv)
-    try:
-        complete = _run(arguments)
-    except KeyboardInterrupt:
-        print("v2v-prepare: interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
-    except V2VError as error:
-        if arguments.debug:
-            raise
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        sys.exit(2 if isinstance(error, UsageError) else 1)
-    if not complete:
-        sys.exit(1)
+
+    def run(arguments: argparse.Namespace) -> None:
+        if not _run(arguments):
+            sys.exit(1)
+
+    run_command(parser, run, argv, interrupted="interrupted; the same command goes on from here")
 
 
 def _run(arguments: argparse.Namespace) -> bool:
@@ -111,7 +102,8 @@ def _run(arguments: argparse.Namespace) -> bool:
             progress=progress,
         )
     if arguments.json is not None:
-        _write_json(Path(arguments.json), report)
+        records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in report.unusable]
+        write_json(arguments.json, records)
     for line in summary(report, encoding, time.monotonic() - started):
         print(line)
     return report.complete
@@ -153,14 +145,6 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
     if len(items) > _SHOWN:
         lines.append(f"  ... and {len(items) - _SHOWN} more; --json FILE has them all")
     return lines
-
-
-def _write_json(path: Path, report: prepare.Report) -> None:
-    records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in report.unusable]
-    try:
-        path.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--json {path}: cannot be written: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager

@@ -7,13 +7,13 @@ has read, and takes up a clearing with its next verdict or its next start.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError, V2VError
+from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.records import write_json
 from v2v_server.cli import new_parser, run_command
 from v2v_server.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
 
@@ -35,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             _clear(file, quarantine)
         in_force = quarantine.verdicts(quarantine.latest)
         if arguments.json is not None:
-            _write_json(arguments.json, quarantine)
+            records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
+            write_json(arguments.json, records)
         for line in quarantine.lines:
             print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
         print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
@@ -56,15 +57,6 @@ def _clear(file: Path, quarantine: Quarantine) -> None:
         quarantine.extend(write_verdict(file, clearing(now), quarantine))
     except OSError as error:
         raise V2VError(f"quarantine file {file} cannot be written: {error.strerror}; nothing was cleared") from error
-
-
-def _write_json(file: str, quarantine: Quarantine) -> None:
-    in_force = quarantine.verdicts(quarantine.latest)
-    records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
-    try:
-        Path(file).write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--json {file}: {error.strerror}") from error
 
 
 if __name__ == "__main__":

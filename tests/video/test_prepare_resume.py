@@ -57,6 +57,19 @@ def test_a_second_run_keeps_everything(source: Path, tmp_path: Path) -> None:
     assert inodes(tmp_path / "out") == before
 
 
+def test_ctrl_c_says_that_the_same_command_goes_on(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("v2v_server.video.prepare.prepare", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"])
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
+
+
 def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(source, out)

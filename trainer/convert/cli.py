@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from trainer.convert.text_events import NS_PER_UNIT
 from trainer.evaluation import layout
 from v2v_client.command import run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -78,10 +78,7 @@ def _run(arguments: argparse.Namespace) -> int:
         print(summary(done))
         records.append(_record(done))
     if arguments.json is not None:
-        try:
-            Path(arguments.json).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"--json {arguments.json}: cannot be written: {error.strerror or error}") from error
+        write_json(arguments.json, records)
     return 0
 
 

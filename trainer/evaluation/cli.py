@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
 from v2v_client.command import run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
 
 LEAST_WIDTH = 110
 """Of tables that do not go to a terminal."""
@@ -109,7 +109,7 @@ def _run(arguments: argparse.Namespace) -> int:
             "cuts": arguments.cuts,
             "reconstruction_hz": run.fps,
         }
-        _write_json(Path(arguments.json), records(scores, settings))
+        write_json(arguments.json, records(scores, settings))
     return 0
 
 
@@ -163,13 +163,6 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
                     f"{score.sequence}: {score.repaired_images} time stamps of pictures mended, "
                     f"{score.empty_windows} windows without events"
                 )
-
-
-def _write_json(path: Path, made: list[dict[str, Any]]) -> None:
-    try:
-        path.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--json {path}: cannot be written: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager

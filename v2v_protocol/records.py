@@ -1,0 +1,23 @@
+"""What a command measured or did, as a JSON file: one list of flat records."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from v2v_protocol.errors import UsageError
+
+
+def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
+    """Writes the records of a command's ``--json FILE``.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    try:
+        Path(file).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--json {os.fspath(file)}: cannot be written: {error.strerror or error}") from error
