@@ -53,6 +53,7 @@ def test_correlation_is_that_of_the_later_half_within_each_frame() -> None:
     assert training_trade.judge(prediction, target).correlation == pytest.approx(np.mean(expected), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_failed_training_says_which_and_why(tmp_path: Path) -> None:
     with pytest.raises(training_trade.TrainingFailed, match=r"exact, seed 4: status 2: .*optimizer.nonsense"):
         training_trade.train("tcp://127.0.0.1:1", "exact", 4, ["optimizer.nonsense=1"], tmp_path)

@@ -129,6 +129,7 @@ def test_numba_keeps_the_kernels_there_whoever_is_imported_first(first: str) -> 
     assert Path(run(code)).parent == compile_cache.SOURCES / "__pycache__" / NAME
 
 
+@pytest.mark.slow
 def test_a_change_of_one_module_reaches_the_kernels_of_another(tmp_path: Path) -> None:
     leave = shutil.ignore_patterns("__pycache__")
     for package in ("v2v_protocol", "v2v_server"):

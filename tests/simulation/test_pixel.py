@@ -296,7 +296,7 @@ def test_golden_voxels(dtype: Any) -> None:
     assert digest(dtype) == GOLDEN[dtype]
 
 
-@pytest.mark.parametrize("dtype", ["int8", pytest.param("float32", marks=pytest.mark.slow)])
-def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path, dtype: str) -> None:
-    code = f"from tests.simulation.test_pixel import digest; print(digest('{dtype}'))"
-    assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN[dtype]]
+@pytest.mark.slow
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
+    code = "from tests.simulation.test_pixel import digest; print(digest('int8')); print(digest('float32'))"
+    assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["int8"], GOLDEN["float32"]]
