@@ -32,10 +32,10 @@ $(CLIPS): $(READY)
 demo: $(READY) $(CLIPS)
 	$(BIN)/python -m examples.demo --videos $(CLIPS) --picture out/demo.png
 
+# Many tests wait for processes of theirs: three at a time keep two cores busy.
 test: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "not slow"
 
-# These start servers and wait for them: three at a time keep two cores busy.
 test-slow: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow
 

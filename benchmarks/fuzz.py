@@ -50,7 +50,7 @@ MOST_DECODE_SECONDS = 1.0
 _SHOWN_BYTES = 400
 _TRIM_SECONDS = 0.5
 _SETTLE_SECONDS = 30.0
-_UNCHANGED = 4
+_SETTLED_LOOKS = 4
 
 
 def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def _settled_mib(pid: int, limit_mib: float = math.inf) -> float:
         held = rss_mib(pid) or 0.0
         unchanged = 0 if held < lowest - 1.0 else unchanged + 1
         lowest = min(lowest, held)
-        if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _UNCHANGED):
+        if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _SETTLED_LOOKS):
             return held
 
 

@@ -134,7 +134,7 @@ def compare(asked: argparse.Namespace) -> list[dict[str, Any]]:
     ):
         for seed in asked.seeds:
             for limit, settings in limits.items():
-                for preset in asked.presets:
+                for preset in SPEED_PRESETS:
                     out = Path(folder) / f"{preset}-{seed}-{settings[0]}"
                     steps = train(server.address, preset, seed, settings, out)
                     judgement = judge_weights(out / LAST, judges)
@@ -165,15 +165,6 @@ def _seeds(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in text.split(","))
 
 
-def _presets(text: str) -> tuple[str, ...]:
-    names = tuple(text.split(","))
-    if unknown := set(names) - set(SPEED_PRESETS):
-        raise argparse.ArgumentTypeError(
-            f"no preset {', '.join(sorted(unknown))}; there are {', '.join(SPEED_PRESETS)}"
-        )
-    return names
-
-
 def _work(asked: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     records = compare(asked)
@@ -188,7 +179,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--videos", required=True, help="to train on")
     parser.add_argument("--held-out", required=True, help="videos to judge by")
     parser.add_argument("--rows", default="full", help="of --videos")
-    parser.add_argument("--presets", type=_presets, default=tuple(SPEED_PRESETS), metavar="A,B", help="(default all)")
     parser.add_argument("--seeds", type=_seeds, default=(0, 1, 2), metavar="0,1,2")
     parser.add_argument(
         "--steps", type=int, default=60, help="batches of each run of equal samples (default 60; 0: none)"

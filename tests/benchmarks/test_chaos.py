@@ -106,7 +106,7 @@ def test_a_short_run_keeps_the_promise(tmp_path: Path) -> None:
     for number in range(6):
         write_clip(clips / f"{number}.mp4", panned_luma(201, 128, 160, step=(1, 1 + number)), gop=12)
     out = tmp_path / "chaos.json"
-    flags = ["--minutes", "0.35", "--every", "1.5", "--remakes", "40", "--seed", "3"]
+    flags = ["--minutes", "0.5", "--every", "1.5", "--remakes", "60", "--seed", "3"]
     status = chaos.main(["--videos", str(clips), *flags, "--keep", str(tmp_path / "run"), "--json", str(out)])
     (record,) = json.loads(out.read_text(encoding="utf-8"))
     assert set(DEMANDED) <= set(record)

@@ -140,7 +140,7 @@ def test_workers_that_always_die_end_in_one_clear_error(
 ) -> None:
     with _faulty(monkeypatch, clips, "--cache-dir", str(cache), stage="decode", action="exit") as server:
         process = psutil.Process(server.pid)
-        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=3)
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=10)
         with pytest.raises(ServerLost):
             list(dataset)
         assert not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
