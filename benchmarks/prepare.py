@@ -33,7 +33,7 @@ from v2v_protocol.records import write_json
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.encode import CODECS, Codec, Encoding, encode_luma
 from v2v_server.video.index import FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma
+from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import probe
 from v2v_server.video.rows import Rows
@@ -113,7 +113,8 @@ class File:
         with opened(self.path) as (container, stream):
             stream.codec_context.options = dict(options)
             for number, frame in enumerate(pictures(container, stream)):
-                copy_luma(frame, LumaFormat.of(frame), self.window, frames[number])
+                luma = LumaFormat.of(frame)
+                copy_luma(luma_plane(frame, luma), luma, self.window, frames[number])
                 if number + 1 == JOB_FRAMES:
                     break
         return frames

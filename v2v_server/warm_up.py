@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,13 @@ def warm_up_in_turn() -> None:
         if is_to_compile:
             # Should it fail, so will the next line, or it does the work.
             subprocess.run([sys.executable, "-m", __name__, str(os.getpid())], stdin=subprocess.DEVNULL, check=False)
-        warm_up()
+        load_kernels()
+
+
+def load_kernels() -> None:
+    """Loads from the cache, or compiles, what every worker runs."""
+    warm_up()
+    import_module("v2v_server.video.full_range")  # importing it compiles, or loads, what is in it
 
 
 @contextmanager
@@ -95,4 +102,4 @@ def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
 
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
-    warm_up()
+    load_kernels()

@@ -16,7 +16,6 @@ import time
 from collections import deque
 from pathlib import Path
 
-import cv2
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
@@ -189,7 +188,8 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     if not root.is_dir():
         raise CorpusError(f"--videos {root}: no such folder on this host")
     keep_freed_memory()
-    cv2.setNumThreads(1)
+    # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
+    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
     # Compile or load the kernels first: a worker that has said hello can work at full speed.
     warm_up_in_turn()
     # What is there by now stays: without it a collection takes a fraction of a millisecond.

@@ -9,7 +9,7 @@ import pytest
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange
 
-from v2v_server.video.luma import LumaFormat, range_table
+from v2v_server.video.luma import LumaFormat, range_table, stretch
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])
@@ -33,6 +33,25 @@ def test_limited_range_equals_swscale_for_every_value() -> None:
     frame.color_range = ColorRange.MPEG
     grey = frame.reformat(format="gray").to_ndarray()
     np.testing.assert_array_equal(range_table(8, False)[luma], grey)
+
+
+def test_stretching_is_the_table_for_every_value_in_every_layout() -> None:
+    luma = np.arange(256, dtype=np.uint8)
+    whole = np.stack([np.roll(luma, shift) for shift in range(256)]).reshape(4, 64, 256)  # every value at every column
+    limited = LumaFormat("yuv420p", int(ColorRange.MPEG), 8, full_range=False, has_plane=True)
+    for part in (np.s_[:], np.s_[1:3], np.s_[:, 5:60], np.s_[:, :, 3:200], np.s_[::2, ::3, 7:8], np.s_[:0]):
+        frames = whole.copy()
+        stretch(frames[part], limited)
+        expected = whole.copy()
+        expected[part] = range_table(8, False)[whole[part]]
+        np.testing.assert_array_equal(frames, expected)
+
+
+@pytest.mark.parametrize(("bits", "full_range"), [(8, True), (10, False), (10, True)])
+def test_what_is_grey_already_is_not_stretched(bits: int, full_range: bool) -> None:
+    frames = np.arange(256, dtype=np.uint8).reshape(1, 16, 16)
+    stretch(frames, LumaFormat("any", 0, bits, full_range, has_plane=True))
+    np.testing.assert_array_equal(frames.ravel(), np.arange(256))
 
 
 @pytest.mark.parametrize(

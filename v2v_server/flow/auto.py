@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from v2v_server.flow import dis
 from v2v_server.flow.estimator import Picture, guarded
+from v2v_server.opencv import cv2
 
 STILL = "zero"
 SLOW = "dis-ultrafast"

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -22,6 +21,7 @@ from v2v_server.flow.estimator import Estimator, Picture, one_thread
 from v2v_server.flow.methods import method
 from v2v_server.flow.settings import AUTO, FlowSettings
 from v2v_server.flow.validity import consistent
+from v2v_server.opencv import cv2
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window
 

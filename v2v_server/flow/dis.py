@@ -6,13 +6,11 @@ the picture's size. Scale 1 takes about four times as long and resolves motion t
 
 from __future__ import annotations
 
-import cv2
-
 from v2v_server.flow.estimator import Estimator, Field, Picture
+from v2v_server.opencv import cv2
 
-ULTRAFAST = cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
-FAST = cv2.DISOPTICAL_FLOW_PRESET_FAST
-MEDIUM = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+ULTRAFAST, FAST, MEDIUM = range(3)
+"""OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*: naming them here would load it."""
 
 SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""

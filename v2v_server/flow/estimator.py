@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+
+from v2v_server.opencv import cv2
 
 Picture = npt.NDArray[np.uint8]
 """[h, w] uint8, C-contiguous."""

@@ -5,9 +5,8 @@ Farneback, "Two-Frame Motion Estimation Based on Polynomial Expansion", SCIA 200
 
 from __future__ import annotations
 
-import cv2
-
 from v2v_server.flow.estimator import Estimator, Field, Picture
+from v2v_server.opencv import cv2
 
 SMALLEST_SIDE_PX = 16
 

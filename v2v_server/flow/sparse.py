@@ -8,10 +8,10 @@ neighbours are never more than the points.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from v2v_server.flow.estimator import Estimator, Field, Picture
+from v2v_server.opencv import cv2
 
 SMALLEST_SIDE_PX = 64
 _GRID_STEP_PX = 8

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from v2v_server.flow.estimator import Field
+from v2v_server.opencv import cv2
 
 _SHARE = 0.01
 _FLOOR_PX2 = 0.5

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
+from v2v_server.opencv import cv2
 from v2v_server.simulation.draw import resized_size
 
 Frames = npt.NDArray[np.uint8]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.index import FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma, range_table
+from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, Window
 
 
@@ -66,7 +66,8 @@ class Stack:
         self._into = into
         self._stride = stride = task.stride
         first, most = task.start - index.first, max(cut.count for cut in cuts)
-        self._expected = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
+        self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
+        self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
         self._taken = 0
         self._cursor = 0  # where the next frame is expected in the index
@@ -89,10 +90,10 @@ class Stack:
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
         """Whether the decoder has left out a frame that the index lists in front of this one."""
-        pts, at = self.index.pts, self._cursor
+        pts, at = self._pts, self._cursor
         if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
             return False
-        found = at if at < len(pts) and pts[at] == frame.pts else int(np.searchsorted(pts, frame.pts))
+        found = at if at < len(pts) and pts[at] == frame.pts else bisect_left(pts, frame.pts)
         self._cursor = found + 1
         return found > at
 
@@ -114,7 +115,7 @@ class Stack:
 
     def _is_passed_over(self, pts: int) -> bool:
         """Whether a frame that presents before the next one to take is one that the stride leaves out."""
-        return self._stride > 1 and bool(np.any(self.index.pts == pts))
+        return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:
         if not self._parts:
@@ -128,9 +129,10 @@ class Stack:
             )
         if not self._luma.describes(frame):
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
+        samples = luma_plane(frame, self._luma)
         for stored, raw in self._parts:
             if self._taken < len(raw):
-                copy_luma(frame, self._luma, stored, raw[self._taken])
+                copy_luma(samples, self._luma, stored, raw[self._taken])
 
     def _part(self, number: int, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
         window = window_of(cut)
@@ -156,7 +158,5 @@ class Stack:
     def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
         """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
         for _, raw in self._parts:
-            if self._luma.bits == 8 and not self._luma.full_range:
-                for rows in (raw.reshape(-1, raw.shape[-1]),) if raw.flags.c_contiguous else raw:
-                    cv2.LUT(rows, range_table(8, False), dst=rows)
+            stretch(raw, self._luma)
             yield self._orientation.upright(raw) if raw.flags.c_contiguous else raw

@@ -26,6 +26,7 @@ from av.video.reformatter import ColorRange
 
 from v2v_server.video.orientation import Window
 
+_BYTE = np.dtype(np.uint8)
 _LUMA_PLANE = re.compile(r"(yuvj?\d{3}p|yuva\d{3}p|gray|nv(12|16|21|24)$)((9|10|12|14|16)(le|be))?$")
 
 
@@ -64,7 +65,7 @@ class LumaFormat:
     def sample(self) -> np.dtype[np.unsignedinteger]:
         """dtype of one sample in the plane."""
         if self.bits == 8:
-            return np.dtype(np.uint8)
+            return _BYTE
         return np.dtype(">u2" if self.pixel_format.endswith("be") else "<u2")
 
 
@@ -87,19 +88,40 @@ def range_table(bits: int, full_range: bool) -> npt.NDArray[np.uint8]:
     return table
 
 
-def copy_luma(frame: VideoFrame, luma: LumaFormat, window: Window, out: npt.NDArray[np.uint8]) -> None:
-    """Copy a window of a frame's luma to ``out`` [h, w] uint8, straight from the decoder's memory.
-
-    8-bit samples are copied as they are (the caller maps the whole stack once); deeper ones are mapped to grey.
-    """
-    top, left, height, width = window
+def luma_plane(frame: VideoFrame, luma: LumaFormat) -> npt.NDArray[np.unsignedinteger]:
+    """The samples of a frame's luma, [H, W] uint8 or uint16 as stored: the decoder's own memory, only to be read."""
     if not luma.has_plane:
         frame = frame.reformat(format="gray")
     plane = frame.planes[0]
-    stride = plane.line_size // luma.sample.itemsize
-    samples = np.frombuffer(memoryview(plane), luma.sample, count=stride * frame.height).reshape(frame.height, stride)
+    sample = luma.sample
+    strides = plane.line_size, sample.itemsize
+    return np.ndarray((frame.height, frame.width), sample, plane, strides=strides)  # type: ignore[arg-type]  # a buffer
+
+
+def copy_luma(
+    samples: npt.NDArray[np.unsignedinteger], luma: LumaFormat, window: Window, out: npt.NDArray[np.uint8]
+) -> None:
+    """Copy a window of :func:`luma_plane` to ``out`` [h, w] uint8.
+
+    8-bit samples are copied as they are (:func:`stretch` maps a whole stack at once); deeper ones are mapped to grey.
+    """
+    top, left, height, width = window
     view = samples[top : top + height, left : left + width]
     if luma.bits == 8:
         out[...] = view
     else:
         np.take(range_table(luma.bits, luma.full_range), view, out=out)
+
+
+def stretch(frames: npt.NDArray[np.uint8], luma: LumaFormat) -> None:
+    """Map what :func:`copy_luma` has copied to grey, in place, where it is not grey yet.
+
+    Args:
+        frames: [n, h, w] uint8, neighbours of a row side by side.
+        luma: the format that they were copied from.
+    """
+    if luma.bits == 8 and not luma.full_range:
+        # Whoever only lists or opens videos does without the compiler.
+        from v2v_server.video.full_range import to_full_range
+
+        to_full_range(frames)

@@ -22,7 +22,7 @@ from v2v_server.video.encode import Encoding, encode_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.index import FrameIndex
 from v2v_server.video.look import Look
-from v2v_server.video.luma import LumaFormat, copy_luma, range_table
+from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, Window
 from v2v_server.video.probe import probe
 from v2v_server.video.scene import MOST_FRAMES, Scene
@@ -163,11 +163,10 @@ def _track_frames(
                     stored = orientation.stored_window(window, index.height_px, index.width_px)
                 if (frame.height, frame.width) != size or not luma.describes(frame):
                     raise VideoError(name, done, "the picture's size or format changes here")
-                picture = np.empty(stored[2:], np.uint8)
-                copy_luma(frame, luma, stored, picture)
-                if luma.bits == 8 and not luma.full_range:
-                    cv2.LUT(picture, range_table(8, False), dst=picture)
-                yield orientation.upright(picture[None])[0]
+                frames = np.empty((1, *stored[2:]), np.uint8)
+                copy_luma(luma_plane(frame, luma), luma, stored, frames[0])
+                stretch(frames, luma)
+                yield orientation.upright(frames)[0]
                 done += 1
                 if done == len(index):
                     return

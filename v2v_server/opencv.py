@@ -1,0 +1,26 @@
+"""OpenCV, loaded when something of it is first used.
+
+A worker whose samples have no flow and are not resized needs nothing of it, and starts without its 30 MB. What names a
+part of OpenCV while it is imported itself, as a default value or a constant, would load it for all: write ``cv2.NAME``
+inside functions only.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import cv2
+else:
+
+    class _OpenCV:
+        def __getattr__(self, name: str) -> Any:
+            import cv2
+
+            value = getattr(cv2, name)
+            setattr(self, name, value)  # the next time it is found without coming here
+            return value
+
+    cv2 = _OpenCV()
+
+__all__ = ["cv2"]
