@@ -1,13 +1,7 @@
 """Memory for batches that is used again, but never while anything still looks at it.
 
 Fresh memory costs more than the copy into it: the kernel hands out zeroed pages one fault at a time. So memory whose
-last user is gone goes back to its pool.
-
-How the last user is known, where the memory is this process's own: an array of a batch does not own its memory but
-refers to a small *loan* object that does (NumPy keeps the object behind ``__array_interface__`` alive as the array's
-base). Whatever is made from that array without copying, a view, a torch tensor, a tensor's storage, another tensor or
-array of the same storage, keeps the loan alive; its finalizer puts the memory back. No reference is counted by hand,
-and no promise of the user is needed. Arrays of an arena refer to their mapping in the same way.
+last user is gone (:mod:`v2v_client.loan`) goes back to its pool.
 
 A process that was forked while somebody looked at an arena may look at it for as long as it likes, and nobody here
 would know: such an arena is not used again.
@@ -17,7 +11,6 @@ from __future__ import annotations
 
 import math
 import os
-import weakref
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -26,22 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_client.arena import Arena, open_arena
+from v2v_client.loan import lend
 from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Layout
-
-
-class _Loan:
-    """Owner, in the eyes of NumPy, of borrowed memory."""
-
-    __slots__ = ("__array_interface__", "__weakref__")
-
-    def __init__(self, memory: npt.NDArray[np.uint8], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        self.__array_interface__ = {
-            "version": 3,
-            "data": (memory.ctypes.data, False),
-            "shape": shape,
-            "typestr": dtype.str,
-        }
 
 
 class BufferPool:
@@ -64,10 +44,7 @@ class BufferPool:
             memory = self._free.pop()
         except IndexError:
             memory = np.empty(math.prod(self._shape) * self._dtype.itemsize, np.uint8)
-        loan = _Loan(memory, self._dtype, self._shape)
-        # The finalizer holds the memory while the loan lives.
-        weakref.finalize(loan, self._free.append, memory).atexit = False
-        return np.asarray(loan)
+        return lend(memory, self._dtype, self._shape, self._free.append)
 
 
 class Memory(Protocol):

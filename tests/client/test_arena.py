@@ -78,6 +78,48 @@ def test_what_the_holder_of_a_batch_writes_is_his_alone(arena: Arena) -> None:
     assert holds(again, 2, 2)
 
 
+def test_a_batch_is_mapped_once_while_nobody_writes_to_it(arena: Arena) -> None:
+    assert write(arena.slot(2), 1)
+    arrays = arena.arrays(nobody)
+    first = arrays["voxels"].ctypes.data
+    assert holds(arrays, 2, 1)
+    del arrays
+    assert write(arena.slot(2), 2)
+    arrays = arena.arrays(nobody)
+    assert arrays["voxels"].ctypes.data == first
+    assert holds(arrays, 2, 2)
+
+
+@pytest.mark.parametrize("name", list(LAYOUT))
+@pytest.mark.parametrize("row", [0, ROWS - 1])
+def test_nothing_is_left_of_what_an_earlier_holder_wrote(arena: Arena, name: str, row: int) -> None:
+    for other in range(ROWS):
+        assert write(arena.slot(other), other)
+    arrays = arena.arrays(nobody)
+    arrays[name][row].reshape(-1)[-1] += 1
+    assert not holds(arrays, row, row)
+    del arrays
+    assert write(arena.slot(1), 7)
+    arrays = arena.arrays(nobody)
+    assert [holds(arrays, other, 7 if other == 1 else other) for other in range(ROWS)] == [True] * ROWS
+
+
+@pytest.mark.parametrize("said", ["nothing", "zeros", "too little"])
+def test_a_kernel_that_does_not_say_who_wrote_is_no_reason_to_show_it(
+    arena: Arena, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pread(descriptor: int, count: int, offset: int) -> bytes:
+        if said == "nothing":
+            raise PermissionError
+        return bytes(count) if said == "zeros" else really(descriptor, count - 8, offset)
+
+    really = os.pread
+    monkeypatch.setattr(os, "pread", pread)
+    assert write(arena.slot(0), 5)
+    arena.arrays(nobody)["voxels"][...] = 111
+    assert holds(arena.arrays(nobody), 0, 5)
+
+
 def test_a_row_can_be_copied_out(arena: Arena) -> None:
     assert write(arena.slot(1), 8)
     copied = arena.get(1)
