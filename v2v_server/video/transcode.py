@@ -218,7 +218,7 @@ def _squared_errors(job: Transcoding, index: FrameIndex, made: Path, found: Fram
         at = ordinal % _COMPARED_FRAMES
         if at == 0:
             count = min(_COMPARED_FRAMES, len(index) - ordinal)
-            got = decode_luma(made, found, ordinal, count).frames
+            got = decode_luma(made, found.slice(ordinal, count), ordinal, count).frames
         errors[ordinal] = cv2.norm(wanted, got[at], cv2.NORM_L2SQR) / wanted.size
     return errors
 
