@@ -50,7 +50,7 @@ def warm_up_in_turn() -> None:
 def load_kernels() -> None:
     """Loads from the cache, or compiles, what every worker runs."""
     warm_up()
-    import_module("v2v_server.video.full_range")  # importing it compiles, or loads, what is in it
+    import_module("v2v_server.simulation.full_range")  # importing it compiles, or loads, what is in it
 
 
 @contextmanager

@@ -137,7 +137,7 @@ def test_no_worker_compiles_and_none_becomes_large(tmp_path: Path) -> None:
         "from v2v_server.simulation.clip import simulate_pixels, simulate_pixels_with_effects, words\n"
         "from v2v_server.warm_up import warm_up_in_turn\n"
         "warm_up_in_turn()\n"
-        "from v2v_server.video.full_range import to_full_range\n"
+        "from v2v_server.simulation.full_range import to_full_range\n"
         "kernels = simulate_pixels, simulate_pixels_with_effects, words, to_full_range\n"
         "print(*(sum(kernel.stats.cache_hits.values()) for kernel in kernels))\n"
         "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"

@@ -1,4 +1,7 @@
-"""Limited-range luma to the full range, compiled: arithmetic that runs in vectors, at a third of a look-up's time."""
+"""Limited-range luma to the full range, compiled: arithmetic that runs in vectors, at a third of a look-up's time.
+
+It is for :mod:`v2v_server.video.luma`; all compiled code lies in this folder, whose sources name the compiler's cache.
+"""
 
 # mypy: allow-untyped-defs
 from __future__ import annotations
