@@ -101,11 +101,11 @@ def _run(arguments: argparse.Namespace) -> bool:
             scene=arguments.scene != "off",
             progress=progress,
         )
+    for line in summary(report, encoding, time.monotonic() - started):
+        print(line)
     if arguments.json is not None:
         records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in report.unusable]
         write_json(arguments.json, records)
-    for line in summary(report, encoding, time.monotonic() - started):
-        print(line)
     return report.complete
 
 

@@ -70,6 +70,20 @@ def test_ctrl_c_says_that_the_same_command_goes_on(
     assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
 
 
+def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([
+            str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1",
+            "--json", str(tmp_path),
+        ])  # fmt: skip
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert "videos prepared" in said.out
+    assert "cannot be written: Is a directory" in said.err
+
+
 def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(source, out)
