@@ -79,7 +79,7 @@ class FrameFuzzer:
             payload.append(b"")
         elif damage == 3:
             shapes.append(1)
-        header = SampleHeader(1, self._int(), names, dtypes, tuple(shapes), {}, "w", 0.0)
+        header = SampleHeader(1, self._int(), names, dtypes, tuple(shapes), self.noise(), "w", 0.0)
         return header, payload
 
     def message(self) -> Frames:

@@ -137,8 +137,8 @@ class Attack:
             index = 0 if lease is None else lease.indices[0]
             if self._random.random() < 0.3:
                 self._send(peer, "liar", *encode(Begun(number)))
-            header = encode(Result(number, self._random.choice((index, index + 1)), 0.1))
-            self._send(peer, "liar", *header, *self._payload(index if lease is None else lease.indices[0]))
+            header = encode(Result(number, self._random.choice((0, number, number + 1))))
+            self._send(peer, "liar", *header, *self._payload(self._random.choice((index, index + 1))))
         self._send(peer, "liar", *encode(Goodbye()))
         peer.close()
 

@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import time
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -75,6 +76,8 @@ class NullWorkers:
         self._poller = zmq.Poller()
         self._names: dict[zmq.Socket[bytes], str] = {}
         self._joining: set[zmq.Socket[bytes]] = set()
+        self._leases: dict[zmq.Socket[bytes], deque[Lease]] = defaultdict(deque)
+        self._begun: dict[zmq.Socket[bytes], int] = {}
         for number in range(count):
             link = self._context.socket(zmq.DEALER)
             name = f"null-{os.getpid()}-{number}"
@@ -97,8 +100,12 @@ class NullWorkers:
         next_ping = time.monotonic() + _PING_SECONDS
         try:
             while self._names:
-                for link, _ in self._poller.poll(int(_PING_SECONDS * 1000)):
+                waiting = not any(self._leases.values())
+                for link, _ in self._poller.poll(int(_PING_SECONDS * 1000) if waiting else 0):
                     self._handle(link, decode(link.recv_multipart()[0]))
+                for link, leases in self._leases.items():
+                    if leases:
+                        self._answer(link, leases)
                 if time.monotonic() >= next_ping:
                     next_ping = time.monotonic() + _PING_SECONDS
                     for link in self._names:
@@ -116,9 +123,7 @@ class NullWorkers:
     def _handle(self, link: zmq.Socket[bytes], message: Message) -> None:
         match message:
             case Lease():
-                link.send_multipart(encode(Begun(message.lease)))
-                frames = answer(message, self._names[link])
-                link.send_multipart([*encode(Result(message.lease, message.indices[0], 0.0)), *frames], copy=False)
+                self._leases[link].append(message)
             case Pong() if link in self._joining:
                 self._joining.remove(link)
                 if not self._joining:
@@ -127,12 +132,22 @@ class NullWorkers:
                 link.send_multipart(encode(Goodbye()))
                 self._poller.unregister(link)
                 del self._names[link]
+                self._leases.pop(link, None)
             case Refused(ErrorCode.UNKNOWN_SESSION):
+                self._leases.pop(link, None)
                 self._say_hello(link)
             case Refused(code, text):
                 raise RemoteError(code, text)
             case _:
                 pass
+
+    def _answer(self, link: zmq.Socket[bytes], leases: deque[Lease]) -> None:
+        """Answers the oldest lease in as many messages as a worker sends that has another one at hand."""
+        lease = leases.popleft()
+        if self._begun.get(link) != lease.lease:
+            link.send_multipart(encode(Begun(lease.lease)))
+        begins = self._begun[link] = leases[0].lease if leases else 0
+        link.send_multipart([*encode(Result(lease.lease, begins)), *answer(lease, self._names[link])], copy=False)
 
 
 def answer(lease: Lease, name: str) -> list[Any]:

@@ -49,7 +49,7 @@ from v2v_protocol.messages import (
     Welcome,
 )
 from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, layout_of
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_map, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
@@ -344,7 +344,7 @@ class Connection:
             self.strays += 1
             self._ask_on(again)
             return None
-        provenance = Provenance.from_dict(header.provenance)
+        provenance = Provenance.from_dict(decode_map(header.provenance))
         identity = SampleId(
             spec_digest=self.stream.spec_digest,
             catalogue_digest=self.stream.catalogue_digest,

@@ -117,7 +117,8 @@ class SampleHeader:
         epoch, index: which sample.
         names, dtypes: of the arrays, in the order of the raw frames.
         shapes: of all arrays, flattened: ndim, extents, ndim, extents ...
-        provenance: ``Provenance.to_dict()``.
+        provenance: ``Provenance.to_dict()`` as :func:`v2v_protocol.wire.encode_map` encodes it, so that a server need
+            not open it.
         worker: name of the server worker that made it.
         cpu_seconds: processor time it took there.
         decoded: whether a clip was decoded for it; False where it came from that of a sibling.
@@ -129,7 +130,7 @@ class SampleHeader:
     names: tuple[str, ...]
     dtypes: tuple[str, ...]
     shapes: tuple[int, ...]
-    provenance: Mapping[str, Any]
+    provenance: bytes
     worker: str
     cpu_seconds: float
     decoded: bool = True
@@ -181,15 +182,15 @@ class Begun:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A lease's sample is done; the frames of its SampleHeader message follow, to be passed on unopened.
+    """A lease's sample is done; the frames of its SampleHeader message follow, to be passed on as they are.
 
-    ``cpu_seconds`` and ``decoded`` are those of the header.
+    Attributes:
+        lease: number of the lease.
+        begins: number of the lease that the worker starts on next, as :class:`Begun` says it; 0: it has none at hand.
     """
 
     lease: int
-    index: int
-    cpu_seconds: float
-    decoded: bool = True
+    begins: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,12 +81,13 @@ def encode(message: Message) -> Frames:
     Raises:
         LimitExceeded: the header is larger than any peer would accept.
     """
-    fields = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
-    header = msgpack.packb({"v": PROTOCOL_VERSION, "t": _NAMES[type(message)], **fields}, use_bin_type=True)
+    cls = type(message)
+    fields: dict[str, Any] = {"v": PROTOCOL_VERSION, "t": _NAMES[cls]}
+    for name in _CHECKS[cls]:
+        fields[name] = getattr(message, name)
+    header = msgpack.packb(fields, use_bin_type=True)
     if len(header) > LARGEST_HEADER_BYTES:
-        raise LimitExceeded(
-            f"a {_NAMES[type(message)]} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}"
-        )
+        raise LimitExceeded(f"a {_NAMES[cls]} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
     return [header]
 
 
@@ -123,7 +124,7 @@ def encode_sample(
         names=tuple(arrays),
         dtypes=tuple(_DTYPE_NAMES[array.dtype] for array in arrays.values()),
         shapes=tuple(shapes),
-        provenance=provenance,
+        provenance=encode_map(provenance),
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
@@ -132,6 +133,22 @@ def encode_sample(
     if in_slot:
         return encode(header)
     return [*encode(header), *(array.reshape(-1).view(np.uint8).data for array in arrays.values())]
+
+
+def encode_map(fields: Mapping[str, Any]) -> bytes:
+    """Plain values, as a field of a message that not everybody opens who passes it on."""
+    packed: bytes = msgpack.packb(fields, use_bin_type=True)
+    return packed
+
+
+def decode_map(packed: bytes) -> dict[str, Any]:
+    """What :func:`encode_map` was given.
+
+    Raises:
+        LimitExceeded: it is nested too deeply.
+        ProtocolError: it is nothing of the kind.
+    """
+    return _mapping(_unpacked(packed, "a map"))
 
 
 def decode(header: Buffer) -> Message:
@@ -144,25 +161,28 @@ def decode(header: Buffer) -> Message:
     """
     if len(header) > LARGEST_HEADER_BYTES:
         raise LimitExceeded(f"a header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
-    try:
-        fields = msgpack.unpackb(header, raw=False, strict_map_key=True, use_list=True)
-    except (ValueError, msgpack.exceptions.UnpackException) as error:
-        # msgpack's own errors quote raw bytes; the kind of damage is enough.
-        raise ProtocolError(f"not a message: {type(error).__name__}") from error
+    fields = _unpacked(header, "a message")
     if not isinstance(fields, dict) or "v" not in fields or "t" not in fields:
         raise ProtocolError("not a message: no version or type")
-    _check_nesting(fields)
     version = fields.pop("v")
     if version != PROTOCOL_VERSION or type(version) is not int:
-        raise VersionMismatch(f"the peer speaks protocol version {version!r:.40}, this side version {PROTOCOL_VERSION}")
+        raise VersionMismatch(
+            f"the peer speaks protocol version {_shown(version)}, this side version {PROTOCOL_VERSION}"
+        )
     name = fields.pop("t")
-    cls = _TYPES.get(name) if isinstance(name, str) else None
+    cls = _TYPES.get(name) if type(name) is str else None
     if cls is None:
-        raise ProtocolError(f"unknown message type {name!r:.40}")
+        raise ProtocolError(f"unknown message type {_shown(name)}")
     checks = _CHECKS[cls]
     if fields.keys() != checks.keys():
         raise ProtocolError(f"{name}: fields {sorted(map(str, fields))[:40]!r:.400}, expected {sorted(checks)}")
-    message: Message = cls(**{key: checks[key](f"{name}.{key}", value) for key, value in fields.items()})
+    key = ""
+    try:
+        for key, check in checks.items():
+            fields[key] = check(fields[key])
+    except ProtocolError as error:
+        raise type(error)(f"{name}.{key}: {error}") from None
+    message: Message = cls(**fields)
     return message
 
 
@@ -217,57 +237,75 @@ def layout_of(header: SampleHeader) -> dict[str, tuple[str, tuple[int, ...]]]:
     return layout
 
 
+def _unpacked(packed: Buffer, what: str) -> Any:
+    try:
+        return msgpack.unpackb(packed, raw=False, strict_map_key=True, use_list=True)
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        # msgpack's own errors quote raw bytes; the kind of damage is enough.
+        raise ProtocolError(f"not {what}: {type(error).__name__}") from error
+
+
 # --- field checks -----------------------------------------------------------------------------------------------------
+# A server decodes three messages a sample: what a check would only need for an error is made up when there is one.
 
-Check: TypeAlias = Callable[[str, Any], Any]
+Check: TypeAlias = Callable[[Any], Any]
 
 
-def _check_nesting(fields: dict[Any, Any]) -> None:
-    level: list[Any] = [fields]
+def _shown(value: Any) -> str:
+    """A value for an error message. Of containers, whose nesting nobody has looked at yet, only what they are."""
+    return f"{value!r:.40}" if type(value) in (int, float, bool, str, bytes) else f"of {type(value).__name__}"
+
+
+def _exactly(kind: type[Any]) -> Check:
+    def check(value: Any) -> Any:
+        if type(value) is not kind:
+            raise ProtocolError(f"expected {kind.__name__}, got {type(value).__name__}")
+        return value
+
+    return check
+
+
+def _int(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**64:
+        raise ProtocolError(f"expected a whole number from 0 to 2**64 - 1, got {_shown(value)}")
+    return value
+
+
+def _float(value: Any) -> float:
+    if type(value) not in (float, int) or not math.isfinite(value):
+        raise ProtocolError(f"expected a finite number, got {_shown(value)}")
+    return float(value)
+
+
+def _int_or_none(value: Any) -> int | None:
+    return None if value is None else _int(value)
+
+
+def _tuple_of(check: Check) -> Check:
+    def check_all(value: Any) -> tuple[Any, ...]:
+        if type(value) is not list:
+            raise ProtocolError(f"expected a list, got {type(value).__name__}")
+        if len(value) > LARGEST_TUPLE:
+            raise LimitExceeded(f"{len(value)} entries; the limit is {LARGEST_TUPLE}")
+        for item in value:
+            check(item)
+        return tuple(value)
+
+    return check_all
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    if type(value) is not dict:
+        raise ProtocolError(f"expected dict, got {type(value).__name__}")
+    level: list[Any] = [value]
     for _ in range(_DEEPEST_NESTING):
         inner: list[Any] = []
         for outer in level:
             inner.extend(outer.values() if type(outer) is dict else outer)
         level = [item for item in inner if type(item) is dict or type(item) is list]
         if not level:
-            return
-    raise LimitExceeded(f"a header nested more than {_DEEPEST_NESTING} deep")
-
-
-def _exactly(kind: type[Any]) -> Check:
-    def check(name: str, value: Any) -> Any:
-        if type(value) is not kind:
-            raise ProtocolError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
-        return value
-
-    return check
-
-
-def _int(name: str, value: Any) -> int:
-    if type(value) is not int or not 0 <= value < 2**64:
-        raise ProtocolError(f"{name}: expected a whole number from 0 to 2**64 - 1, got {value!r:.40}")
-    return value
-
-
-def _float(name: str, value: Any) -> float:
-    if type(value) not in (float, int) or not math.isfinite(value):
-        raise ProtocolError(f"{name}: expected a finite number, got {value!r:.40}")
-    return float(value)
-
-
-def _int_or_none(name: str, value: Any) -> int | None:
-    return None if value is None else _int(name, value)
-
-
-def _tuple_of(check: Check) -> Check:
-    def check_all(name: str, value: Any) -> tuple[Any, ...]:
-        if type(value) is not list:
-            raise ProtocolError(f"{name}: expected a list, got {type(value).__name__}")
-        if len(value) > LARGEST_TUPLE:
-            raise LimitExceeded(f"{name}: {len(value)} entries; the limit is {LARGEST_TUPLE}")
-        return tuple(check(name, item) for item in value)
-
-    return check_all
+            return value
+    raise LimitExceeded(f"nested more than {_DEEPEST_NESTING} deep")
 
 
 _BY_ANNOTATION: dict[str, Check] = {
@@ -279,7 +317,7 @@ _BY_ANNOTATION: dict[str, Check] = {
     "int | None": _int_or_none,
     "tuple[int, ...]": _tuple_of(_int),
     "tuple[str, ...]": _tuple_of(_exactly(str)),
-    "Mapping[str, Any]": _exactly(dict),
+    "Mapping[str, Any]": _mapping,
 }
 _CHECKS: dict[type[Any], dict[str, Check]] = {
     # Annotations are strings here (postponed evaluation), which makes them keys of a closed vocabulary: a message

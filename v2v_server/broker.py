@@ -26,6 +26,8 @@ from v2v_server.quarantine import Verdict
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``reception.MOST_CREDIT``)."""
 _TICK_SECONDS = 0.1
+# Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
+_NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
 
 class Broker:
@@ -138,16 +140,23 @@ def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
     The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
     """
     try:
-        identity, *frames = router.recv_multipart(zmq.NOBLOCK, copy=False)
+        identity = frame = router.recv(_NOBLOCK, copy=False)
     except zmq.Again:
         return None  # a connection that just ended took it along
-    return identity.bytes, [*(frame.bytes for frame in frames[:1]), *frames[1:]]
+    frames: list[Any] = []
+    while frame.more:  # recv_multipart asks the socket instead, which takes longer
+        frame = router.recv(_NOBLOCK, copy=False)
+        frames.append(frame if frames else frame.bytes)
+    return identity.bytes, frames
 
 
 def _send(router: zmq.Socket[bytes], identity: bytes, frames: Sequence[Any]) -> bool:
     """False when the peer is not connected any more, or does not read what it is sent."""
     try:
-        router.send_multipart([identity, *frames], zmq.NOBLOCK, copy=False)
+        router.send(identity, _NOBLOCK_MORE)
+        for frame in frames[:-1]:
+            router.send(frame, _NOBLOCK_MORE, copy=False)
+        router.send(frames[-1], _NOBLOCK, copy=False)
     except zmq.Again:
         return False
     except zmq.ZMQError as error:

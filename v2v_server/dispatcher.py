@@ -25,6 +25,7 @@ from v2v_protocol.messages import (
     Pong,
     Refused,
     Result,
+    SampleHeader,
     Stop,
     Want,
     WorkerHello,
@@ -34,7 +35,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
 from v2v_server.candidates import Candidates
-from v2v_server.inspection import flaw
+from v2v_server.inspection import inspected
 from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker, refusal
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
@@ -257,26 +258,37 @@ class Dispatcher:
         return instructions + self._assign(now)
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
-        asked = self._leases.task(result.lease, identity)
-        session = None if asked is None else self.sessions.get(asked.session)
-        wrong = None if asked is None or session is None else flaw(result, payload, asked, session.form)
-        if wrong is not None:
-            # No worker of ours does this, and one that did it once would do it again.
-            refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {wrong}")))
-            return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
-        task = self._leases.finished(result.lease, identity, now)
-        cpu_seconds = min(max(result.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
-        if task is None or not self.sessions.answered(task, cpu_seconds):
+        task = self._leases.task(result.lease, identity)
+        session = None if task is None else self.sessions.get(task.session)
+        instructions: list[Instruction] = []
+        if task is None or session is None:
             self.counters.late_results += 1
-            return self._assign(now)
+        else:
+            try:
+                header = inspected(payload, task, session.form)
+            except ProtocolError as error:
+                # No worker of ours does this, and one that did it once would do it again.
+                refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
+                return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+            if self._count(session, task, header, in_slot=len(payload) == 1):
+                instructions.append(ToConsumer(task.session, payload))
+        self._leases.finished(result.lease, identity, now)
+        self._leases.begun(result.begins, identity, now)
+        return instructions + self._assign(now)
+
+    def _count(self, session: Session, task: Task, header: SampleHeader, *, in_slot: bool) -> bool:
+        """Accounts for a sample; False when nobody waits for it."""
+        cpu_seconds = min(max(header.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
+        if not self.sessions.answered(task, cpu_seconds):
+            self.counters.late_results += 1
+            return False
         self.counters.samples += 1
-        self.counters.decodes += result.decoded
+        self.counters.decodes += header.decoded
         self.counters.worker_cpu_seconds += cpu_seconds
-        if session is not None:
-            self.counters.batches += 1 / session.batch_size
-            self.counters.bytes += sum(session.form.sizes)
-            self.counters.in_slots += len(payload) == 1
-        return [ToConsumer(task.session, payload), *self._assign(now)]
+        self.counters.batches += 1 / session.batch_size
+        self.counters.bytes += sum(session.form.sizes)
+        self.counters.in_slots += in_slot
+        return True
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
         self._workers.remove(identity)

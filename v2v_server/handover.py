@@ -11,7 +11,8 @@ import os
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -90,15 +91,29 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
         name = ArenaName.parse(slot.arena)
         if not 0 < slot.number <= name.slots:
             return None
-        sizes = Form.of(layout).sizes
-        *offsets, total = array_offsets(sizes, name.slots)
+        places, total = _places(tuple(layout.items()), name.slots)
         with closing(_Arena(name, total)) as arena:
             return {
                 array: arena.map(offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
-                for (array, (dtype, shape)), size, offset in zip(layout.items(), sizes, offsets, strict=True)
+                for array, dtype, shape, size, offset in places
             }
     except (OSError, ProtocolError):
         return None
+
+
+_Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
+
+
+@lru_cache(maxsize=16)  # the same for every sample of a stream
+def _places(layout: tuple[tuple[str, tuple[str, tuple[int, ...]]], ...], slots: int) -> tuple[list[_Place], int]:
+    """(name, dtype, shape, bytes of one sample, offset of the first) of each array in an arena; the arena's bytes."""
+    sizes = Form.of(dict(layout)).sizes
+    *offsets, total = array_offsets(sizes, slots)
+    places = [
+        (array, np.dtype(dtype), shape, size, offset)
+        for (array, (dtype, shape)), size, offset in zip(layout, sizes, offsets, strict=True)
+    ]
+    return places, total
 
 
 class _Arena:

@@ -129,9 +129,8 @@ def sample_layout(lease: Lease) -> Layout:
     Raises:
         ProtocolError: the lease asks for an array that nobody makes.
     """
-    spec = _spec(lease.spec)
     try:
-        return array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
+        return _layout(lease.spec, lease.arrays)
     except UsageError as error:
         raise ProtocolError(f"lease {lease.lease}: {error}") from error
 
@@ -202,6 +201,12 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
 @lru_cache(maxsize=16)
 def _spec(canonical: bytes) -> StreamSpec:
     return StreamSpec.from_dict(json.loads(canonical))
+
+
+@lru_cache(maxsize=16)
+def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
+    spec = _spec(canonical)
+    return array_layout(spec.recipe, spec.voxel_dtype, arrays)
 
 
 def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:

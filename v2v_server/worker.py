@@ -43,6 +43,8 @@ from v2v_server.warm_up import warm_up_in_turn
 
 CREDIT = 2
 _PING_SECONDS = 5.0
+_MORE = int(zmq.SNDMORE)
+"""A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
 
 
 class Worker:
@@ -64,6 +66,8 @@ class Worker:
         self._logbook = logbook
         self._clips = Clips(root)
         self._leases: deque[Lease] = deque()
+        self._begun = 0  # the lease that was last said to be begun
+        self._hellos = 0
         self._stopping = False
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
@@ -95,14 +99,19 @@ class Worker:
         try:
             self._say_hello()
             while not self._stopping:
-                self._receive(0.0 if self._leases else _PING_SECONDS)
-                if self._leases and not self._stopping:
+                if not self._leases:
+                    self._receive(_PING_SECONDS)
+                elif self._begun != self._leases[0].lease:
+                    self._begin()
+                else:
                     self._work(self._leases.popleft())
             self._send(encode(Goodbye()))
         finally:
             self._context.destroy()
 
     def _say_hello(self) -> None:
+        self._begun = 0  # a server that does not know us counts its leases anew
+        self._hellos += 1
         hello = WorkerHello(self._name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT)
         self._send(encode(hello))
 
@@ -113,9 +122,9 @@ class Worker:
             self._send(encode(Ping()))
             return
         while self._poller.poll(0):
-            frames = self._socket.recv_multipart()
+            first, *_ = self._socket.recv_multipart()
             try:
-                self._handle(decode(frames[0]))
+                self._handle(decode(first))
             except ProtocolError as error:
                 print(f"{self._name}: ignored a message from the server: {error}", file=sys.stderr)
 
@@ -134,13 +143,24 @@ class Worker:
             case _:
                 pass
 
+    def _begin(self) -> None:
+        self._begun = self._leases[0].lease
+        self._send(encode(Begun(self._begun)))
+
     def _work(self, lease: Lease) -> None:
         note(self._logbook, lease.lease)
-        self._send(encode(Begun(lease.lease)))
-        self._make(lease)
+        frames = self._made(lease)
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
+        hellos = self._hellos
+        self._receive(0.0)
+        if frames is None or hellos != self._hellos:
+            return  # the server has forgotten this lease, and may have given its number to another
+        # What is begun next is said along with what is done.
+        self._begun = self._leases[0].lease if self._leases and not self._stopping else 0
+        self._send([*encode(Result(lease.lease, self._begun)), *frames])
 
-    def _make(self, lease: Lease) -> None:
+    def _made(self, lease: Lease) -> Frames | None:
+        """The frames of a lease's sample; None where its video fails, which is said at once."""
         room = room_for(lease, sample_layout(lease))
         started = time.process_time()
         try:
@@ -152,9 +172,9 @@ class Worker:
             sample = make_sample(lease, clip, room.arrays)
         except VideoError as error:
             self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
-            return
+            return None
         cpu_seconds = time.process_time() - started
-        frames = sample_message(
+        return sample_message(
             lease,
             room,
             provenance=sample.provenance.to_dict(),
@@ -162,10 +182,12 @@ class Worker:
             cpu_seconds=cpu_seconds,
             decoded=decoded,
         )
-        self._send([*encode(Result(lease.lease, lease.indices[0], cpu_seconds, decoded)), *frames])
 
     def _send(self, frames: Frames) -> None:
-        self._socket.send_multipart(frames, copy=False)
+        *first, last = frames
+        for frame in first:
+            self._socket.send(frame, _MORE, copy=False)
+        self._socket.send(last, copy=False)
 
 
 def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:

@@ -11,10 +11,9 @@ from benchmarks.usage import consume, peak_rss_bytes
 from tests.benchmarks.small import FLAGS, RECIPE
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
-from v2v_protocol.messages import Result, SampleHeader
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
-from v2v_protocol.wire import decode, decode_sample
-from v2v_server.inspection import flaw
+from v2v_protocol.wire import decode_map, decode_sample
+from v2v_server.inspection import inspected
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.schedule import Schedule
@@ -32,13 +31,11 @@ def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ..
     )  # fmt: skip
     frames = answer(lease, "null-1")
     layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
-    assert flaw(Result(7, 1, 0.0), frames, task, Form.of(layout)) is None
-    header = decode(frames[0])
-    assert isinstance(header, SampleHeader)
+    header = inspected(frames, task, Form.of(layout))
     found = decode_sample(header, frames[1:])
     assert {name: (array.dtype.name, array.shape) for name, array in found.items()} == layout
     assert all(np.all(array == 1) for array in found.values())
-    provenance = Provenance.from_dict(header.provenance)
+    provenance = Provenance.from_dict(decode_map(header.provenance))
     assert provenance.id == SampleId(SMALL_SPEC.digest, catalogue.digest, provenance.id.numerics_version, 5, 3, 1)
     assert (provenance.video, provenance.quarantine) == (lease.video, 2)
 

@@ -16,15 +16,17 @@ from hypothesis import strategies as st
 from tests.protocol.wire_messages import MESSAGES, WRONG, example, messages
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.messages import Goodbye, Lease, Ping, Refused, Result, SampleHeader, Want
+from v2v_protocol.messages import Goodbye, Hello, Lease, Ping, Refused, SampleHeader, Want
 from v2v_protocol.wire import (
     ARRAY_DTYPES,
     LARGEST_ARRAY_BYTES,
     LARGEST_HEADER_BYTES,
     LARGEST_TUPLE,
     decode,
+    decode_map,
     decode_sample,
     encode,
+    encode_map,
     encode_sample,
 )
 
@@ -69,8 +71,8 @@ def test_any_message_travels_unchanged(message: Any) -> None:
 
 
 def test_whole_numbers_are_read_as_floats_where_floats_belong() -> None:
-    again = decode(msgpack.packb(plain(Result(1, 2, 0.5)) | {"cpu_seconds": 3}))
-    assert isinstance(again, Result)
+    again = decode(msgpack.packb(plain(example(SampleHeader)) | {"cpu_seconds": 3}))
+    assert isinstance(again, SampleHeader)
     assert type(again.cpu_seconds) is float
 
 
@@ -136,7 +138,27 @@ def test_a_field_nested_too_deeply_is_refused_before_anybody_looks_at_it() -> No
     nested: Any = 1
     for _ in range(100):
         nested = {"recipe": nested}
-    refuse({"v": 1, "t": "hello", "spec": nested, "arrays": [], "batch_size": 1, "seed": 1}, LimitExceeded, "nested")
+    refuse(plain(example(Hello)) | {"spec": nested}, LimitExceeded, "hello.spec: nested")
+
+
+@given(st.dictionaries(st.text(max_size=5), _values, max_size=4))
+def test_a_map_travels_unchanged(fields: dict[str, Any]) -> None:
+    assert repr(decode_map(encode_map(fields))) == repr(fields)  # nan is not equal to itself
+
+
+@given(st.binary(max_size=100))
+def test_what_is_no_map_is_refused(data: bytes) -> None:
+    try:
+        assert type(decode_map(data)) is dict
+    except ProtocolError as error:
+        assert len(str(error)) < 200  # noqa: PT017
+
+
+@pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1a"])
+@pytest.mark.parametrize("depth", [17, 200, 990, 1024, 200_000])
+def test_a_map_nested_too_deeply_is_refused(opening: bytes, depth: int) -> None:
+    with pytest.raises(ProtocolError):
+        decode_map(b"\x81\xa1a" + opening * depth + b"\x90")
 
 
 # --- form -------------------------------------------------------------------------------------------------------------
@@ -226,7 +248,7 @@ def test_a_list_that_only_claims_to_be_huge_is_refused() -> None:
 
 
 def header(names: Any, dtypes: Any, shapes: Any) -> SampleHeader:
-    return SampleHeader(0, 0, tuple(names), tuple(dtypes), tuple(shapes), {}, "w", 0.0)
+    return SampleHeader(0, 0, tuple(names), tuple(dtypes), tuple(shapes), b"", "w", 0.0)
 
 
 _arrays = st.dictionaries(
@@ -249,6 +271,7 @@ def test_arrays_travel_unchanged(layout: dict[str, tuple[str, list[int]]], seed:
     message = decode(frames[0])
     assert isinstance(message, SampleHeader)
     assert (message.epoch, message.index, message.worker, message.cpu_seconds) == (3, 2**48 - 1, "w", 0.25)
+    assert decode_map(message.provenance) == {"video": "a"}
     again = decode_sample(message, [bytes(frame) for frame in frames[1:]])
     assert list(again) == list(arrays)
     for name, array in arrays.items():

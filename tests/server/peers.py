@@ -27,7 +27,7 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Buffer, decode, encode
+from v2v_protocol.wire import Buffer, decode, encode, encode_map
 from v2v_server.blame import Cause, Loss
 from v2v_server.dispatcher import Dispatcher
 from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
@@ -45,16 +45,21 @@ def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
     return frames_of(array_layout(SMALL_SPEC.recipe, "int8", ("voxels",)), epoch, index, seed)
 
 
-def answer_to(lease: Lease, *, in_slot: bool = False) -> list[Buffer]:
+def answer_to(lease: Lease, *, in_slot: bool = False, cpu_seconds: float = 0.1) -> list[Buffer]:
     """What an honest worker sends behind its Result."""
     spec = StreamSpec.from_dict(json.loads(lease.spec))
     layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
-    frames = frames_of(layout, lease.epoch, lease.indices[0], lease.seed, lease.slot)
+    frames = frames_of(layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds)
     return frames[:1] if in_slot else frames
 
 
 def frames_of(
-    layout: Mapping[str, tuple[str, tuple[int, ...]]], epoch: int, index: int, seed: int, slot: int = NO_SLOT
+    layout: Mapping[str, tuple[str, tuple[int, ...]]],
+    epoch: int,
+    index: int,
+    seed: int,
+    slot: int = NO_SLOT,
+    cpu_seconds: float = 0.1,
 ) -> list[Buffer]:
     """A sample message of zeros in that layout."""
     header = SampleHeader(
@@ -63,9 +68,9 @@ def frames_of(
         names=tuple(layout),
         dtypes=tuple(dtype for dtype, _ in layout.values()),
         shapes=tuple(extent for _, shape in layout.values() for extent in (len(shape), *shape)),
-        provenance={"seed": seed},
+        provenance=encode_map({"seed": seed}),
         worker="w",
-        cpu_seconds=0.1,
+        cpu_seconds=cpu_seconds,
         slot=slot,
     )
     return [*encode(header), *(memoryview(bytes(layout_bytes({name: layout[name]}))) for name in layout)]
@@ -183,11 +188,13 @@ class Peers:
         self.worker_says(identity, Begun(lease.lease))
         return lease
 
-    def finish(self, identity: bytes = b"w", cpu_seconds: float = 0.1, *, in_slot: bool = False) -> Lease:
-        """Answers the oldest lease, in its slot if asked to and it has one."""
+    def finish(
+        self, identity: bytes = b"w", cpu_seconds: float = 0.1, *, in_slot: bool = False, begins: int = 0
+    ) -> Lease:
+        """Answers the oldest lease, in its slot if asked to and it has one, and says what it begins next."""
         lease = self.leases[identity].popleft()
-        frames = answer_to(lease, in_slot=in_slot and lease.slot != NO_SLOT)
-        self.worker_says(identity, Result(lease.lease, lease.indices[0], cpu_seconds), *frames)
+        frames = answer_to(lease, in_slot=in_slot and lease.slot != NO_SLOT, cpu_seconds=cpu_seconds)
+        self.worker_says(identity, Result(lease.lease, begins), *frames)
         return lease
 
     def fail(self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7) -> Lease:

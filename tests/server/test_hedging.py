@@ -74,7 +74,7 @@ def test_a_failure_answers_for_both() -> None:
     at.finish(b"fast")
     assert at.samples() == [*before, (0, 20)]
     at.worker_says(b"slow", JobFailed(first.lease, None, "late"))
-    at.worker_says(b"slow", Result(first.lease, 20, 0.1), b"late")
+    at.worker_says(b"slow", Result(first.lease), b"late")
     assert at.samples() == [*before, (0, 20)]
     assert len(at.dispatcher._leases) == 0
 

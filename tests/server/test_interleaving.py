@@ -15,6 +15,7 @@ from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
 from v2v_client.slots import Answer, Slots
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.messages import ErrorCode, Goodbye, JobFailed, Lease, Ping, Refused, Result, SampleHeader, Unavailable
+from v2v_protocol.wire import decode_map
 from v2v_server.blame import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
@@ -71,7 +72,7 @@ class Interleaving(RuleBasedStateMachine):
                     # The heart of the promise: nothing comes that is not waited for.
                     self.owed[identity].remove((message.epoch, message.index))
                     if isinstance(message, SampleHeader):
-                        assert message.provenance == {"seed": self.seed[identity]}
+                        assert decode_map(message.provenance) == {"seed": self.seed[identity]}
             self.read[identity] = len(heard)
         while self.at.given_up:
             # Those of this host are killed. The others are out of reach, and say something later.
@@ -222,7 +223,7 @@ class Interleaving(RuleBasedStateMachine):
         elif how == "unreachable" or not held:
             self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
         else:
-            self.at.worker_says(identity, Result(held[0].lease, 49 - held[0].indices[0], 0.1), b"nonsense")
+            self.at.worker_says(identity, Result(held[0].lease), b"nonsense")
             if self.at.dispatcher.sessions.get(held[0].reply_to) is not None:
                 self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
         self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
@@ -237,9 +238,7 @@ class Interleaving(RuleBasedStateMachine):
         if failed:
             self.at.worker_says(identity, JobFailed(lease.lease, None, "late"))
         else:
-            self.at.worker_says(
-                identity, Result(lease.lease, lease.indices[0], 0.1), *sample_frames(0, lease.indices[0])
-            )
+            self.at.worker_says(identity, Result(lease.lease), *sample_frames(0, lease.indices[0]))
         self._listen()
 
     @rule(seconds=st.sampled_from((0.1, 1.5, 10.0, DEADLINE / 2, DEADLINE + 1)))

@@ -10,7 +10,7 @@ import pytest
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
-from v2v_protocol.messages import Begun, ErrorCode, Hello, Lease, Refused
+from v2v_protocol.messages import Begun, ErrorCode, Goodbye, Hello, Lease, Refused
 from v2v_protocol.sample import Refusal, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server import remake as remake_module
@@ -92,6 +92,38 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
     # The operator reads the verdict; what the quarantine refuses from then on is no news.
     assert at.dispatcher.take_refusals() == []
     assert at.dispatcher.counters.refused_candidates == 1
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_what_was_begun_along_with_a_result_is_to_blame_like_any_other(answered: bool) -> None:
+    """Whether or not anybody waits for that result."""
+    at = peers()
+    at.hello()
+    at.want(0, identity=b"c")
+    at.join()
+    if not answered:
+        at.consumer_says(b"c", Goodbye())
+        at.hello()
+    at.want(1)
+    _, second = at.leases[b"w"]
+    at.begin()
+    at.finish(begins=second.lease)
+    assert at.samples() == ([(0, 0)] if answered else [])
+    at.die(cause=Cause.CRASHED, text="died")
+    assert at.recorded == [against(second)]
+
+
+def test_only_the_worker_that_holds_a_lease_begins_it() -> None:
+    at = peers()
+    at.hello()
+    at.want(0, 1)
+    at.join(b"other", credit=1)
+    at.join(b"w", credit=1)
+    (others,) = at.leases[b"other"]
+    at.begin(b"w")
+    at.finish(b"w", begins=others.lease)
+    at.die(b"other", cause=Cause.CRASHED)
+    assert at.recorded == []
 
 
 def test_a_worker_that_hangs_is_blamed_through_its_end() -> None:

@@ -127,7 +127,7 @@ def test_a_result_in_another_slot_than_was_lent_is_none(slot: int) -> None:
     lease = at.begin()
     frames = answer_to(lease)
     header = at_header(frames[0], slot)
-    at.worker_says(b"w", Result(lease.lease, 0, 0.1), header, *frames[1:])
+    at.worker_says(b"w", Result(lease.lease), header, *frames[1:])
     assert at.samples() == []
     assert [held.indices for held in at.leases[b"w1"]] == [(0,)]
 
@@ -138,7 +138,7 @@ def test_a_header_alone_is_no_result_where_no_slot_was_lent() -> None:
     at.hello()
     at.want(0)
     lease = at.begin()
-    at.worker_says(b"w", Result(lease.lease, 0, 0.1), *answer_to(lease)[:1])
+    at.worker_says(b"w", Result(lease.lease), *answer_to(lease)[:1])
     assert at.samples() == []
 
 

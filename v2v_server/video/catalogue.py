@@ -116,18 +116,17 @@ class Catalogue:
     def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
         """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
 
-        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. Of the others,
-        the latest slices are kept, because siblings ask for the same one after the other.
+        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
+        kept, because siblings ask for the same one after the other.
 
         Raises:
             CorpusError, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
         """
         key = id, start, count
         if key not in self._slices:
-            stored = self._stored_index(id)
-            if len(stored) <= _SMALL_INDEX_BYTES:
-                return stored
-            encoded = FrameIndex.from_bytes(stored).slice(start, count).to_bytes()
+            encoded = self._stored_index(id)
+            if len(encoded) > _SMALL_INDEX_BYTES:
+                encoded = FrameIndex.from_bytes(encoded).slice(start, count).to_bytes()
             while len(self._slices) >= _KEPT_SLICES:
                 del self._slices[next(iter(self._slices))]
             self._slices[key] = encoded
