@@ -84,7 +84,7 @@ class LeaseBook:
         self._out: dict[tuple[bytes, int, int], list[int]] = {}
         self._durations: dict[bytes, deque[float]] = {}
         self._next = 1
-        self._lightened: set[bytes] = set()
+        self._changed: set[bytes] = set()
 
     def __len__(self) -> int:
         return len(self._leases)
@@ -97,10 +97,10 @@ class LeaseBook:
         tasks = [self._leases[number].task for number in self._held.get(worker, ())]
         return len({task.clip for task in tasks if task is not None}) + tasks.count(None)
 
-    def take_lightened(self) -> set[bytes]:
-        """Workers that hold less than they did, or nothing that somebody waits for, since the last call."""
-        lightened, self._lightened = self._lightened, set()
-        return lightened
+    def take_changed(self) -> set[bytes]:
+        """Workers that hold more or less than at the last call, or something that nobody waits for any more."""
+        changed, self._changed = self._changed, set()
+        return changed
 
     def tasks_of(self, worker: bytes) -> Iterator[Task]:
         """The tasks that this worker holds and somebody still waits for."""
@@ -121,6 +121,7 @@ class LeaseBook:
         self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
         self._held.setdefault(worker, []).append(number)
         self._out.setdefault(task.sample, []).append(number)
+        self._changed.add(worker)
         return number
 
     def begun(self, number: int, worker: bytes, now: float) -> None:
@@ -211,11 +212,11 @@ class LeaseBook:
     def _retire(self, sample: tuple[bytes, int, int]) -> None:
         for number in self._out.pop(sample, ()):
             self._leases[number].task = None
-            self._lightened.add(self._leases[number].worker)
+            self._changed.add(self._leases[number].worker)
 
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)
-        self._lightened.add(lease.worker)
+        self._changed.add(lease.worker)
         held = self._held[lease.worker]
         held.remove(number)
         if not held:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -31,8 +32,11 @@ class Workers:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, _Worker] = {}
-        # Among a thousand busy workers the one that has just answered is found at once.
-        self._may_have_room: set[bytes] = set()
+        # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
+        self._changed: set[bytes] = set()
+        self._room: dict[bytes, int] = {}  # what they hold who have room for more
+        self._heap: list[tuple[int, bytes]] = []  # all of that, and what was so once
+        self._in_heap: set[tuple[int, bytes]] = set()
 
     def __len__(self) -> int:
         return len(self._workers)
@@ -47,11 +51,12 @@ class Workers:
     def add(self, identity: bytes, credit: int, now: float) -> None:
         """A worker said hello."""
         self._workers[identity] = _Worker(max(1, min(credit, MOST_WORKER_CREDIT)), now)
-        self._may_have_room.add(identity)
+        self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
         """It is gone."""
         self._workers.pop(identity, None)
+        self._changed.add(identity)
 
     def heard(self, identity: bytes, now: float) -> bool:
         """A message came from it; False when nobody of that name said hello."""
@@ -80,28 +85,47 @@ class Workers:
             keep_one_empty: a task that runs alone waits: the worker that holds least is left to work itself empty.
             other_than: not this one, which is slow at the task.
         """
-        free = sorted(self._free())[int(keep_one_empty) :]
-        return next((identity for _, identity in free if identity != other_than), None)
+        lightest = self._lightest(2 + keep_one_empty)[keep_one_empty:]
+        return next((identity for _, identity in lightest if identity != other_than), None)
 
     def for_lone_task(self) -> bytes | None:
         """A worker that holds nothing."""
-        return next((identity for held, identity in sorted(self._free()) if not held), None)
+        return next((identity for held, identity in self._lightest(1) if not held), None)
 
     def _give_up(self, found: Iterable[bytes]) -> list[bytes]:
         given_up = [identity for identity in found if not self._workers[identity].given_up]
         for identity in given_up:
             self._workers[identity].given_up = True
+        self._changed.update(given_up)
         return given_up
 
-    def _free(self) -> list[tuple[int, bytes]]:
-        """(leases held, identity) of those with room; a task that runs alone leaves none."""
-        self._may_have_room |= self._leases.take_lightened()
-        free = []
-        for identity in list(self._may_have_room):
-            worker = self._workers.get(identity)
-            held = self._leases.held_by(identity)
-            if worker is None or worker.given_up or held >= worker.credit:
-                self._may_have_room.remove(identity)
-            elif not any(runs_alone(task) for task in self._leases.tasks_of(identity)):
-                free.append((held, identity))
-        return free
+    def _lightest(self, most: int) -> list[tuple[int, bytes]]:
+        """(leases held, identity) of those with room who hold least, in that order; equals by name."""
+        self._look_at_changed()
+        found: list[tuple[int, bytes]] = []
+        while self._heap and len(found) < most:
+            entry = heapq.heappop(self._heap)
+            if self._room.get(entry[1]) == entry[0]:
+                found.append(entry)
+            else:
+                self._in_heap.remove(entry)
+        for entry in found:
+            heapq.heappush(self._heap, entry)
+        return found
+
+    def _look_at_changed(self) -> None:
+        changed, self._changed = self._changed | self._leases.take_changed(), set()
+        for identity in changed:
+            worker, held = self._workers.get(identity), self._leases.held_by(identity)
+            if worker is None or worker.given_up or held >= worker.credit or self._is_alone(identity):
+                self._room.pop(identity, None)
+                continue
+            self._room[identity] = held
+            # An entry stays in the heap until it comes up, so that there is one at most of each kind.
+            if (held, identity) not in self._in_heap:
+                self._in_heap.add((held, identity))
+                heapq.heappush(self._heap, (held, identity))
+
+    def _is_alone(self, identity: bytes) -> bool:
+        """A task that runs alone leaves no room."""
+        return any(runs_alone(task) for task in self._leases.tasks_of(identity))

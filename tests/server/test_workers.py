@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v2v_server.blame import ALONE_AFTER, runs_alone
@@ -61,27 +61,35 @@ def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from(("add", "remove", "load", "finish", "leave", "give up")), st.integers(0, 9)),
-        max_size=60,
+        st.tuples(
+            st.sampled_from(("load", "load", "finish", "add", "remove", "load alone", "leave", "give up")),
+            st.integers(0, 3),
+            st.integers(0, 3),
+        ),
+        min_size=20,
+        max_size=100,
     )
 )
-def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int]]) -> None:
-    """The table looks only at workers that may have room: none is ever forgotten."""
+@settings(max_examples=300)
+def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int, int]]) -> None:
+    """The table looks only at workers whose load has changed: none is ever forgotten, nor kept in mind twice."""
     table, out = Table(), []
-    for what, which in moves:
-        name = f"w{which % 4}"
+    for number in range(4):
+        table.workers.add(f"w{number}".encode(), 1 + number, 0.0)
+    for what, which, how in moves:
+        name, session = f"w{which}", b"cd"[how % 2 :][:1]
         identity = name.encode()
         if what == "add" and identity not in table.workers:
-            table.workers.add(identity, 1 + which % 3, 0.0)
+            table.workers.add(identity, 1 + how, 0.0)
         elif what == "remove":
             table.workers.remove(identity)
             table.book.lost(identity)
-        elif what == "load" and identity in table.workers and not lonely(table, identity):
-            out.append((table.load(name, deaths=ALONE_AFTER * (which == 9), session=b"cd"[which % 2 :][:1]), identity))
+        elif what in ("load", "load alone") and identity in table.workers and not lonely(table, identity):
+            out.append((table.load(name, deaths=ALONE_AFTER * (what == "load alone"), session=session), identity))
         elif what == "finish" and out:
             table.book.finished(*out.pop(which % len(out)), 0.0)
         elif what == "leave":
-            table.book.forget_session(b"cd"[which % 2 :][:1])
+            table.book.forget_session(session)
         elif what == "give up":
             table.workers.hanging(DEADLINE * 10)
         expected = sorted(
@@ -89,7 +97,14 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
             for identity, worker in table.workers._workers.items()
             if not worker.given_up and table.book.held_by(identity) < worker.credit and not lonely(table, identity)
         )
-        assert sorted(table.workers._free()) == expected
+        assert table.workers._lightest(99) == expected
+        names = [identity for _, identity in expected]
+        assert table.workers.for_lone_task() == next((name for held, name in expected if not held), None)
+        for kept in (False, True):
+            assert table.next(keep_one_empty=kept) == next(iter(names[kept:]), None)
+            others = [name for name in names[kept:] if name != identity]
+            assert table.next(keep_one_empty=kept, other_than=identity) == next(iter(others), None)
+    assert len(table.workers._heap) <= 4 * 5
 
 
 def lonely(table: Table, identity: bytes) -> bool:
