@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy.typing as npt
 
-from v2v_protocol.sample import Provenance
-
 
 @dataclass(frozen=True, slots=True)
 class Payload:
@@ -31,7 +29,7 @@ class Arrival:
     Attributes:
         index: global index.
         payload: its arrays.
-        provenance: where it came from.
+        provenance: where it came from, see :meth:`v2v_client.connection.Connection.provenance`.
         worker: name of the server worker that made it.
         cpu_seconds: processor time that took there.
         decoded: whether a clip was decoded for it.
@@ -39,7 +37,7 @@ class Arrival:
 
     index: int
     payload: Payload
-    provenance: Provenance
+    provenance: bytes
     worker: str
     cpu_seconds: float
     decoded: bool

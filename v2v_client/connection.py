@@ -344,23 +344,35 @@ class Connection:
             self.strays += 1
             self._ask_on(again)
             return None
-        provenance = Provenance.from_dict(decode_map(header.provenance))
+        self._quarantine = max(self._quarantine or 0, header.quarantine)
+        self._asked.pop(header.index, None)
+        self._credit_refusals = 0
+        self._last = header.index
+        self._ask_on(again)
+        return Arrival(header.index, found, header.provenance, header.worker, header.cpu_seconds, header.decoded)
+
+    def provenance(self, index: int, packed: bytes) -> Provenance:
+        """Where a sample came from. Opened once its batch is whole: many at once take less than one at a time.
+
+        Args:
+            index: of the sample.
+            packed: as it arrived.
+
+        Raises:
+            ProtocolError: it is that of another sample, or of none.
+        """
+        provenance = Provenance.from_dict(decode_map(packed))
         identity = SampleId(
             spec_digest=self.stream.spec_digest,
             catalogue_digest=self.stream.catalogue_digest,
             numerics_version=self.stream.numerics_version,
             seed=self._hello.seed,
-            epoch=header.epoch,
-            index=header.index,
+            epoch=self._epoch,
+            index=index,
         )
         if provenance.id != identity:
             raise ProtocolError(f"{self._address} sent {provenance.id} in answer to {identity}")
-        self._quarantine = max(self._quarantine or 0, provenance.quarantine)
-        self._asked.pop(header.index, None)
-        self._credit_refusals = 0
-        self._last = header.index
-        self._ask_on(again)
-        return Arrival(header.index, found, provenance, header.worker, header.cpu_seconds, header.decoded)
+        return provenance
 
     def _ask_on(self, again: bool) -> None:
         """After a sample; one that comes again held credit that we took for free."""

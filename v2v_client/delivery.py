@@ -31,7 +31,7 @@ class _Draft:
         self._buffers = buffers
         self._memory: Memory = (buffers.shared() if shared else None) or buffers.own()
         self._left: SharedMemory | None = None
-        self.provenance: list[Provenance | None] = [None] * samples
+        self.provenance: list[bytes | None] = [None] * samples
         self.cpu_seconds = 0.0
         self.decodes = 0
         self.in_place = 0  # samples that a worker put into their row
@@ -130,14 +130,24 @@ def deliver(
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
         draft = drafts.pop(number)
         lend = lend and draft.in_place > 0  # workers elsewhere have no use for it, and a message is cheaper without
-        quarantine = max([quarantine, *(item.quarantine for item in draft.provenance if item is not None)])
-        yield _finished(draft, plan.indices(number), epoch, resume_state(number, quarantine), clock() - began)
+        indices = plan.indices(number)
+        provenance = tuple(
+            connection.provenance(index, packed)
+            for index, packed in zip(indices, draft.provenance, strict=True)
+            if packed is not None
+        )
+        quarantine = max([quarantine, *(item.quarantine for item in provenance)])
+        yield _finished(draft, indices, provenance, epoch, resume_state(number, quarantine), clock() - began)
 
 
 def _finished(
-    draft: _Draft, indices: tuple[int, ...], epoch: int, resume_state: Mapping[str, Any], wait_seconds: float
+    draft: _Draft,
+    indices: tuple[int, ...],
+    provenance: tuple[Provenance, ...],
+    epoch: int,
+    resume_state: Mapping[str, Any],
+    wait_seconds: float,
 ) -> Batch:
-    provenance = tuple(item for item in draft.provenance if item is not None)
     if len(provenance) != len(indices):
         raise ProtocolError(f"a batch of {len(indices)} samples has {len(provenance)}: the reorder window is at fault")
     tensors = {name: torch.from_numpy(array) for name, array in draft.whole().items()}

@@ -123,6 +123,7 @@ class SampleHeader:
         cpu_seconds: processor time it took there.
         decoded: whether a clip was decoded for it; False where it came from that of a sibling.
         slot: the slot that the lease named, to which this worker writes no more; 0: it named none.
+        quarantine: number of the quarantine snapshot that the lease named, as the provenance says it.
     """
 
     epoch: int
@@ -135,6 +136,7 @@ class SampleHeader:
     cpu_seconds: float
     decoded: bool = True
     slot: int = 0
+    quarantine: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,13 +102,14 @@ def encode_sample(
     decoded: bool = True,
     slot: int = NO_SLOT,
     in_slot: bool = False,
+    quarantine: int = 0,
 ) -> Frames:
     """A whole SampleHeader message. The arrays are not copied: leave them alone until they are sent.
 
     Args:
         slot: the slot that the lease named.
         in_slot: the arrays lie there, so the header goes alone.
-        epoch, index, arrays, provenance, worker, cpu_seconds, decoded: see :class:`SampleHeader`.
+        epoch, index, arrays, provenance, worker, cpu_seconds, decoded, quarantine: see :class:`SampleHeader`.
 
     Raises:
         LimitExceeded: an array dtype that is not on the allow-list, or an array that is not C-contiguous.
@@ -129,6 +130,7 @@ def encode_sample(
         cpu_seconds=cpu_seconds,
         decoded=decoded,
         slot=slot,
+        quarantine=quarantine,
     )
     if in_slot:
         return encode(header)

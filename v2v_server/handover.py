@@ -77,6 +77,7 @@ def sample_message(
         decoded=decoded,
         slot=lease.slot,
         in_slot=room.in_slot,
+        quarantine=lease.quarantine,
     )
 
 

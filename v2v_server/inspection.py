@@ -35,6 +35,8 @@ def inspected(payload: Sequence[Any], task: Task, form: Form) -> SampleHeader:
         raise ProtocolError("its header is that of another sample, or of none")
     if (header.names, header.dtypes) != (form.names, form.dtypes):
         raise ProtocolError(f"it has {list(header.names)!r:.100} of {list(header.dtypes)!r:.100}")
+    if header.quarantine != task.snapshot:
+        raise ProtocolError(f"it was made under quarantine snapshot {header.quarantine}, not {task.snapshot}")
     slot = NO_SLOT if task.slot is None else task.slot.number
     if header.slot != slot:
         raise ProtocolError(f"it names slot {header.slot}, slot {slot} was lent")

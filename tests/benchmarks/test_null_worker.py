@@ -24,7 +24,7 @@ from v2v_server.sequences import SequenceTable
 def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ...]) -> None:
     catalogue = corpus(video("a.mp4"), video("b.mp4"))
     schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
-    task = Task(b"consumer", 3, 1)
+    task = Task(b"consumer", 3, 1, snapshot=2)
     lease = describe(
         task, number=7, sequence=schedule.candidate(5, 3, 1, 0), quarantine=2, catalogue=catalogue, spec=SMALL_SPEC,
         seed=5, arrays=arrays, deadline_seconds=60.0,

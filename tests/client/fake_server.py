@@ -60,6 +60,7 @@ class FakeServer:
         refuse_repeat: refuses, once and for credit, a request that repeats an index.
         overstated: Welcome grants this much more than is accepted.
         alter: changes the frames of a sample before they are sent.
+        snapshot: quarantine snapshot that samples are made under.
         workers: where they are: "here" they put samples into the slots that are lent, "elsewhere" they cannot and send
             them, "many" is both, and some samples are made by a second worker, which knows of no slot.
         hellos, wants: what came, in order.
@@ -84,6 +85,7 @@ class FakeServer:
         self.refuse_repeat = False
         self.overstated = 0
         self.alter: Callable[[list[Any]], list[Any]] = lambda frames: frames
+        self.snapshot = 0
         self.workers = "here"
         self.hellos: list[Hello] = []
         self.goodbyes = 0
@@ -286,7 +288,7 @@ class FakeServer:
             _put(slot, {name: np.full_like(array, 101) for name, array in arrays.items()}, session)  # the first worker
             slot = None
         identity = SampleId(session.spec.digest, self.catalogue, 1, seed, epoch, index)
-        provenance = Provenance(identity, "a.mp4", "7:00", 0, 0, (), _PARAMS, 0, 0, "h264 exact")
+        provenance = Provenance(identity, "a.mp4", "7:00", 0, 0, (), _PARAMS, 0, 0, "h264 exact", self.snapshot)
         return encode_sample(
             epoch=epoch,
             index=index,
@@ -296,6 +298,7 @@ class FakeServer:
             cpu_seconds=0.25,
             slot=NO_SLOT if slot is None else slot.number,
             in_slot=in_slot,
+            quarantine=self.snapshot,
         )
 
 

@@ -46,6 +46,22 @@ def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(se
     assert server.refused_for_credit == 1
 
 
+def test_a_session_is_opened_again_under_the_newest_snapshot_of_any_sample_that_came(server: FakeServer) -> None:
+    """Be it one whose provenance nobody has opened yet."""
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+        connection.open()
+        for index, snapshot in enumerate((7, 3)):
+            server.call(lambda snapshot=snapshot: setattr(server, "snapshot", snapshot))
+            connection.want([index])
+            assert _next(connection) == index
+        greeted = len(server.hellos)
+        server.forget()
+        connection.want([2])
+        assert _next(connection) == 2
+        assert [again.quarantine for again in server.hellos[greeted:]] == [7]
+
+
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("which", [1, 2])
 def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(

@@ -49,7 +49,9 @@ def answer_to(lease: Lease, *, in_slot: bool = False, cpu_seconds: float = 0.1) 
     """What an honest worker sends behind its Result."""
     spec = StreamSpec.from_dict(json.loads(lease.spec))
     layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
-    frames = frames_of(layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds)
+    frames = frames_of(
+        layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds, quarantine=lease.quarantine
+    )
     return frames[:1] if in_slot else frames
 
 
@@ -60,6 +62,7 @@ def frames_of(
     seed: int,
     slot: int = NO_SLOT,
     cpu_seconds: float = 0.1,
+    quarantine: int = 0,
 ) -> list[Buffer]:
     """A sample message of zeros in that layout."""
     header = SampleHeader(
@@ -72,6 +75,7 @@ def frames_of(
         worker="w",
         cpu_seconds=cpu_seconds,
         slot=slot,
+        quarantine=quarantine,
     )
     return [*encode(header), *(memoryview(bytes(layout_bytes({name: layout[name]}))) for name in layout)]
 

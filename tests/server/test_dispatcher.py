@@ -744,6 +744,7 @@ def _shortened(frames: list[Any]) -> list[Any]:
 
 NONSENSE: dict[str, Callable[[], list[Any]]] = {
     "nothing": list,
+    "another quarantine snapshot": lambda: frames_of({"voxels": ("int8", (2, 2, 8, 8))}, 0, 0, 0, quarantine=1),
     "garbage": lambda: [b"\xc1garbage", *sample_frames(0, 0)[1:]],
     "another message": lambda: [*encode(Ping()), *sample_frames(0, 0)[1:]],
     "header of another sample": lambda: sample_frames(0, 1),
