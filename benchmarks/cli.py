@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import benchmarks
+from v2v_protocol.errors import V2VError
 
 _LINE_WIDTH = 104
 
@@ -55,6 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before, sys.argv = sys.argv, [f"v2v-bench {name}", *rest]
     try:
         status = importlib.import_module(f"benchmarks.{name}").main()
+    except (V2VError, OSError) as error:  # of a result that was printed and cannot be written, say
+        print(f"v2v-bench {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
     finally:
         sys.argv = before
     return int(status)

@@ -18,22 +18,24 @@ from typing import Any, get_args
 
 import msgpack
 
+from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.messages import Message, SampleHeader
 from v2v_protocol.wire import ARRAY_DTYPES, Frames, encode
 
 MESSAGE_TYPES: tuple[type[Any], ...] = get_args(Message)
 _ITEM_BYTES = {"int8": 1, "uint8": 1, "int16": 2, "float16": 2, "float32": 4}
 _EDGES = (0, 1, 2, 127, 128, 255, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**63, 2**64 - 1)
+_VERSION = b"\xa1v" + bytes([PROTOCOL_VERSION])
 _BOMBS = (
     b"\xdf\xff\xff\xff\xff",
     b"\xdd\xff\xff\xff\xff",
     b"\xc6\xff\xff\xff\xff",
     b"\xdb\xff\xff\xff\xff",
     b"\xc9\xff\xff\xff\xff\x00",
-    b"\x82\xa1v\x01\xa1t\xdb\x7f\xff\xff\xff",
+    b"\x82" + _VERSION + b"\xa1t\xdb\x7f\xff\xff\xff",
     b"\x91" * 5000,
     b"\x81\xa1a" * 2000,
-    b"\x83\xa1v\x01\xa1t\xa4ping\xa1x" + b"\x91" * 900 + b"\x90",
+    b"\x83" + _VERSION + b"\xa1t\xa4ping\xa1x" + b"\x91" * 900 + b"\x90",
 )
 
 

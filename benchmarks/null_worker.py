@@ -135,6 +135,7 @@ class NullWorkers:
                 self._leases.pop(link, None)
             case Refused(ErrorCode.UNKNOWN_SESSION):
                 self._leases.pop(link, None)
+                self._begun.pop(link, None)
                 self._say_hello(link)
             case Refused(code, text):
                 raise RemoteError(code, text)

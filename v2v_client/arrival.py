@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy.typing as npt
 
+from v2v_protocol.messages import SampleHeader
+
 
 @dataclass(frozen=True, slots=True)
 class Payload:
@@ -27,17 +29,9 @@ class Arrival:
     """One sample.
 
     Attributes:
-        index: global index.
+        header: what is said of it; its provenance is opened by :meth:`v2v_client.connection.Connection.provenance`.
         payload: its arrays.
-        provenance: where it came from, see :meth:`v2v_client.connection.Connection.provenance`.
-        worker: name of the server worker that made it.
-        cpu_seconds: processor time that took there.
-        decoded: whether a clip was decoded for it.
     """
 
-    index: int
+    header: SampleHeader
     payload: Payload
-    provenance: bytes
-    worker: str
-    cpu_seconds: float
-    decoded: bool

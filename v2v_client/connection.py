@@ -349,29 +349,30 @@ class Connection:
         self._credit_refusals = 0
         self._last = header.index
         self._ask_on(again)
-        return Arrival(header.index, found, header.provenance, header.worker, header.cpu_seconds, header.decoded)
+        return Arrival(header, found)
 
-    def provenance(self, index: int, packed: bytes) -> Provenance:
+    def provenance(self, header: SampleHeader) -> Provenance:
         """Where a sample came from. Opened once its batch is whole: many at once take less than one at a time.
-
-        Args:
-            index: of the sample.
-            packed: as it arrived.
 
         Raises:
             ProtocolError: it is that of another sample, or of none.
         """
-        provenance = Provenance.from_dict(decode_map(packed))
+        provenance = Provenance.from_dict(decode_map(header.provenance))
         identity = SampleId(
             spec_digest=self.stream.spec_digest,
             catalogue_digest=self.stream.catalogue_digest,
             numerics_version=self.stream.numerics_version,
             seed=self._hello.seed,
-            epoch=self._epoch,
-            index=index,
+            epoch=header.epoch,
+            index=header.index,
         )
         if provenance.id != identity:
             raise ProtocolError(f"{self._address} sent {provenance.id} in answer to {identity}")
+        if type(provenance.quarantine) is not int or provenance.quarantine != header.quarantine:
+            raise ProtocolError(
+                f"{self._address} sent sample {header.index} of epoch {header.epoch} as made under quarantine snapshot "
+                f"{header.quarantine}, and its provenance names {provenance.quarantine!r:.40}"
+            )
         return provenance
 
     def _ask_on(self, again: bool) -> None:

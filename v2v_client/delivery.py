@@ -17,6 +17,7 @@ from v2v_client.ordering import ReorderWindow
 from v2v_client.world import EpochPlan
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ProtocolError
+from v2v_protocol.messages import SampleHeader
 from v2v_protocol.sample import Provenance
 
 
@@ -31,7 +32,7 @@ class _Draft:
         self._buffers = buffers
         self._memory: Memory = (buffers.shared() if shared else None) or buffers.own()
         self._left: SharedMemory | None = None
-        self.provenance: list[bytes | None] = [None] * samples
+        self.headers: list[SampleHeader | None] = [None] * samples
         self.cpu_seconds = 0.0
         self.decodes = 0
         self.in_place = 0  # samples that a worker put into their row
@@ -50,15 +51,15 @@ class _Draft:
             self.in_place += 1
             if self._left is not None:
                 self._memory.put(row, self._left.get(row))
-        self.provenance[row] = sample.provenance
-        self.cpu_seconds += sample.cpu_seconds
-        self.decodes += sample.decoded
+        self.headers[row] = sample.header
+        self.cpu_seconds += sample.header.cpu_seconds
+        self.decodes += sample.header.decoded
 
     def _leave(self) -> None:
         left = self._memory
         if isinstance(left, SharedMemory):
             self._left, self._memory = left, self._buffers.own()
-            for row, there in enumerate(self.provenance):
+            for row, there in enumerate(self.headers):
                 if there is not None:
                     self._memory.put(row, left.get(row))
 
@@ -111,7 +112,7 @@ def deliver(
         connection.want(asked, slots)
 
     def accept(sample: Arrival) -> None:
-        place = window.receive(sample.index)
+        place = window.receive(sample.header.index)
         if place is not None:
             drafts[place.batch].fill(place.row, sample)
 
@@ -130,14 +131,11 @@ def deliver(
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
         draft = drafts.pop(number)
         lend = lend and draft.in_place > 0  # workers elsewhere have no use for it, and a message is cheaper without
-        indices = plan.indices(number)
-        provenance = tuple(
-            connection.provenance(index, packed)
-            for index, packed in zip(indices, draft.provenance, strict=True)
-            if packed is not None
-        )
+        provenance = tuple(connection.provenance(header) for header in draft.headers if header is not None)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
-        yield _finished(draft, indices, provenance, epoch, resume_state(number, quarantine), clock() - began)
+        yield _finished(
+            draft, plan.indices(number), provenance, epoch, resume_state(number, quarantine), clock() - began
+        )
 
 
 def _finished(

@@ -1,7 +1,7 @@
 """Messages <-> frames of a ZeroMQ multipart message.
 
 Frame 0 is a msgpack map: ``{"v": protocol version, "t": type name, ...fields}``. A SampleHeader is followed by one raw
-frame per array; a Result is followed by the frames of a whole SampleHeader message, which a broker passes on unopened.
+frame per array; a Result by the frames of a whole SampleHeader message, which a broker passes on as they are.
 
 Everything that comes off a wire is hostile until it is decoded: sizes are limited before anything is allocated, types
 are checked field by field, dtypes come from an allow-list, nothing is ever unpickled. Whatever bytes arrive,
@@ -248,7 +248,7 @@ def _unpacked(packed: Buffer, what: str) -> Any:
 
 
 # --- field checks -----------------------------------------------------------------------------------------------------
-# A server decodes three messages a sample: what a check would only need for an error is made up when there is one.
+# A server decodes two headers a sample: what a check would only need for an error is made up when there is one.
 
 Check: TypeAlias = Callable[[Any], Any]
 

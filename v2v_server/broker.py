@@ -139,14 +139,14 @@ def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
 
     The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
     """
+    frames: list[Any] = []
     try:
         identity = frame = router.recv(_NOBLOCK, copy=False)
+        while frame.more:  # recv_multipart asks the socket instead, which takes longer
+            frame = router.recv(_NOBLOCK, copy=False)
+            frames.append(frame if frames else frame.bytes)
     except zmq.Again:
         return None  # a connection that just ended took it along
-    frames: list[Any] = []
-    while frame.more:  # recv_multipart asks the socket instead, which takes longer
-        frame = router.recv(_NOBLOCK, copy=False)
-        frames.append(frame if frames else frame.bytes)
     return identity.bytes, frames
 
 

@@ -1,6 +1,6 @@
 """The server's mind: messages and deaths in, instructions out. No sockets, no processes, no clock.
 
-Consumers ask (Want), sessions queue, free workers are given leases, results pass through unopened. Whatever a peer
+Consumers ask (Want), sessions queue, free workers are given leases, results pass through as they are. Whatever a peer
 sends, the answer is an instruction or a counted fault, never an exception: one bad peer must not stop the others.
 """
 

@@ -34,12 +34,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         if arguments.clear and quarantine.verdicts(quarantine.latest):
             _clear(file, quarantine)
         in_force = quarantine.verdicts(quarantine.latest)
-        if arguments.json is not None:
-            records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
-            write_json(arguments.json, records)
         for line in quarantine.lines:
             print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
         print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
+        if arguments.json is not None:
+            records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
+            write_json(arguments.json, records)
 
     run_command(parser, run, argv)
 

@@ -11,6 +11,7 @@ from v2v_server.leases import LeaseBook
 
 MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
+_MOST_STALE = 64
 SILENCE_SECONDS = 30.0
 """A worker without work says so every five seconds; after this long without a word it is taken for gone."""
 
@@ -121,10 +122,14 @@ class Workers:
                 self._room.pop(identity, None)
                 continue
             self._room[identity] = held
-            # An entry stays in the heap until it comes up, so that there is one at most of each kind.
+            # An entry that is out of date stays until it comes up, or until there are more of them than of others.
             if (held, identity) not in self._in_heap:
                 self._in_heap.add((held, identity))
                 heapq.heappush(self._heap, (held, identity))
+        if len(self._heap) > 2 * len(self._room) + _MOST_STALE:
+            self._heap = [(held, identity) for identity, held in self._room.items()]
+            self._in_heap = set(self._heap)
+            heapq.heapify(self._heap)
 
     def _is_alone(self, identity: bytes) -> bool:
         """A task that runs alone leaves no room."""

@@ -85,4 +85,4 @@ def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
 def _next(connection: Connection) -> int:
     arrival = connection.receive()
     assert arrival is not None
-    return arrival.index
+    return arrival.header.index

@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import gc
 import os
 import pickle
@@ -26,6 +27,7 @@ from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Refused
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
+from v2v_protocol.wire import decode, decode_map, encode, encode_map
 from v2v_server.handover import slot_arrays
 
 SEED = 5
@@ -474,13 +476,26 @@ def test_a_sample_that_cannot_be_made_is_named(server):
         list(batches)
 
 
+def with_provenance(frames, change):
+    header = decode(frames[0])
+    changed = encode_map(change(decode_map(header.provenance)))
+    return [*encode(dataclasses.replace(header, provenance=changed)), *frames[1:]]
+
+
 GARBAGE = {
     "no message": lambda frames: [b"\xc1garbage", *frames[1:]],
     "an array too short": lambda frames: [frames[0], bytes(frames[1])[:-1], frames[2]],
     "an array less": lambda frames: frames[:2],
     "an array more": lambda frames: [*frames, b"x"],
-    "another sample's provenance": lambda frames: [
-        bytes(frames[0]).replace(b"catalogue-1", b"catalogue-9"),
+    "another sample's provenance": lambda frames: with_provenance(
+        frames, lambda was: was | {"id": was["id"] | {"catalogue_digest": "catalogue-9"}}
+    ),
+    "a provenance that is no map": lambda frames: with_provenance(frames, list),
+    "a provenance of something else": lambda frames: with_provenance(frames, lambda was: {"id": was["id"]}),
+    "another snapshot in the provenance": lambda frames: with_provenance(frames, lambda was: was | {"quarantine": 1}),
+    "no snapshot in the provenance": lambda frames: with_provenance(frames, lambda was: was | {"quarantine": False}),
+    "a provenance that cannot be read": lambda frames: [
+        *encode(dataclasses.replace(decode(frames[0]), provenance=b"\xc1")),
         *frames[1:],
     ],
 }

@@ -30,6 +30,9 @@ from v2v_protocol.wire import (
     encode_sample,
 )
 
+V = b"\x82\xa1v" + bytes([PROTOCOL_VERSION])
+"""A message of two fields begins, with its version."""
+
 by_name = pytest.mark.parametrize("cls", MESSAGES, ids=lambda cls: cls.__name__)
 
 
@@ -130,7 +133,7 @@ def test_messages_with_a_replaced_field(data: st.DataObject) -> None:
 @pytest.mark.parametrize("depth", [1, 15, 16, 17, 200, 990, 1020, 1024, 200_000])
 def test_nesting(opening: bytes, depth: int) -> None:
     """Depths that the decoder takes, but that no repr() survives."""
-    for before in (b"\x82\xa1v\x01\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping\xa1v\x01\xa1x", b""):
+    for before in (V + b"\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping" + V[1:] + b"\xa1x", b""):
         message_or_refusal(before + opening * depth + b"\x90")
 
 
@@ -186,7 +189,9 @@ def test_every_field_is_of_its_type(cls: type[Any]) -> None:
 
 
 @by_name
-@pytest.mark.parametrize("version", [0, 2, -1, 2**64 - 1, 1.0, True, "1", None, [1], {"v": 1}])
+@pytest.mark.parametrize(
+    "version", [0, 1, PROTOCOL_VERSION + 1, -1, 2**64 - 1, float(PROTOCOL_VERSION), True, "2", None, [2], {"v": 2}]
+)
 def test_other_versions_are_refused_with_both_numbers(cls: type[Any], version: Any) -> None:
     refuse(plain(example(cls)) | {"v": version}, VersionMismatch, f"this side version {PROTOCOL_VERSION}")
 
@@ -210,10 +215,10 @@ def test_nothing_may_follow_a_message() -> None:
 
 def test_extension_types_and_bad_text_are_refused() -> None:
     for value in (msgpack.Timestamp(1, 2), msgpack.ExtType(5, b"x")):
-        refuse({"v": 1, "t": "refused", "code": value, "text": ""}, match="code: expected str")
+        refuse({"v": PROTOCOL_VERSION, "t": "refused", "code": value, "text": ""}, match="code: expected str")
         refuse({"v": value, "t": "ping"}, VersionMismatch)
     with pytest.raises(ProtocolError, match="UnicodeDecodeError"):
-        decode(b"\x82\xa1v\x01\xa1t\xa2\xff\xfe")
+        decode(V + b"\xa1t\xa2\xff\xfe")
 
 
 # --- limits -----------------------------------------------------------------------------------------------------------
@@ -241,7 +246,7 @@ def test_lists_are_limited() -> None:
 def test_a_list_that_only_claims_to_be_huge_is_refused() -> None:
     for claim in (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"):
         with pytest.raises(ProtocolError, match="not a message"):
-            decode(b"\x84\xa1v\x01\xa1t\xa4want\xa5epoch\x00\xa7indices" + claim)
+            decode(b"\x84" + V[1:] + b"\xa1t\xa4want\xa5epoch\x00\xa7indices" + claim)
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------

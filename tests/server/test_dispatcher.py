@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from tests.protocol.wire_messages import messages
 from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
 from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
-from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -659,10 +659,10 @@ GARBAGE: list[list[bytes]] = [
     [b"", b""],
     [bytes(LARGEST_HEADER_BYTES + 1)],
     [b"\x82\xa1v" + b"\x91" * 1000 + b"\x90" + b"\xa1t\xa4ping"],
-    [msgpack.packb({"v": 2, "t": "ping"})],
-    [msgpack.packb({"v": 1, "t": "x" * 1000})],
+    [msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "ping"})],
+    [msgpack.packb({"v": PROTOCOL_VERSION, "t": "x" * 1000})],
     [msgpack.packb({"v": "\0" * 500_000, "t": "ping"})],
-    [msgpack.packb({"v": 1, "t": "ping", "\0" * 500_000: 1})],
+    [msgpack.packb({"v": PROTOCOL_VERSION, "t": "ping", "\0" * 500_000: 1})],
 ]
 
 
@@ -684,7 +684,7 @@ def test_garbage_is_counted_and_answered(frames: list[bytes]) -> None:
 
 def test_another_protocol_version_is_refused_as_such_on_both_sides() -> None:
     at = peers()
-    frames = [msgpack.packb({"v": 2, "t": "ping"})]
+    frames = [msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "ping"})]
     at.carry_out(at.dispatcher.from_consumer(b"c", frames, 0.0))
     at.carry_out(at.dispatcher.from_worker(b"w", frames, 0.0))
     for answer in (at.refusals()[0], at.told[b"w"][0]):

@@ -137,6 +137,7 @@ def test_failures_end_in_one_line_and_a_status(
     assert captured.err.startswith("v2v-quarantine: ")
     assert text in captured.err
     assert len(captured.err.splitlines()) == 1
+    assert ("snapshot 1 holds 1 verdicts" in captured.out) == (damage == "json is a folder")
     if damage == "unwritable":
         monkeypatch.undo()
         assert read_quarantine(file).latest == 1

@@ -107,6 +107,18 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
     assert len(table.workers._heap) <= 4 * 5
 
 
+def test_those_who_came_and_went_are_not_kept_in_mind() -> None:
+    """Behind some who are always there, and first in the order."""
+    table = Table(**{f"a{number}": 2 for number in range(3)})
+    for number in range(2000):
+        name = f"b{number}".encode()
+        table.workers.add(name, 2, 0.0)
+        assert table.next() == b"a0"
+        table.workers.remove(name)
+    assert table.next() == b"a0"
+    assert len(table.workers._heap) == len(table.workers._in_heap) < 100
+
+
 def lonely(table: Table, identity: bytes) -> bool:
     return any(runs_alone(task) for task in table.book.tasks_of(identity))
 

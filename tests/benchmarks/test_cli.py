@@ -1,0 +1,39 @@
+"""``v2v-bench``: one line for what went wrong, and a status."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import cli, corpus, kernel
+
+
+def test_a_file_that_cannot_be_written_is_one_line_after_what_was_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    each = {
+        "cpu_seconds_per_sample": 1.0, "cpu_seconds_per_pixel_step": 1.0, "ratio_to_released": 1.0,
+        "median_cpu_seconds_per_sample": 1.0, "median_ratio_to_released": 1.0,
+    }  # fmt: skip
+    monkeypatch.setattr(kernel, "measure", lambda turns: [{"name": "kernel", **each}])
+    assert cli.main(["kernel", "--json", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert said.out.startswith("kernel ")
+    assert said.err == f"v2v-bench kernel: --json {tmp_path}: cannot be written: Is a directory\n"
+
+
+def test_an_error_of_the_system_is_one_line_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full() -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(corpus, "main", full)
+    assert cli.main(["corpus"]) == 2
+    assert capsys.readouterr().err == "v2v-bench corpus: [Errno 28] No space left on device\n"
+
+
+def test_what_is_unknown_is_named_with_what_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["nothing"]) == 2
+    assert "no benchmark 'nothing'; known: chaos, corpus" in capsys.readouterr().err
