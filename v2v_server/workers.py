@@ -11,9 +11,10 @@ from v2v_server.leases import LeaseBook
 
 MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
-_MOST_STALE = 64
 SILENCE_SECONDS = 30.0
 """A worker without work says so every five seconds; after this long without a word it is taken for gone."""
+_MOST_STALE = 64
+"""Entries out of date that the heap may hold, besides one for each worker with room, before it is made anew."""
 
 
 @dataclass(slots=True)
