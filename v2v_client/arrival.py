@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy.typing as npt
 
+from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import SampleHeader
+from v2v_protocol.sample import Provenance, SampleId
+from v2v_protocol.wire import decode_map
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,3 +38,25 @@ class Arrival:
 
     header: SampleHeader
     payload: Payload
+
+
+def opened_provenance(header: SampleHeader, identity: SampleId, sender: str) -> Provenance:
+    """Where a sample came from.
+
+    Args:
+        header: of the sample.
+        identity: what was asked for.
+        sender: of the header, for the message of an error.
+
+    Raises:
+        ProtocolError: it is the provenance of another sample, or none.
+    """
+    provenance = Provenance.from_dict(decode_map(header.provenance))
+    if provenance.id != identity:
+        raise ProtocolError(f"{sender} sent {provenance.id} in answer to {identity}")
+    if type(provenance.quarantine) is not int or provenance.quarantine != header.quarantine:
+        raise ProtocolError(
+            f"{sender} sent sample {header.index} of epoch {header.epoch} as made under quarantine snapshot "
+            f"{header.quarantine}, and its provenance names {provenance.quarantine!r:.40}"
+        )
+    return provenance

@@ -28,7 +28,7 @@ from dataclasses import replace
 
 import zmq
 
-from v2v_client.arrival import Arrival
+from v2v_client.arrival import Arrival, opened_provenance
 from v2v_client.lending import Lending
 from v2v_client.link import Link
 from v2v_client.liveness import Due, Liveness, Patience
@@ -49,7 +49,7 @@ from v2v_protocol.messages import (
     Welcome,
 )
 from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_map, encode, layout_of
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, layout_of
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
@@ -357,7 +357,6 @@ class Connection:
         Raises:
             ProtocolError: it is that of another sample, or of none.
         """
-        provenance = Provenance.from_dict(decode_map(header.provenance))
         identity = SampleId(
             spec_digest=self.stream.spec_digest,
             catalogue_digest=self.stream.catalogue_digest,
@@ -366,14 +365,7 @@ class Connection:
             epoch=header.epoch,
             index=header.index,
         )
-        if provenance.id != identity:
-            raise ProtocolError(f"{self._address} sent {provenance.id} in answer to {identity}")
-        if type(provenance.quarantine) is not int or provenance.quarantine != header.quarantine:
-            raise ProtocolError(
-                f"{self._address} sent sample {header.index} of epoch {header.epoch} as made under quarantine snapshot "
-                f"{header.quarantine}, and its provenance names {provenance.quarantine!r:.40}"
-            )
-        return provenance
+        return opened_provenance(header, identity, self._address)
 
     def _ask_on(self, again: bool) -> None:
         """After a sample; one that comes again held credit that we took for free."""
