@@ -44,6 +44,10 @@ class Clips:
                 return first, True
         return decode_for(lease, lease.indices[:1], self._root)[0], True
 
+    def has(self, lease: Lease) -> bool:
+        """Whether the lease's sample needs no decoding."""
+        return _key(lease, lease.indices[0]) in self._kept
+
 
 def _key(lease: Lease, index: int) -> tuple[object, ...]:
     """Everything of a lease that its decoded clip depends on, and its index."""

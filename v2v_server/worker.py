@@ -1,8 +1,9 @@
 """The server worker: takes a lease, makes its sample, sends it, takes the next.
 
 It holds the leases of two clips at a time, so that the next one is at hand when a sample is done; sending happens in
-ZeroMQ's own thread while the next sample is made. Its life is in others' hands: it may be killed at any moment, and
-does nothing that would have to be undone.
+ZeroMQ's own thread while the next sample is made. Siblings that are made in little time and lie in slots are announced
+together: server and consumer then wake once for all of them, and find the rest at hand. Its life is in others' hands:
+it may be killed at any moment, and does nothing that would have to be undone.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ from v2v_server.warm_up import warm_up_in_turn
 
 CREDIT = 2
 _PING_SECONDS = 5.0
+_TOGETHER_SECONDS = 0.1
+"""A sample that is done waits for its siblings while it has not waited this long."""
 _MORE = int(zmq.SNDMORE)
 """A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
 
@@ -68,6 +71,8 @@ class Worker:
         self._leases: deque[Lease] = deque()
         self._begun = 0  # the lease that was last said to be begun
         self._hellos = 0
+        self._unsent: list[tuple[int, Frames]] = []  # leases that are done, and what is to be said of their samples
+        self._unsent_since = 0.0
         self._stopping = False
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
@@ -105,6 +110,7 @@ class Worker:
                     self._begin()
                 else:
                     self._work(self._leases.popleft())
+            self._send_results()
             self._send(encode(Goodbye()))
         finally:
             self._context.destroy()
@@ -151,13 +157,38 @@ class Worker:
         note(self._logbook, lease.lease)
         frames = self._made(lease)
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
+        if frames is not None:
+            if not self._unsent:
+                self._unsent_since = time.monotonic()
+            self._unsent.append((lease.lease, frames))
+            if self._may_wait(frames):
+                self._begun = self._leases[0].lease
+                return
         hellos = self._hellos
         self._receive(0.0)
-        if frames is None or hellos != self._hellos:
-            return  # the server has forgotten this lease, and may have given its number to another
-        # What is begun next is said along with what is done.
+        if hellos != self._hellos:
+            self._unsent.clear()  # the server has forgotten these leases, and may have given their numbers to others
+        self._send_results()
+
+    def _may_wait(self, frames: Frames) -> bool:
+        """Whether what was just made is sent along with its sibling, which is made next and needs no decoding."""
+        return (
+            len(frames) == 1  # arrays that travel with it had better be on their way
+            and self._logbook is not None  # elsewhere the server blames what was begun to its knowledge
+            and bool(self._leases)
+            and self._clips.has(self._leases[0])
+            and time.monotonic() - self._unsent_since < _TOGETHER_SECONDS
+        )
+
+    def _send_results(self) -> None:
+        """Says what is done, and along with it what is begun next."""
+        if not self._unsent:
+            return
         self._begun = self._leases[0].lease if self._leases and not self._stopping else 0
-        self._send([*encode(Result(lease.lease, self._begun)), *frames])
+        begun = [*(number for number, _ in self._unsent[1:]), self._begun]
+        for (number, frames), next_one in zip(self._unsent, begun, strict=True):
+            self._send([*encode(Result(number, next_one)), *frames])
+        self._unsent.clear()
 
     def _made(self, lease: Lease) -> Frames | None:
         """The frames of a lease's sample; None where its video fails, which is said at once."""

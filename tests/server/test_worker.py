@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,22 +28,36 @@ from v2v_protocol.messages import (
     Stop,
     WorkerHello,
 )
+from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server import worker as worker_module
 from v2v_server.clips import Clips
+from v2v_server.handover import Room
 from v2v_server.worker import Worker
 
 WAIT_MS = 20_000
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
+LAYOUT: Layout = {"voxels": ("int8", (2, 2))}
 
 
 class Server:
-    """A worker in a thread, which waits in the middle of each sample, and the socket that it talks to."""
+    """A worker in a thread, which waits in the middle of each sample, and the socket that it talks to.
+
+    Attributes:
+        worker: it.
+        in_slots: whether its samples lie in slots.
+        decoded: leases that need no decoding, since their siblings were decoded before.
+        now: what its clock says.
+    """
 
     def __init__(self, router: zmq.Socket[bytes], worker: Worker) -> None:
+        self.worker = worker
+        self.in_slots = False
+        self.decoded: set[int] = set()
+        self.now = 0.0
         self._router = router
-        self._worker = worker
-        self._turns: queue.Queue[tuple[bool, VideoError | None]] = queue.Queue()
+        self._started: queue.Queue[int] = queue.Queue()
+        self._turns: queue.Queue[tuple[bool, int, float, VideoError | None]] = queue.Queue()
 
     def heard(self) -> Message:
         """The next message of the worker."""
@@ -56,29 +71,61 @@ class Server:
     def lease(self, number: int) -> None:
         self.says(replace(LEASE, lease=number))
 
-    def lets_it_finish(self, *, after_post: bool = False, error: VideoError | None = None) -> None:
-        """The sample that the worker makes, once there is post for it if there is to be any; or its video fails."""
-        self._turns.put((after_post, error))
+    def lets_it_finish(
+        self, *, after_post: bool = False, held: int = 0, seconds: float = 0.0, error: VideoError | None = None
+    ) -> None:
+        """The sample that the worker makes is done, or its video fails.
 
-    def make(self, *_: object) -> Any:
+        Args:
+            after_post: not before there is post for it.
+            held: not before it holds so many other leases.
+            seconds: that it takes.
+            error: why the video fails.
+        """
+        self._turns.put((after_post, held, seconds, error))
+
+    def waits_for_its_start(self, number: int) -> None:
+        """Returns when the worker is at that lease."""
+        while self._started.get(timeout=WAIT_MS / 1000) != number:
+            pass
+
+    def make(self, lease: Lease, *_: object) -> Any:
         """In place of ``make_sample``, in the worker's thread."""
-        after_post, error = self._turns.get(timeout=WAIT_MS / 1000)
-        assert not after_post or self._worker._socket.poll(WAIT_MS)
+        self._started.put(lease.lease)
+        after_post, held, seconds, error = self._turns.get(timeout=WAIT_MS / 1000)
+        assert not after_post or self.worker._socket.poll(WAIT_MS)
+        while len(self.worker._leases) < held:
+            self.worker._receive(WAIT_MS / 1000)
+        self.now += seconds
         if error is not None:
             raise error
         return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+def has_logbook() -> bool:
+    return True
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_logbook: bool) -> Iterator[Server]:
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.ROUTER) as router,
+        (tmp_path / "logbook").open("wb") as logbook,
+    ):
         router.setsockopt(zmq.LINGER, 0)
         port = router.bind_to_random_port("tcp://127.0.0.1")
-        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{port}")
+        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{port}", logbook.fileno() if has_logbook else None)
         server = Server(router, worker)
         monkeypatch.setattr(worker_module, "make_sample", server.make)
-        monkeypatch.setattr(worker_module, "sample_layout", lambda lease: {"voxels": ("int8", (2, 2))})
+        monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
+        monkeypatch.setattr(worker_module, "room_for", lambda lease, layout: Room(new_arrays(layout), server.in_slots))
+        monkeypatch.setattr(
+            worker_module, "time", SimpleNamespace(monotonic=lambda: server.now, process_time=time.process_time)
+        )
         monkeypatch.setattr(Clips, "take", lambda self, lease: (None, False))
+        monkeypatch.setattr(Clips, "has", lambda self, lease: lease.lease in server.decoded)
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
@@ -86,7 +133,8 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
             yield server
         finally:
             worker.stop()
-            server.lets_it_finish()
+            for _ in range(3):
+                server.lets_it_finish()
             server.says(Stop())
             thread.join(WAIT_MS / 1000)
             assert not thread.is_alive()
@@ -131,7 +179,7 @@ def test_a_worker_stopped_by_a_signal_begins_nothing_of_what_it_holds(server: Se
     server.lease(1)
     assert server.heard() == Begun(1)
     server.lease(2)
-    server._worker.stop()
+    server.worker.stop()
     server.lets_it_finish(after_post=True)
     assert server.heard() == Result(1, begins=0)
     assert server.heard() == Goodbye()
@@ -148,3 +196,78 @@ def test_a_sample_for_a_server_that_was_restarted_is_dropped(server: Server) -> 
     assert server.heard() == Begun(1)
     server.lets_it_finish()
     assert server.heard() == Result(1, begins=0)
+
+
+class TestSiblings:
+    """The worker decodes for lease 1 and holds 2 and 3, whose samples are made of the same clip."""
+
+    @pytest.fixture
+    def in_slots(self) -> bool:
+        return True
+
+    @pytest.fixture(autouse=True)
+    def leases(self, server: Server, in_slots: bool) -> None:
+        server.in_slots = in_slots
+        server.decoded = {2, 3}
+        for number in (1, 2, 3):
+            server.lease(number)
+        assert server.heard() == Begun(1)
+
+    def test_are_announced_together(self, server: Server) -> None:
+        server.lets_it_finish(held=2)
+        server.lets_it_finish()
+        server.lets_it_finish()
+        assert [server.heard() for _ in range(3)] == [Result(1, begins=2), Result(2, begins=3), Result(3, begins=0)]
+
+    def test_wait_for_each_other(self, server: Server) -> None:
+        """Seen where they are not announced at all, for a server that has forgotten them."""
+        server.lets_it_finish(held=2)
+        server.lets_it_finish()
+        server.waits_for_its_start(3)
+        server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you?"))
+        server.lets_it_finish(after_post=True)
+        assert isinstance(server.heard(), WorkerHello)
+        server.lease(1)
+        assert server.heard() == Begun(1)
+
+    def test_do_not_wait_for_another_clip(self, server: Server) -> None:
+        server.decoded = {2}
+        server.lets_it_finish(held=2)
+        server.lets_it_finish()
+        assert [server.heard() for _ in range(2)] == [Result(1, begins=2), Result(2, begins=3)]
+
+    def test_do_not_wait_long(self, server: Server) -> None:
+        server.lets_it_finish(held=2)
+        server.lets_it_finish(seconds=1.0)
+        assert [server.heard() for _ in range(2)] == [Result(1, begins=2), Result(2, begins=3)]
+
+    @pytest.mark.parametrize("in_slots", [False])
+    def test_do_not_wait_with_arrays_that_travel(self, server: Server) -> None:
+        server.lets_it_finish(held=2)
+        assert server.heard() == Result(1, begins=2)
+
+    @pytest.mark.parametrize("has_logbook", [False])
+    def test_do_not_wait_where_the_server_cannot_see_which_one_is_in_work(self, server: Server) -> None:
+        server.lets_it_finish(held=2)
+        assert server.heard() == Result(1, begins=2)
+
+    def test_that_are_done_are_announced_when_the_next_fails(self, server: Server) -> None:
+        server.lets_it_finish(held=2)
+        server.lets_it_finish(error=VideoError("a.mp4", 7, "cut short"))
+        assert server.heard() == JobFailed(2, 7, "cut short")
+        assert server.heard() == Result(1, begins=3)
+
+    def test_that_are_done_are_announced_by_a_worker_that_leaves(
+        self, server: Server, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Told to after it chose to wait."""
+
+        def has(_: Clips, lease: Lease) -> bool:
+            if lease.lease == 3:
+                server.worker.stop()
+            return True
+
+        monkeypatch.setattr(Clips, "has", has)
+        server.lets_it_finish(held=2)
+        server.lets_it_finish()
+        assert [server.heard() for _ in range(3)] == [Result(1, begins=2), Result(2, begins=0), Goodbye()]
