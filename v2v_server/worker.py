@@ -45,7 +45,8 @@ from v2v_server.warm_up import warm_up_in_turn
 CREDIT = 2
 _PING_SECONDS = 5.0
 _TOGETHER_SECONDS = 0.1
-"""A sample that is done waits for its siblings while it has not waited this long."""
+"""What is done waits for a sibling if less time than this has gone by since the first of them was begun. Not since it
+was done: where samples take long the server's clocks, which run from result to result, must see each of them."""
 _MORE = int(zmq.SNDMORE)
 """A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
 
@@ -154,12 +155,12 @@ class Worker:
         self._send(encode(Begun(self._begun)))
 
     def _work(self, lease: Lease) -> None:
+        if not self._unsent:
+            self._unsent_since = time.monotonic()
         note(self._logbook, lease.lease)
         frames = self._made(lease)
         note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
         if frames is not None:
-            if not self._unsent:
-                self._unsent_since = time.monotonic()
             self._unsent.append((lease.lease, frames))
             if self._may_wait(frames):
                 self._begun = self._leases[0].lease

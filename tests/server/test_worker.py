@@ -54,7 +54,7 @@ class Server:
         self.worker = worker
         self.in_slots = False
         self.decoded: set[int] = set()
-        self.now = 0.0
+        self.now = 1000.0
         self._router = router
         self._started: queue.Queue[int] = queue.Queue()
         self._turns: queue.Queue[tuple[bool, int, float, VideoError | None]] = queue.Queue()
@@ -179,6 +179,7 @@ def test_a_worker_stopped_by_a_signal_begins_nothing_of_what_it_holds(server: Se
     server.lease(1)
     assert server.heard() == Begun(1)
     server.lease(2)
+    server.waits_for_its_start(1)
     server.worker.stop()
     server.lets_it_finish(after_post=True)
     assert server.heard() == Result(1, begins=0)
@@ -237,9 +238,14 @@ class TestSiblings:
         assert [server.heard() for _ in range(2)] == [Result(1, begins=2), Result(2, begins=3)]
 
     def test_do_not_wait_long(self, server: Server) -> None:
-        server.lets_it_finish(held=2)
-        server.lets_it_finish(seconds=1.0)
+        server.lets_it_finish(held=2, seconds=0.06)
+        server.lets_it_finish(seconds=0.06)
         assert [server.heard() for _ in range(2)] == [Result(1, begins=2), Result(2, begins=3)]
+
+    def test_do_not_wait_for_another_where_the_first_took_long(self, server: Server) -> None:
+        """The server would see two of them take the time that it allows for one."""
+        server.lets_it_finish(held=2, seconds=1.0)
+        assert server.heard() == Result(1, begins=2)
 
     @pytest.mark.parametrize("in_slots", [False])
     def test_do_not_wait_with_arrays_that_travel(self, server: Server) -> None:
