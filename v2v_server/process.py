@@ -73,6 +73,12 @@ def take_long_turns() -> bool:
     return bool(kernel.syscall(set_, 0, ctypes.byref(attributes), 0) == 0)
 
 
+def give_way() -> None:
+    """Lets others have this core at a good moment, where any are waiting, instead of at the end of the turn."""
+    if hasattr(os, "sched_yield"):
+        os.sched_yield()
+
+
 def die_with_parent(parent_pid: int) -> None:
     """Makes the kernel kill this process when its parent dies, even by SIGKILL (Linux; elsewhere nothing happens).
 

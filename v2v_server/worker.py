@@ -38,7 +38,7 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode
 from v2v_server.clips import Clips
 from v2v_server.handover import room_for, sample_message
 from v2v_server.logbook import IDLE, note
-from v2v_server.process import die_with_parent, keep_freed_memory, take_long_turns
+from v2v_server.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
 from v2v_server.produce import make_sample, sample_layout
 from v2v_server.warm_up import warm_up_in_turn
 
@@ -111,6 +111,8 @@ class Worker:
                     self._begin()
                 else:
                     self._work(self._leases.popleft())
+                    if not self._unsent:
+                        give_way()  # the next clip finds the caches cold anyhow; in the middle of one they are warm
             self._send_results()
             self._send(encode(Goodbye()))
         finally:

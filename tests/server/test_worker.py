@@ -257,6 +257,17 @@ class TestSiblings:
         server.lets_it_finish(held=2)
         assert server.heard() == Result(1, begins=2)
 
+    def test_are_made_in_one_turn_on_the_core(self, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+        done: list[str] = []
+        monkeypatch.setattr(worker_module, "give_way", lambda: done.append("turn"))
+        monkeypatch.setattr(worker_module, "note", lambda _, lease: done.append(str(lease)) if lease else None)
+        server.lease(4)
+        server.lets_it_finish(held=3)
+        server.lets_it_finish()
+        server.lets_it_finish()
+        server.waits_for_its_start(4)
+        assert done[-4:] == ["2", "3", "turn", "4"]
+
     def test_that_are_done_are_announced_when_the_next_fails(self, server: Server) -> None:
         server.lets_it_finish(held=2)
         server.lets_it_finish(error=VideoError("a.mp4", 7, "cut short"))
