@@ -66,14 +66,13 @@ def test_one_step_under_every_preset(tmp_path: Path) -> None:
     for number in range(2):
         write_clip(folder / f"{number}.mp4", panned_luma(211, 128, 144, step=(1, 1 + number)), gop=25)
     status = training_trade.main([
-        "--videos", str(folder), "--held-out", str(folder), "--seeds", "0", "--steps", "1", "--seconds", "0.5",
+        "--videos", str(folder), "--held-out", str(folder), "--seeds", "0", "--steps", "1", "--seconds", "5",
         "--samples", "2", "--json", str(file),
     ])  # fmt: skip
     assert status == 0
     records = json.loads(file.read_text())
     assert [(record["preset"], record["limit"]) for record in records] == [
-        (preset, limit) for limit in ("1 batches", "0.5 s") for preset in ("exact", "balanced", "fast")
+        (preset, limit) for limit in ("1 batches", "5 s") for preset in ("exact", "balanced", "fast")
     ]
-    assert all(record["error_of_constant"] > 0 for record in records)
-    # How many batches half a second is worth is the machine's to say: on busy cores none.
+    assert all(record["steps"] >= 1 and record["error_of_constant"] > 0 for record in records)
     assert [record["steps"] for record in records[:3]] == [1, 1, 1]
