@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Thread
 from typing import Any
 
 import zmq
@@ -40,6 +42,7 @@ class Link:
         self._routing_id = b""
         self._sockets = 0
         self._handshakes = 0
+        self._torn = False
 
     def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
         """Opens a socket, in place of the one before, which is dropped with whatever it holds.
@@ -54,25 +57,26 @@ class Link:
         self.disconnect(linger_ms=0)
         if not keep_name:
             self._routing_id = b"\x01" + os.urandom(15)  # a first byte of 0 is ZeroMQ's own
-        socket = self._context.socket(zmq.DEALER)
-        socket.setsockopt(zmq.ROUTING_ID, self._routing_id)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.RCVHWM, 0)
-        socket.setsockopt(zmq.SNDHWM, 0)
-        socket.setsockopt(zmq.IPV6, 1)
-        socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
-        socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
-        self._sockets += 1
-        events = f"inproc://handshakes-{self._sockets}"
-        socket.monitor(events, zmq.EVENT_HANDSHAKE_SUCCEEDED)
-        monitor = self._context.socket(zmq.PAIR)
-        monitor.setsockopt(zmq.LINGER, 0)
-        monitor.connect(events)
-        self._socket, self._monitor, self._handshakes = socket, monitor, 0
-        self._poller = zmq.Poller()
-        self._poller.register(socket, zmq.POLLIN)
-        self._poller.register(monitor, zmq.POLLIN)
+        with self._in_one_piece():
+            socket = self._context.socket(zmq.DEALER)
+            socket.setsockopt(zmq.ROUTING_ID, self._routing_id)
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.setsockopt(zmq.RCVHWM, 0)
+            socket.setsockopt(zmq.SNDHWM, 0)
+            socket.setsockopt(zmq.IPV6, 1)
+            socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
+            socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+            socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
+            self._sockets += 1
+            events = f"inproc://handshakes-{self._sockets}"
+            socket.monitor(events, zmq.EVENT_HANDSHAKE_SUCCEEDED)
+            monitor = self._context.socket(zmq.PAIR)
+            monitor.setsockopt(zmq.LINGER, 0)
+            monitor.connect(events)
+            self._socket, self._monitor, self._handshakes = socket, monitor, 0
+            self._poller = zmq.Poller()
+            self._poller.register(socket, zmq.POLLIN)
+            self._poller.register(monitor, zmq.POLLIN)
         try:
             socket.connect(self._address)
         except zmq.ZMQError as error:
@@ -82,18 +86,31 @@ class Link:
         """Drops the socket, if there is one; what was sent has ``linger_ms`` to leave, in the background."""
         socket, self._socket = self._socket, None
         monitor, self._monitor = self._monitor, None
-        if socket is not None:
-            socket.close(linger=linger_ms)
-        if monitor is not None:
-            monitor.close()
+        with self._in_one_piece():
+            if socket is not None:
+                socket.close(linger=linger_ms)
+            if monitor is not None:
+                monitor.close()
+
+    @contextmanager
+    def _in_one_piece(self) -> Iterator[None]:
+        """Marks the link as torn for good if an exception strikes in here. Only one that a signal's handler raises
+        does, and it may leave a socket open that is known to nobody but the frames of its traceback."""
+        before, self._torn = self._torn, True
+        yield
+        self._torn = before
 
     def close(self) -> None:
-        """Frees context and thread, after the time the socket was given to linger."""
+        """Frees context and thread, after the time the socket was given to linger; where a signal has torn the link, in
+        the background, once nothing holds its sockets any more."""
         try:
             self.disconnect(linger_ms=0)
         finally:
-            # And whatever a signal's exception in the midst of that has left open: terminating would wait for it.
-            self._context.destroy(linger=0)
+            if self._torn:
+                # Terminating waits for every socket, and waiting here keeps the traceback alive that keeps one open.
+                Thread(target=self._context.destroy, kwargs={"linger": 0}, daemon=True).start()
+            else:
+                self._context.destroy(linger=0)
 
     def send(self, frames: Sequence[Any]) -> None:
         """Queues a message; it is sent when the peer can be reached."""

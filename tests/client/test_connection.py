@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
+import sys
 from collections.abc import Iterator
 from contextlib import closing
+from types import FrameType
 
 import pytest
 import zmq
+import zmq.sugar.context
+import zmq.sugar.socket
 
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
+from v2v_client import link
 from v2v_client.connection import Connection
 from v2v_client.liveness import Patience
 from v2v_protocol.messages import Hello
@@ -80,6 +87,47 @@ def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
     monkeypatch.setattr(zmq.Socket, "close", interrupted)
     with pytest.raises(KeyboardInterrupt):
         connection.close()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.filterwarnings("ignore:Unclosed (socket|context):ResourceWarning")  # the collector closes some of them
+def test_a_signal_anywhere_in_opening_and_closing_ends_in_its_exception_and_not_in_a_hang(server: FakeServer) -> None:
+    """ZeroMQ's context waits for ever for a socket that nobody closed, be it one that is being made, or whose closing
+    has begun. The exception's traceback keeps it alive, as that of an interrupted program does."""
+    sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
+
+    def interrupted_at(line: int) -> bool:
+        """Whether as many lines were run as it takes to be interrupted at that one."""
+        passed = 0
+
+        def trace(frame: FrameType, event: str, argument: object) -> object:
+            nonlocal passed
+            if frame.f_code.co_filename not in sugar or frame.f_code.co_name == "__del__":
+                return None
+            passed += event == "line"
+            if passed == line:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+            return trace
+
+        connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            connection.open()
+            connection.close()
+        except KeyboardInterrupt:
+            sys.settrace(None)
+            connection.close()
+            return True
+        finally:
+            sys.settrace(before)
+        return False
+
+    lines = itertools.count(1)
+    while interrupted_at(line := next(lines)):
+        pass
+    assert line > 100
 
 
 def _next(connection: Connection) -> int:
