@@ -19,16 +19,15 @@ import benchmarks
 from v2v_protocol.errors import V2VError
 
 _LINE_WIDTH = 104
+_PARTS = frozenset({"cli", "chaos_consumer", "null_worker", "route_process"})
+"""Modules whose ``main`` is for processes that benchmarks start."""
 
 
 def names() -> dict[str, str]:
-    """What can be run: name and beginning of its docstring, read from the source without importing anything.
-
-    Modules with an underscore in their name are parts of others.
-    """
+    """What can be run: name and beginning of its docstring, read from the source without importing anything."""
     found = {}
     for module in pkgutil.iter_modules(benchmarks.__path__):
-        if "_" in module.name or module.name == "cli":
+        if module.name in _PARTS:
             continue
         tree = ast.parse(Path(benchmarks.__path__[0], f"{module.name}.py").read_text(encoding="utf-8"))
         if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
@@ -39,7 +38,7 @@ def names() -> dict[str, str]:
 
 def usage() -> str:
     """The list of benchmarks."""
-    lines = [f"  {name:12s} {line}" for name, line in names().items()]
+    lines = [f"  {name:14s} {line}" for name, line in names().items()]
     return "\n".join(["usage: v2v-bench NAME [flags]     v2v-bench NAME --help", "", *lines])
 
 

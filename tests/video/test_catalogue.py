@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -82,6 +84,37 @@ def test_a_folder(corpus: Path, opener: Opener) -> None:
     assert catalogue.path("sub/b.mp4") == (corpus / "sub/b.mp4").resolve()
     np.testing.assert_array_equal(catalogue.frame_index("a.mp4").seconds(0, 30), np.arange(30) / 25)
     assert catalogue.notes == ()
+
+
+def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> None:
+    (corpus / "circle.mp4").symlink_to(corpus / "circle.mp4")
+    catalogue = opener(corpus)
+    assert len(ids(catalogue)) == 3
+    assert [(problem.id, problem.reason) for problem in catalogue.problems] == [
+        ("circle.mp4", "cannot be looked at: Too many levels of symbolic links")
+    ]
+
+
+def test_an_index_keeps_what_cannot_be_looked_at_today(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = opener(corpus)
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if "sub" in os.fspath(path):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", denied)
+        locked = opener(corpus)
+    assert ids(locked) == ["a.mp4"]
+    assert [problem.id for problem in locked.problems] == ["sub"]
+    assert locked.notes == ()
+    again = opener(corpus)
+    assert again.digest == first.digest
+    assert opener.probed == [3, 0, 0]
 
 
 def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener) -> None:

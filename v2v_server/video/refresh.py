@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import sqlite3
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -74,7 +76,7 @@ def _refreshed(
         known = store.records()
         stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
         wanted = set(ids)
-        store.forget([id for id in known if id not in wanted and not (root / id).is_file()])
+        store.forget([id for id in known if id not in wanted and _is_gone(root / id)])
         with closing(survey(root, stale, processes)) as found:
             for batch in _batches(found, len(stale), progress):
                 store.put(batch)
@@ -86,6 +88,14 @@ def _refreshed(
     except BaseException:
         store.close()
         raise
+
+
+def _is_gone(path: Path) -> bool:
+    """Whether there is no such file. One that cannot be looked at today is not gone."""
+    try:
+        return not stat.S_ISREG(path.stat().st_mode)
+    except OSError as error:
+        return error.errno in (errno.ENOENT, errno.ENOTDIR)
 
 
 def _unchanged(root: Path, record: Record) -> bool:

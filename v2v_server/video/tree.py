@@ -55,12 +55,17 @@ def _below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused
         if entry.name.startswith("."):
             continue
         relative = prefix + entry.name
-        if entry.is_dir():
+        try:
+            is_folder, is_file = entry.is_dir(), entry.is_file()
+        except OSError as error:  # a link that leads in a circle, or where this user may not look
+            refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
+            continue
+        if is_folder:
             yield from _below(folder / entry.name, f"{relative}/", above | {identity}, refused)
         elif os.path.splitext(entry.name)[1].lower() in VIDEO_SUFFIXES:
             if printable(relative) != relative:
                 refused[printable(relative)] = "its name is not UTF-8 text or holds control characters; rename it"
-            elif not entry.is_file():
+            elif not is_file:
                 refused[relative] = "is no regular file, or a link that leads nowhere"
             else:
                 yield relative
