@@ -3,7 +3,7 @@
 Pure data: the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
 """
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""
 
 NUMERICS_VERSION = 2

@@ -67,6 +67,10 @@ class VideoChanged(VideoError):
     """The file differs from the one that was catalogued (size, or hash of its head and tail)."""
 
 
+class VideoUnreadable(VideoError):
+    """This host could not read the file, which says nothing of its bytes: it is not there, or its storage failed."""
+
+
 class ProtocolError(V2VError):
     """The peer sent something that no peer of this protocol sends."""
 

@@ -197,11 +197,16 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class JobFailed:
-    """The lease's video could not give what it promised. ``frame`` and ``reason`` are those of VideoError."""
+    """The lease's video could not give what it promised. ``frame`` and ``reason`` are those of VideoError.
+
+    Attributes:
+        here: the worker's host cannot read the file, or has another one in its place, which says nothing of the video.
+    """
 
     lease: int
     frame: int | None
     reason: str
+    here: bool = False
 
 
 # --- server -> worker -------------------------------------------------------------------------------------------------

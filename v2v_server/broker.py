@@ -20,7 +20,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_HEADER_BYTES
 from v2v_server.blame import Loss
 from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.instructions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
 from v2v_server.quarantine import Verdict
 
 MOST_QUEUED = 512
@@ -75,6 +75,7 @@ class Broker:
         *,
         give_up: Callable[[GiveUp], Loss],
         record: Callable[[Record], list[Verdict]],
+        look_for: Callable[[LookFor], bool],
         watched: Callable[[bytes], bool],
         every_tick: Callable[[float], list[Instruction]],
         stopping: Callable[[], bool],
@@ -85,6 +86,7 @@ class Broker:
             dispatcher: decides.
             give_up: ends the process of a worker that hangs, and says what its loss means.
             record: writes a verdict down; returns what the quarantine has more now.
+            look_for: whether this host has a video as it was catalogued.
             watched: whether somebody else reports how that worker's process ends, once it has.
             every_tick: called about ten times a second with the time; may return instructions.
             stopping: asked at every turn.
@@ -109,6 +111,8 @@ class Broker:
                         todo.extend(dispatcher.worker_lost(hopeless.identity, loss, time.monotonic()))
                     case Record() as verdict:
                         todo.extendleft(reversed(dispatcher.recorded(verdict, record(verdict), time.monotonic())))
+                    case LookFor() as missing:
+                        todo.extend(dispatcher.looked_for(missing, look_for(missing), time.monotonic()))
 
         while not stopping():
             ready = dict(poller.poll(int(_TICK_SECONDS * 1000)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from v2v_protocol.errors import VideoError
+from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server.produce import Decoded, decode_for
 
@@ -42,7 +42,13 @@ class Clips:
             else:
                 self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
                 return first, True
-        return decode_for(lease, lease.indices[:1], self._root)[0], True
+        try:
+            return decode_for(lease, lease.indices[:1], self._root)[0], True
+        except (VideoChanged, VideoUnreadable):
+            raise
+        except VideoError:
+            # Storage may fail for a moment, which decoders do not always say. What the file does, it does again.
+            return decode_for(lease, lease.indices[:1], self._root)[0], True
 
     def has(self, lease: Lease) -> bool:
         """Whether the lease's sample needs no decoding."""

@@ -36,7 +36,7 @@ from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.blame import Cause, Loss, judged, runs_alone
 from v2v_server.candidates import Candidates
 from v2v_server.inspection import inspected
-from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker, refusal
+from v2v_server.instructions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, refusal
 from v2v_server.jobs import describe
 from v2v_server.leases import LeaseBook, Task
 from v2v_server.metrics import Counters
@@ -184,10 +184,8 @@ class Dispatcher:
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
-            case JobFailed(lease, frame, reason):
-                task = self._leases.finished(lease, identity, now)
-                failed = [] if task is None else self._candidates.refuse(task, frame, reason)
-                return [*failed, *self._assign(now)]
+            case JobFailed():
+                return self._job_failed(identity, message, now)
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
             case Goodbye():
@@ -224,11 +222,27 @@ class Dispatcher:
                 each.quarantine = self._quarantine.latest
         return [*self._candidates.refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
 
+    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Instruction]:
+        """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
+
+        Args:
+            missing: the instruction.
+            found: whether this host has the video as it was catalogued.
+            now: the time.
+        """
+        if not found:
+            return [*self._candidates.refuse(missing.task, missing.frame, missing.reason), *self._assign(now)]
+        self.counters.missing_videos += 1
+        self._workers.rest(missing.identity, now)
+        self.sessions.put_back(missing.task)
+        return self._assign(now)
+
     def tick(self, now: float) -> list[Instruction]:
         """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         instructions: list[Instruction] = []
+        self._workers.wake(now)
         for identity in self._workers.hanging(now):
             instructions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
         for identity in self._workers.vanished(now):
@@ -275,6 +289,17 @@ class Dispatcher:
         self._leases.finished(result.lease, identity, now)
         self._leases.begun(result.begins, identity, now)
         return instructions + self._assign(now)
+
+    def _job_failed(self, identity: bytes, failed: JobFailed, now: float) -> list[Instruction]:
+        task = self._leases.finished(failed.lease, identity, now)
+        session = None if task is None else self.sessions.get(task.session)
+        if task is None or session is None:
+            return self._assign(now)
+        if not failed.here:
+            return [*self._candidates.refuse(task, failed.frame, failed.reason), *self._assign(now)]
+        # The catalogue is of this host's files: if the video is here, other workers can have it too.
+        video = self._candidates.sequence(session, task).video
+        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, task)]
 
     def _count(self, session: Session, task: Task, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""

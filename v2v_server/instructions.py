@@ -52,7 +52,26 @@ class Record:
     task: Task
 
 
-Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record
+@dataclass(frozen=True, slots=True)
+class LookFor:
+    """A worker cannot have a video on its host: see whether it is on this one as it was catalogued, and report.
+
+    Attributes:
+        video, fingerprint: of the file.
+        identity: the worker.
+        frame, reason: what the worker said.
+        task: what it was to make of it.
+    """
+
+    video: str
+    fingerprint: str
+    identity: bytes
+    frame: int | None
+    reason: str
+    task: Task
+
+
+Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor
 
 
 def refusal(code: ErrorCode, text: str) -> Frames:

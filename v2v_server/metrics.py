@@ -23,6 +23,7 @@ class Counters:
         second_leases: samples given to a second worker because the first was slow.
         late_results: answers to leases that had been taken back.
         workers_lost: workers that died or were given up.
+        missing_videos: leases whose worker could not have a video that the server's host has.
         malformed: messages that were none.
     """
 
@@ -38,12 +39,13 @@ class Counters:
     second_leases: int = 0
     late_results: int = 0
     workers_lost: int = 0
+    missing_videos: int = 0
     malformed: int = 0
 
     @property
     def faults(self) -> int:
         """Everything that went wrong and was survived."""
-        return self.refused_candidates + self.unavailable + self.workers_lost + self.malformed
+        return self.refused_candidates + self.unavailable + self.workers_lost + self.missing_videos + self.malformed
 
 
 class Rate:

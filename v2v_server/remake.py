@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError
+from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.sample import Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.candidates import next_candidate
@@ -49,6 +49,7 @@ def remake(
         UsageError: an index outside the epoch, or arrays nobody makes.
         CorpusError: no video gives a sequence.
         SampleUnavailable: no candidate could give the sample.
+        VideoUnreadable: this host cannot read a candidate's file, whatever a server made of it.
     """
     array_layout(spec.recipe, spec.voxel_dtype, arrays)
     SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
@@ -83,6 +84,8 @@ def remake(
         )
         try:
             return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+        except VideoUnreadable:
+            raise
         except VideoError as error:
             task = next_candidate(task, lease.video, error.frame, error.reason)
     raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import secrets
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
 from v2v_server.config import ServeConfig
 from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, Record
+from v2v_server.instructions import GiveUp, Instruction, LookFor, Record
 from v2v_server.pool import Pool
 from v2v_server.process import keep_freed_memory
 from v2v_server.progress import catalogue_progress
@@ -26,7 +28,9 @@ from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_qua
 from v2v_server.sequences import SequenceTable
 from v2v_server.status import StatusLine, summary, write
 from v2v_server.video.catalogue import Catalogue, open_catalogue
+from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.rows import Rows
+from v2v_server.workers import REST_SECONDS
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -82,7 +86,7 @@ def serve(config: ServeConfig) -> None:
     with _stop_on_signals(stop):
         broker = Broker(config.bind, config.worker_bind or _private_address(label))
         pool = Pool(config.workers, catalogue.root, broker.worker_address, label)
-        running = _Running(config, dispatcher, broker, pool, quarantine, quarantine_file)
+        running = _Running(config, catalogue, dispatcher, broker, pool, quarantine, quarantine_file)
 
         def stopping() -> bool:
             return stop.is_set() or (config.parent_pid != 0 and os.getppid() != config.parent_pid)
@@ -92,6 +96,7 @@ def serve(config: ServeConfig) -> None:
                 dispatcher,
                 give_up=running.give_up,
                 record=running.record,
+                look_for=running.look_for,
                 watched=pool.watches,
                 every_tick=running.every_tick,
                 stopping=stopping,
@@ -111,6 +116,7 @@ class _Running:
     """What a running server does to the world: reap and kill workers, write verdicts, talk to its operator."""
 
     config: ServeConfig
+    catalogue: Catalogue
     dispatcher: Dispatcher
     broker: Broker
     pool: Pool
@@ -118,6 +124,7 @@ class _Running:
     quarantine_file: Path
     status: StatusLine = field(default_factory=StatusLine)
     announced: bool = False
+    missing_told: float = -math.inf
 
     def every_tick(self, now: float) -> list[Instruction]:
         """Reaps the dead, starts what is due, announces, and shows the status."""
@@ -143,6 +150,24 @@ class _Running:
         name = hopeless.identity.decode(errors="replace")
         self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others")
         return loss
+
+    def look_for(self, missing: LookFor) -> bool:
+        """Whether this host has the video as it was catalogued. If so, the operator is told of the host that has not,
+        once in a while: all workers of a host fail alike."""
+        try:
+            check_fingerprint(self.catalogue.path(missing.video), missing.fingerprint)
+        except (VideoError, CorpusError):
+            return False
+        now = time.monotonic()
+        if now >= self.missing_told + REST_SECONDS:
+            self.missing_told = now
+            name = missing.identity.decode(errors="replace")
+            self._say(
+                f"worker {name} failed on {missing.video}, which is on this host as it was catalogued: "
+                f"{missing.reason}; others make the sample, and it gets no work for {REST_SECONDS:g} s. Look at "
+                "--videos on its host"
+            )
+        return True
 
     def record(self, instruction: Record) -> list[Verdict]:
         """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs."""

@@ -20,7 +20,15 @@ from pathlib import Path
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import CorpusError, ProtocolError, RemoteError, UsageError, VideoError
+from v2v_protocol.errors import (
+    CorpusError,
+    ProtocolError,
+    RemoteError,
+    UsageError,
+    VideoChanged,
+    VideoError,
+    VideoUnreadable,
+)
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -205,7 +213,8 @@ class Worker:
                 gc.collect()
             sample = make_sample(lease, clip, room.arrays)
         except VideoError as error:
-            self._send(encode(JobFailed(lease.lease, error.frame, error.reason)))
+            here = isinstance(error, VideoChanged | VideoUnreadable)
+            self._send(encode(JobFailed(lease.lease, error.frame, error.reason, here)))
             return None
         cpu_seconds = time.process_time() - started
         return sample_message(

@@ -13,6 +13,8 @@ MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
 SILENCE_SECONDS = 30.0
 """A worker without work says so every five seconds; after this long without a word it is taken for gone."""
+REST_SECONDS = 10.0
+"""A worker whose host cannot read what the server's can gets no work for so long: storage may come back."""
 _MOST_STALE = 64
 """Entries out of date that the heap may hold, besides one for each worker with room, before it is made anew."""
 
@@ -34,6 +36,7 @@ class Workers:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, _Worker] = {}
+        self._resting: dict[bytes, float] = {}  # until when
         # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
         self._changed: set[bytes] = set()
         self._room: dict[bytes, int] = {}  # what they hold who have room for more
@@ -58,6 +61,7 @@ class Workers:
     def remove(self, identity: bytes) -> None:
         """It is gone."""
         self._workers.pop(identity, None)
+        self._resting.pop(identity, None)
         self._changed.add(identity)
 
     def heard(self, identity: bytes, now: float) -> bool:
@@ -67,6 +71,19 @@ class Workers:
             return False
         worker.last_heard = now
         return True
+
+    def rest(self, identity: bytes, now: float) -> None:
+        """It gets no work for a while."""
+        if identity in self._workers:
+            self._resting[identity] = now + REST_SECONDS
+            self._changed.add(identity)
+
+    def wake(self, now: float) -> None:
+        """Those that have rested get work again."""
+        rested = [identity for identity, until in self._resting.items() if now >= until]
+        for identity in rested:
+            del self._resting[identity]
+        self._changed.update(rested)
 
     def hanging(self, now: float) -> list[bytes]:
         """Workers with an overdue lease. Each is reported once, and gets no more work."""
@@ -119,7 +136,10 @@ class Workers:
         changed, self._changed = self._changed | self._leases.take_changed(), set()
         for identity in changed:
             worker, held = self._workers.get(identity), self._leases.held_by(identity)
-            if worker is None or worker.given_up or held >= worker.credit or self._is_alone(identity):
+            if worker is None or worker.given_up or identity in self._resting:
+                self._room.pop(identity, None)
+                continue
+            if held >= worker.credit or self._is_alone(identity):
                 self._room.pop(identity, None)
                 continue
             self._room[identity] = held

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,6 +50,25 @@ def reference(clips: Path) -> list[str]:
 def cache(tmp_path: Path) -> Path:
     """A quarantine of the test's own."""
     return tmp_path / "cache"
+
+
+def test_a_worker_whose_host_lacks_the_videos_changes_nothing(
+    clips: Path, tmp_path: Path, reference: list[str]
+) -> None:
+    """It fails fastest, so it is asked most: an empty mount point, say."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    command = [sys.executable, "-m", "v2v_server.cli", "worker", "--connect", address, "--videos", str(tmp_path)]
+    with LocalServer(clips, workers=1, flags=[*SMALL_FLAGS, "--worker-bind", address]) as server:
+        with subprocess.Popen(command) as lacking:
+            try:
+                while "failed on" not in server.last_lines():
+                    assert [digest(batch) for batch in epoch_of(server.address)] == reference
+                assert lacking.poll() is None
+            finally:
+                lacking.terminate()
+        assert "Look at --videos on its host" in server.last_lines()
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -30,7 +30,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
 from v2v_server.blame import Cause, Loss
 from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.instructions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
 from v2v_server.quarantine import Quarantine, Verdict
 from v2v_server.video.catalogue import Catalogue
 
@@ -97,6 +97,7 @@ class Peers:
         writable: whether verdicts can be written down.
         recorded: verdicts that were to be written down.
         others: lines that somebody else writes before the next verdict, numbered.
+        gone: videos that the server's host has not either.
         sent: kinds of all instructions in the order they were carried out, with what they were about.
     """
 
@@ -112,6 +113,7 @@ class Peers:
     writable: bool = True
     recorded: list[Verdict] = field(default_factory=list)
     others: list[Verdict] = field(default_factory=list)
+    gone: set[str] = field(default_factory=set)
     sent: list[tuple[str, Any]] = field(default_factory=list)
 
     # --- carrying -----------------------------------------------------------------------------------------------------
@@ -140,6 +142,9 @@ class Peers:
                 case Record() as record:
                     self.sent.append(("record", record.verdict))
                     todo.extendleft(reversed(self.dispatcher.recorded(record, self._write(record.verdict), self.now)))
+                case LookFor() as missing:
+                    found = missing.video not in self.gone
+                    todo.extend(self.dispatcher.looked_for(missing, found, self.now))
 
     def _write(self, verdict: Verdict) -> list[Verdict]:
         if not self.writable:
@@ -201,9 +206,11 @@ class Peers:
         self.worker_says(identity, Result(lease.lease, begins), *frames)
         return lease
 
-    def fail(self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7) -> Lease:
+    def fail(
+        self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7, *, here: bool = False
+    ) -> Lease:
         lease = self.leases[identity].popleft()
-        self.worker_says(identity, JobFailed(lease.lease, frame, reason))
+        self.worker_says(identity, JobFailed(lease.lease, frame, reason, here))
         return lease
 
     def die(self, identity: bytes = b"w", cause: Cause = Cause.KILLED, text: str = "died") -> list[Lease]:

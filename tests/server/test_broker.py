@@ -12,7 +12,7 @@ from v2v_protocol.wire import encode
 from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
 from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, Record, ToConsumer, ToWorker
+from v2v_server.instructions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
 from v2v_server.leases import Task
 from v2v_server.quarantine import Verdict
 
@@ -36,6 +36,10 @@ class Scripted:
     def recorded(self, record: Record, written: list[Verdict], now: float) -> list[Instruction]:
         self.told.append(("recorded", record, written))
         return list(self.after_record)
+
+    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Instruction]:
+        self.told.append(("looked for", missing, found))
+        return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
         self.told.append(("lost", identity, loss))
@@ -71,6 +75,7 @@ def carried(dispatcher: Scripted, watched: frozenset[bytes] = frozenset()) -> li
             cast(Dispatcher, dispatcher),
             give_up=give_up,
             record=record,
+            look_for=lambda missing: missing.video == "a.mp4",
             watched=watched.__contains__,
             every_tick=every_tick,
             stopping=lambda: bool(ticks),
@@ -89,6 +94,12 @@ def test_a_record_is_written_and_reported_before_what_follows() -> None:
         ("consumer lost", b"first"),
         ("consumer lost", b"gone"),
     ]
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_what_is_looked_for_is_reported(found: bool) -> None:
+    missing = LookFor("a.mp4" if found else "b.mp4", "f", b"w", None, "cannot be read", Task(b"c", 0, 0))
+    assert carried(Scripted([missing])) == [("looked for", missing, found)]
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means() -> None:

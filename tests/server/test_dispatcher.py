@@ -46,7 +46,7 @@ from v2v_server.instructions import GiveUp, Record, ToConsumer
 from v2v_server.reception import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.schedule import MOST_CANDIDATES
 from v2v_server.video.index import FrameIndex
-from v2v_server.workers import SILENCE_SECONDS
+from v2v_server.workers import REST_SECONDS, SILENCE_SECONDS
 
 
 def refused(replies: list[Message], code: ErrorCode) -> str:
@@ -355,6 +355,67 @@ def test_a_second_hello_of_a_worker_returns_what_it_held() -> None:
     assert [lease.indices[0] for lease in at.leases[b"w"]] == [0, 1]
     at.work_off()
     assert at.samples() == [(0, 0), (0, 1)]
+
+
+def test_a_video_that_only_the_workers_host_lacks_is_made_elsewhere() -> None:
+    """Or the bytes behind a name would depend on who was asked. Storage may come back, so the worker only rests."""
+    at = peers()
+    at.join(b"w1", credit=1)
+    at.join(b"w2", credit=1)
+    at.hello()
+    at.want(3)
+    first = at.fail(b"w1", reason="cannot be read: No such file or directory", frame=None, here=True)
+    (second,) = at.leases[b"w2"]
+    assert (second.video, second.candidate, second.refusals) == (first.video, 0, {"refusals": []})
+    at.want(4)
+    assert not at.leases[b"w1"]
+    at.work_off(b"w2")
+    at.tick(REST_SECONDS - 0.1)
+    at.want(5, 6)
+    assert not at.leases[b"w1"]
+    at.tick(0.2)
+    assert len(at.leases[b"w1"]) == 1
+    for name in (b"w1", b"w2"):
+        at.work_off(name)
+    assert sorted(at.samples()) == [(0, 3), (0, 4), (0, 5), (0, 6)]
+    counters = at.dispatcher.counters
+    assert (counters.missing_videos, counters.refused_candidates, counters.faults) == (1, 0, 1)
+
+
+def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    at.gone.add(at.leases[b"w"][0].video)
+    at.fail(reason="changed since it was catalogued", frame=None, here=True)
+    (second,) = at.leases[b"w"]
+    assert (second.candidate, second.refusals["refusals"][0]["reason"]) == (1, "changed since it was catalogued")
+    assert at.dispatcher.counters.missing_videos == 0
+
+
+def test_a_single_worker_whose_storage_fails_goes_on_when_it_is_back() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    for _ in range(3):
+        at.fail(here=True)
+        assert not at.leases[b"w"]
+        at.tick(REST_SECONDS)
+    at.work_off()
+    assert at.samples() == [(0, 3)]
+    assert at.dispatcher.counters.refused_candidates == 0
+
+
+def test_who_waits_for_a_video_that_is_looked_for_may_leave() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    at.consumer_says(b"c", Goodbye())
+    at.fail(here=True)
+    assert (at.dispatcher.counters.missing_videos, at.dispatcher.waiting) == (0, 0)
 
 
 def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
@@ -690,7 +751,7 @@ def test_another_protocol_version_is_refused_as_such_on_both_sides() -> None:
     for answer in (at.refusals()[0], at.told[b"w"][0]):
         assert isinstance(answer, Refused)
         assert answer.code == ErrorCode.VERSION
-        assert "2" in answer.text
+        assert str(PROTOCOL_VERSION) in answer.text
 
 
 @pytest.mark.parametrize("text", ["x" * 1_000_000, "\0" * 400_000, "\U0001f600" * 200_000])
@@ -813,7 +874,7 @@ _near = st.one_of(
     ),
     st.builds(Begun, lease=st.integers(0, 20)),
     st.builds(Result, lease=st.integers(0, 20), begins=st.integers(0, 20)),
-    st.builds(JobFailed, lease=st.integers(0, 20), frame=st.none(), reason=st.text()),
+    st.builds(JobFailed, lease=st.integers(0, 20), frame=st.none(), reason=st.text(), here=st.booleans()),
     st.builds(
         WorkerHello,
         name=st.text(),

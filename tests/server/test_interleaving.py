@@ -99,8 +99,8 @@ class Interleaving(RuleBasedStateMachine):
     def answer(self, identity: bytes) -> Lease:
         return self.at.finish(identity)
 
-    def fail(self, identity: bytes) -> Lease:
-        return self.at.fail(identity)
+    def fail(self, identity: bytes, *, here: bool = False) -> Lease:
+        return self.at.fail(identity, here=here)
 
     @rule(identity=consumers, batch_size=st.integers(1, 4), pinned=st.none() | st.integers(0, 3))
     def connect(self, identity: bytes, batch_size: int, pinned: int | None) -> None:
@@ -172,13 +172,13 @@ class Interleaving(RuleBasedStateMachine):
         return cause is None
 
     @precondition(lambda self: self._busy())
-    @rule(which=st.integers(0, 3), what=st.sampled_from(("begin", "finish", "finish", "fail")))
+    @rule(which=st.integers(0, 3), what=st.sampled_from(("begin", "finish", "finish", "fail", "miss")))
     def work(self, which: int, what: str) -> None:
         identity = self._busy()[which % len(self._busy())]
         if what == "begin":
             self._begin(identity)
             return
-        lease = self.answer(identity) if what == "finish" else self.fail(identity)
+        lease = self.answer(identity) if what == "finish" else self.fail(identity, here=what == "miss")
         self.late.append((identity, lease))
         self._listen()
 
@@ -389,9 +389,9 @@ class WithSlots(Interleaving):
         del self.lent[lease.lease]
         return self.at.finish(identity, in_slot=True)
 
-    def fail(self, identity: bytes) -> Lease:
+    def fail(self, identity: bytes, *, here: bool = False) -> Lease:
         self._note_leases()
-        lease = super().fail(identity)
+        lease = super().fail(identity, here=here)
         self.lent.pop(lease.lease, None)
         return lease
 
@@ -433,7 +433,10 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
 
     moves: dict[str, tuple[float, Callable[[], object]]] = {
         "get_on": (12, lambda: model._busy() and model.owed and model.get_on(draw.randrange(4), draw.randrange(1, 24))),
-        "work": (30, lambda: model._busy() and model.work(draw.randrange(4), draw.choice(("begin", "finish", "fail")))),
+        "work": (
+            30,
+            lambda: model._busy() and model.work(draw.randrange(4), draw.choice(("begin", "finish", "fail", "miss"))),
+        ),
         "ask": (8, lambda: model.ask(who(), draw.randrange(2), draw.sample(range(50), draw.randrange(6)))),
         "time_passes": (15, lambda: model.time_passes(draw.choice((0.1, 1.5, 2.0, 3.0, 3.0, 20.0, 61.0)))),
         "replenish": (15, lambda: model.replenish({draw.choice(names)}, draw.choice((1, CREDIT)))),

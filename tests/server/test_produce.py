@@ -6,17 +6,20 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.clips import panned_luma, write_clip
 from tests.server.corpus import SMALL_SPEC
-from v2v_protocol.errors import VideoError
+from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
+from v2v_server import clips
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
-from v2v_server.produce import decode_for, make_sample
+from v2v_server.produce import Decoded, decode_for, make_sample
+from v2v_server.remake import remake
 from v2v_server.schedule import Schedule
 from v2v_server.sequences import SequenceTable
 from v2v_server.video.catalogue import Catalogue, open_catalogue
@@ -53,6 +56,63 @@ def test_a_whole_index_and_its_slice_make_the_same_sample(catalogue: Catalogue, 
     whole, part = (make_sample(each, decode_for(each, each.indices, catalogue.root)[0]) for each in (lease, cut))
     assert whole.provenance == part.provenance
     assert all(np.array_equal(array, part.arrays[name]) for name, array in whole.arrays.items())
+
+
+class TestASecondAttempt:
+    """What a file does, it does again; storage may fail for a moment."""
+
+    @pytest.fixture
+    def failures(self, monkeypatch: pytest.MonkeyPatch) -> list[VideoError]:
+        """What the next attempts to decode end in."""
+        left: list[VideoError] = []
+
+        def decode(*arguments: Any) -> tuple[Decoded, ...]:
+            if left:
+                raise left.pop(0)
+            return decode_for(*arguments)
+
+        monkeypatch.setattr(clips, "decode_for", decode)
+        return left
+
+    def test_makes_the_sample(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
+        failures.append(VideoError("a.mp4", 3, "does not decode"))
+        decoded, _ = clips.Clips(catalogue.root).take(lease)
+        expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+        assert np.array_equal(make_sample(lease, decoded).arrays["voxels"], expected.arrays["voxels"])
+
+    def test_has_the_last_word(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
+        failures += [VideoError("a.mp4", 3, "first"), VideoError("a.mp4", 3, "second")]
+        with pytest.raises(VideoError, match="second"):
+            clips.Clips(catalogue.root).take(lease)
+
+    def test_finds_a_file_that_was_replaced_meanwhile(
+        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
+    ) -> None:
+        (catalogue.root / "a.mp4").write_bytes(b"another")
+        failures.append(VideoError("a.mp4", 3, "does not decode"))
+        with pytest.raises(VideoChanged):
+            clips.Clips(catalogue.root).take(lease)
+
+    def test_is_not_made_where_the_file_is_missing(
+        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
+    ) -> None:
+        """The server looks whether it is there."""
+        failures += [VideoUnreadable("a.mp4", None, "cannot be read"), VideoError("a.mp4", 3, "asked again")]
+        with pytest.raises(VideoUnreadable):
+            clips.Clips(catalogue.root).take(lease)
+
+
+def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Catalogue, lease: Lease) -> None:
+    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    with closing(open_catalogue(catalogue.root, processes=0)) as both:
+        (catalogue.root / "a.mp4").unlink()
+        ended = set()
+        for index in range(4):
+            try:
+                ended.add(remake(both, SMALL_SPEC, seed=0, epoch=0, index=index).provenance.video)
+            except VideoUnreadable as error:
+                ended.add(f"no {error.video}")
+        assert ended == {"b.mp4", "no a.mp4"}
 
 
 @pytest.mark.parametrize("damage", ["garbage", "cut short", "too few frames"])

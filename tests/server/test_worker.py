@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from tests.protocol.wire_messages import example
-from v2v_protocol.errors import VideoError
+from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -164,6 +164,14 @@ def test_after_a_failure_the_next_lease_is_begun_by_itself(server: Server) -> No
     assert server.heard() == Begun(2)
     server.lets_it_finish()
     assert server.heard() == Result(2, begins=0)
+
+
+@pytest.mark.parametrize("kind", [VideoChanged, VideoUnreadable])
+def test_what_its_host_lacks_is_not_called_the_videos_fault(server: Server, kind: type[VideoError]) -> None:
+    server.lease(1)
+    assert server.heard() == Begun(1)
+    server.lets_it_finish(error=kind("a.mp4", None, "cannot be read"))
+    assert server.heard() == JobFailed(1, None, "cannot be read", here=True)
 
 
 def test_a_worker_told_to_stop_begins_nothing_more(server: Server) -> None:

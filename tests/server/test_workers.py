@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from v2v_server.blame import ALONE_AFTER, runs_alone
 from v2v_server.leases import LeaseBook, Task
-from v2v_server.workers import MOST_WORKER_CREDIT, SILENCE_SECONDS, Workers
+from v2v_server.workers import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
 
 DEADLINE = 60.0
 
@@ -62,7 +62,9 @@ def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(("load", "load", "finish", "add", "remove", "load alone", "leave", "give up")),
+            st.sampled_from(
+                ("load", "load", "finish", "add", "remove", "load alone", "leave", "give up", "rest", "wake")
+            ),
             st.integers(0, 3),
             st.integers(0, 3),
         ),
@@ -92,10 +94,18 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
             table.book.forget_session(session)
         elif what == "give up":
             table.workers.hanging(DEADLINE * 10)
+        elif what == "rest":
+            table.workers.rest(identity, float(how))
+        elif what == "wake":
+            table.workers.wake(how + REST_SECONDS)
+        resting = table.workers._resting
         expected = sorted(
             (table.book.held_by(identity), identity)
             for identity, worker in table.workers._workers.items()
-            if not worker.given_up and table.book.held_by(identity) < worker.credit and not lonely(table, identity)
+            if not worker.given_up
+            and identity not in resting
+            and table.book.held_by(identity) < worker.credit
+            and not lonely(table, identity)
         )
         assert table.workers._lightest(99) == expected
         names = [identity for _, identity in expected]
@@ -191,6 +201,25 @@ def test_nobody_is_added_to_a_lone_task_as_a_twin() -> None:
     table = Table(a=2, b=2)
     table.load("b", deaths=ALONE_AFTER)
     assert table.next(other_than=b"a") is None
+
+
+# --- those whose storage fails ----------------------------------------------------------------------------------------
+
+
+def test_who_rests_gets_nothing_until_it_wakes() -> None:
+    table = Table(a=2, b=2)
+    table.workers.rest(b"a", 5.0)
+    table.workers.rest(b"stranger", 5.0)
+    assert (table.next(), table.next(other_than=b"b"), table.workers.for_lone_task()) == (b"b", None, b"b")
+    table.workers.wake(5.0 + REST_SECONDS - 0.1)
+    assert table.next(other_than=b"b") is None
+    table.workers.wake(5.0 + REST_SECONDS)
+    assert table.next() == b"a"
+    # Another process of that name has not failed.
+    table.workers.rest(b"a", 20.0)
+    table.workers.remove(b"a")
+    table.workers.add(b"a", 2, 20.0)
+    assert table.next() == b"a"
 
 
 # --- the hopeless -----------------------------------------------------------------------------------------------------

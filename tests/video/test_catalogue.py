@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
+from tests.video.failing_storage import failing_opens
 from tests.video.lethal_reads import always_killed, killed_once, lethal
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.video import catalogue as catalogue_module
@@ -115,6 +116,28 @@ def test_an_index_keeps_what_cannot_be_looked_at_today(
     again = opener(corpus)
     assert again.digest == first.digest
     assert opener.probed == [3, 0, 0]
+
+
+def test_storage_that_fails_for_a_moment_costs_nothing(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = failing_opens(monkeypatch, a=1)
+    assert ids(opener(corpus)) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
+    assert left == {"a": 0}
+
+
+def test_storage_that_fails_at_one_start_is_asked_again_at_the_next(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = opener(corpus, cache_dir=corpus.parent / "other").digest
+    left = failing_opens(monkeypatch, a=2)
+    first = opener(corpus)
+    assert [(problem.id, problem.reason) for problem in first.problems] == [
+        ("a.mp4", "cannot be opened: Input/output error")
+    ]
+    assert left == {"a": 0}
+    assert opener(corpus).digest == whole
+    assert opener.probed == [3, 3, 1]
 
 
 def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener) -> None:

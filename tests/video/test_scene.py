@@ -15,9 +15,12 @@ from hypothesis import strategies as st
 from skimage import data
 
 from tests.clips import damaged, panned_luma, write_clip
+from tests.video.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_server.video import scenes as looking
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.encode import Encoding
+from v2v_server.video.isolate import run_isolated
 from v2v_server.video.look import look
 from v2v_server.video.manifest import MANIFEST_NAME
 from v2v_server.video.prepare import prepare
@@ -262,6 +265,24 @@ def test_a_corpus_is_looked_at_once(folder: Path) -> None:
         assert looked == [1, 1]
         assert next(video.runs for video in changed.videos if video.id == "whole.mp4") == ((0, 20), (20, 50))
         assert changed.scene_digest != digest
+
+
+def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once at once, and else at the next start: otherwise a video would never have had a cut."""
+    with opened(folder, scene=False), opened(folder, cache_dir=tmp_path / "other") as undisturbed:
+        digest = undisturbed.scene_digest
+    monkeypatch.setattr(looking, "run_isolated", lambda look, jobs, processes: run_isolated(look, jobs, 0))
+    left = failing_opens(monkeypatch, cut=2, whole=1)
+    with opened(folder) as first:
+        assert left == {"cut": 0, "whole": 0}
+        assert {video.id: video.runs for video in first.videos if video.id != "broken.mp4"} == {
+            "cut.mkv": ((0, 70),), "whole.mp4": ((0, 50),),
+        }  # fmt: skip
+        assert any("cut.mkv" in note for note in first.notes)
+    with opened(folder) as again:
+        assert again.scene_digest == digest
 
 
 def test_only_the_rows_in_use_are_looked_at(folder: Path) -> None:

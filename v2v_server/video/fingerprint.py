@@ -6,7 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
-from v2v_protocol.errors import VideoChanged, VideoError
+from v2v_protocol.errors import VideoChanged, VideoUnreadable
 
 _BLOCK_BYTES = 64 * 1024
 
@@ -15,7 +15,7 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     """Size in bytes and a hash of the first and last 64 KiB: ``"<size>-<32 hexadecimal digits>"``.
 
     Raises:
-        VideoError: the file cannot be read.
+        VideoUnreadable: the file cannot be read.
     """
     try:
         with Path(path).open("rb") as file:
@@ -24,7 +24,7 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
             file.seek(max(0, size - _BLOCK_BYTES))
             digest.update(file.read(_BLOCK_BYTES))
     except OSError as error:
-        raise VideoError(os.fspath(path), None, f"cannot be read: {error.strerror or error}") from error
+        raise VideoUnreadable(os.fspath(path), None, f"cannot be read: {error.strerror or error}") from error
     return f"{size}-{digest.hexdigest()[:32]}"
 
 
@@ -33,7 +33,7 @@ def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
 
     Raises:
         VideoChanged: it is another one now.
-        VideoError: it cannot be read.
+        VideoUnreadable: it cannot be read.
     """
     found = fingerprint(path)
     if found != expected:

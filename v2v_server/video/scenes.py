@@ -115,14 +115,14 @@ class Looking:
         look = partial(_look_at, os.fspath(root))
         suspects = []
         for job, scene in run_isolated(look, jobs(), processes):
-            if isinstance(scene, Died):
+            if isinstance(scene, Died) or not scene:
                 suspects.append(job)
             else:
                 yield by_id[job.id], Scene.from_bytes(scene)
-        # Once more, alone: it may have been killed from outside, or for want of memory. A second death is not kept: of
-        # such a video nothing is known, and the next start tries again.
+        # Once more, alone: it may have been killed from outside, or for want of memory, or its storage failed for a
+        # moment. A second failure is not kept: of such a video nothing is known, and the next start tries again.
         for job, scene in run_isolated(look, suspects, 1):
-            if not isinstance(scene, Died):
+            if not isinstance(scene, Died) and scene:
                 yield by_id[job.id], Scene.from_bytes(scene)
 
     def _told(self, record: Record) -> Scene | None:
@@ -147,7 +147,8 @@ class _Job:
 
 
 def _look_at(root: str, job: _Job) -> bytes:
-    """The encoded scene of one video: of what decodes before the first error."""
+    """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
+    decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.
     from v2v_server.video.look import Look
     from v2v_server.video.transcode import luma_frames
@@ -159,6 +160,8 @@ def _look_at(root: str, job: _Job) -> bytes:
                 luma_frames(Path(root, job.id), FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES
             ):
                 seen.add(picture)
-        except VideoError:
+        except VideoError as error:
+            if isinstance(error.__cause__, OSError):
+                return b""
             return seen.scene().to_bytes()  # whoever is served what lies behind finds the same error
     return seen.scene().to_bytes()

@@ -8,10 +8,10 @@ from collections.abc import Callable, Generator, Iterable
 from functools import partial
 from pathlib import Path
 
-from v2v_protocol.errors import VideoError
+from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.isolate import Died, run_isolated
-from v2v_server.video.probe import probe
+from v2v_server.video.probe import VideoFacts, probe
 from v2v_server.video.store import Record
 
 Examine = Callable[[str, str], Record]
@@ -33,7 +33,9 @@ def examine(root: str, id: str) -> Record:
         return Record(id, -1, 0, problem=error.reason)
     size, mtime = status.st_size, status.st_mtime_ns
     try:
-        facts = probe(path)
+        facts = _facts(path)
+    except VideoUnreadable as error:
+        return Record(id, -1, 0, problem=error.reason)
     except VideoError as error:
         where = "" if error.frame is None else f"frame {error.frame}: "
         return Record(id, size, mtime, problem=where + error.reason)
@@ -51,6 +53,26 @@ def examine(root: str, id: str) -> Record:
         codec=facts.codec,
         frame_index=facts.index.to_bytes(),
     )
+
+
+def _facts(path: Path) -> VideoFacts:
+    """What is known of the video; an error of the system, rather than of the decoder, has to come twice.
+
+    Raises:
+        VideoUnreadable: it came twice.
+        VideoError: the file is no video that this program serves.
+    """
+    try:
+        return probe(path)
+    except VideoError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+    try:
+        return probe(path)
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError):
+            raise VideoUnreadable(error.video, error.frame, error.reason) from error
+        raise
 
 
 def survey(root: Path, ids: Iterable[str], processes: int, examine: Examine = examine) -> Generator[Record, None, None]:
