@@ -97,6 +97,14 @@ def simulate(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--epoch", type=int, default=0)
     parser.add_argument("--index", type=int, default=0, help="global index in the epoch")
+    parser.add_argument(
+        "--quarantine",
+        type=int,
+        default=0,
+        metavar="N",
+        help="snapshot the sample was made under (its provenance says)",
+    )
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as the server's")
     parser.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     parser.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), help=f"comma separated, of {','.join(ARRAYS)}")
@@ -117,6 +125,8 @@ def simulate(argv: Sequence[str] | None = None) -> None:
             seed=arguments.seed,
             epoch=arguments.epoch,
             index=arguments.index,
+            snapshot=arguments.quarantine,
+            cache_dir=arguments.cache_dir,
         )
 
     run_command(parser, run, argv)

@@ -18,7 +18,7 @@ from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.picture import draw_sample, write_png
 from v2v_server.produce import decode_for, make_sample
-from v2v_server.quarantine import Quarantine
+from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule
 from v2v_server.sequences import SequenceTable
 from v2v_server.video.catalogue import Catalogue, open_catalogue
@@ -103,6 +103,8 @@ def simulate_to_file(
     seed: int,
     epoch: int,
     index: int,
+    snapshot: int = 0,
+    cache_dir: str | None = None,
 ) -> None:
     """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
 
@@ -112,16 +114,30 @@ def simulate_to_file(
         picture: a .png file to draw it into, or None.
         spec: fields of the StreamSpec; None in any takes the default.
         arrays, seed, epoch, index: see :func:`remake`.
+        snapshot: number of the quarantine snapshot to make it under.
+        cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
 
     Raises:
-        UsageError, CorpusError, SampleUnavailable: see :func:`remake`; or a file cannot be written.
+        UsageError, CorpusError, SampleUnavailable, VideoUnreadable: see :func:`remake`; or a file cannot be written, or
+            there is no such snapshot.
     """
     stream = StreamSpec.from_dict(spec)
     scene = stream.scene != "off"
-    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene)
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
+    quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
+    quarantine.verdicts(snapshot)  # before any work: whether there is such a snapshot
     for problem in catalogue.problems:
         print(f"cannot be used: {problem.id}: {problem.reason}")
-    sample = remake(catalogue, stream, seed=seed, epoch=epoch, index=index, arrays=arrays)
+    sample = remake(
+        catalogue,
+        stream,
+        seed=seed,
+        epoch=epoch,
+        index=index,
+        arrays=arrays,
+        quarantine=quarantine,
+        snapshot=snapshot,
+    )
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:

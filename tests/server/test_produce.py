@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -16,13 +17,19 @@ from tests.server.corpus import SMALL_SPEC
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server import clips
+from v2v_server.cli import simulate
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
 from v2v_server.produce import Decoded, decode_for, make_sample
+from v2v_server.quarantine import Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.remake import remake
 from v2v_server.schedule import Schedule
 from v2v_server.sequences import SequenceTable
 from v2v_server.video.catalogue import Catalogue, open_catalogue
+from v2v_server.video.fingerprint import fingerprint
+
+CHANGED = ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")
+"""Fields of the small recipe that are not the paper's."""
 
 
 @pytest.fixture
@@ -113,6 +120,28 @@ def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Ca
             except VideoUnreadable as error:
                 ended.add(f"no {error.video}")
         assert ended == {"b.mp4", "no a.mp4"}
+
+
+def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalogue, tmp_path: Path) -> None:
+    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    cache = str(tmp_path / "cache")
+
+    def made(*flags: str) -> str:
+        recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
+        out = tmp_path / "sample.npz"
+        simulate([str(catalogue.root), f"--out={out}", f"--cache-dir={cache}", "--index=2", *recipe, *flags])
+        with np.load(out) as content:
+            video: str = json.loads(str(content["provenance"]))["video"]
+        return video
+
+    first = made()
+    mark = fingerprint(catalogue.root / first)
+    file = quarantine_path(catalogue.root, cache)
+    for frame in (0, 10):  # two verdicts refuse the file
+        write_verdict(file, Verdict(0, first, mark, frame, "crash", "t"), read_quarantine(file))
+    assert (made(), made("--quarantine=2")) == (first, {"a.mp4": "b.mp4", "b.mp4": "a.mp4"}[first])
+    with pytest.raises(SystemExit):
+        made("--quarantine=3")
 
 
 @pytest.mark.parametrize("damage", ["garbage", "cut short", "too few frames"])

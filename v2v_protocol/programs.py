@@ -1,0 +1,51 @@
+"""The programs, as pip installs them. One whose packages were not installed along says so in a line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+
+_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks"})
+
+Program = Callable[[], int | None]
+"""Returns the exit status; None is success."""
+
+
+def _program(name: str, module: str, function: str, extra: str) -> Program:
+    """A program whose modules are imported when it runs.
+
+    Args:
+        name: of the command.
+        module, function: what it runs.
+        extra: the extra of the distribution that brings what it imports.
+    """
+
+    def run() -> int | None:
+        try:
+            status: int | None = getattr(import_module(module), function)()
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package in _OURS:
+                raise
+            print(
+                f"{name}: needs the Python package {package}, which is not installed; the extra '{extra}' brings it: "
+                f"pip install '.[{extra}]' in a checkout of v2v-stream",
+                file=sys.stderr,
+            )
+            return 2
+        return status
+
+    return run
+
+
+serve = _program("v2v-serve", "v2v_server.cli", "serve", "server")
+worker = _program("v2v-worker", "v2v_server.cli", "worker", "server")
+simulate = _program("v2v-simulate", "v2v_server.cli", "simulate", "server")
+prepare = _program("v2v-prepare", "v2v_server.prepare_cli", "main", "server")
+quarantine = _program("v2v-quarantine", "v2v_server.quarantine_cli", "main", "server")
+loadtest = _program("v2v-loadtest", "v2v_client.loadtest", "main", "client")
+train = _program("v2v-train", "trainer.train", "main", "trainer")
+evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")
+convert = _program("v2v-convert", "trainer.convert.cli", "main", "convert")
+bench = _program("v2v-bench", "benchmarks.cli", "main", "dev")
