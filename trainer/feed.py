@@ -90,7 +90,7 @@ class Feed:
         """The batches of epochs ``first`` .. ``end - 1``."""
         for epoch in range(first, end):
             self._dataset.set_epoch(epoch)
-            batches = iter(self._source)
+            batches = _begun(self._source)
             while (batch := self._timed(batches)) is not None:
                 yield batch if self._copies is None else _moved(batch, self._copies)
 
@@ -100,6 +100,21 @@ class Feed:
             return next(batches, None)
         finally:
             self.wait_seconds += time.perf_counter() - began
+
+
+def _begun(source: Iterable[Batch]) -> Iterator[Batch]:
+    """An iteration, with the handler of SIGCHLD that was there before.
+
+    A DataLoader installs one in which the death of a loader worker becomes an error wherever this process is. A SIGTERM
+    to the whole process group would so end the run in the middle of a step. Without it the death is noticed where the
+    batches of that worker are waited for.
+    """
+    before = signal.getsignal(signal.SIGCHLD)
+    try:
+        return iter(source)
+    finally:
+        if signal.getsignal(signal.SIGCHLD) is not before:  # so this is the main thread: others cannot install any
+            signal.signal(signal.SIGCHLD, before or signal.SIG_DFL)
 
 
 def _moved(batch: Batch, copies: torch.cuda.Stream) -> Batch:

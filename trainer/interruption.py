@@ -94,6 +94,10 @@ class StopRequest:
                 item = None if self.wanted else self.next(iterator)
             except (ServerLost, RemoteError) as error:
                 self.failure = error
+            except RuntimeError:
+                # What reached this process reached its loader workers too, and PyTorch says that one is gone.
+                if not self.signal:
+                    raise
             if self._agree(self.wanted) or item is None:
                 return
             yield item

@@ -1,0 +1,92 @@
+"""Signals and the death of loader workers, where batches are taken from."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import psutil
+import pytest
+import torch
+
+from tests.client.fake_server import FakeServer
+from tests.waiting import until
+from trainer.feed import Feed
+from trainer.interruption import StopRequest
+from v2v_client import V2VStreamDataset
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _no_handler_yet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As in a process that has had no DataLoader yet: PyTorch installs its handler once."""
+    monkeypatch.setattr("torch.utils.data._utils.signal_handling._SIGCHLD_handler_set", False)
+    before = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGCHLD, before)
+
+
+class Installing(V2VStreamDataset):
+    """Installs a handler when an iteration begins, as a DataLoader does; then it may go wrong."""
+
+    fails = False
+
+    def __iter__(self) -> Iterator[int]:  # type: ignore[override]
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        if self.fails:
+            raise KeyboardInterrupt
+        return iter(range(3))
+
+
+@pytest.mark.parametrize("before", [signal.SIG_DFL, signal.default_int_handler], ids=["none", "one"])
+def test_the_handler_of_before_is_in_place_while_a_step_is_made(before: signal.Handlers) -> None:
+    signal.signal(signal.SIGCHLD, before)
+    for _ in Feed(Installing("tcp://127.0.0.1:1"), CPU).epochs(0, 2):
+        assert signal.getsignal(signal.SIGCHLD) is before
+
+
+def test_the_handler_of_before_is_back_where_an_iteration_could_not_begin() -> None:
+    dataset = Installing("tcp://127.0.0.1:1")
+    dataset.fails = True
+    with pytest.raises(KeyboardInterrupt):
+        next(Feed(dataset, CPU).epochs(0, 1))
+    assert signal.getsignal(signal.SIGCHLD) is signal.SIG_DFL
+
+
+def loader_worker(before: set[psutil.Process]) -> psutil.Process:
+    """The one process of a loader that is not the resource tracker."""
+    started = set(psutil.Process().children()) - before
+    (worker,) = [process for process in started if "spawn_main" in " ".join(process.cmdline())]
+    return worker
+
+
+@pytest.mark.slow
+def test_a_signal_to_the_whole_group_lets_the_step_finish() -> None:
+    """The loader worker dies of it in the middle of the step; the run ends after the step."""
+    before, finished = set(psutil.Process().children()), []
+    with FakeServer() as server, StopRequest() as stop:
+        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=20.0), CPU, loader_workers=1)
+        for batch in stop.until(feed.epochs(0, 2)):
+            worker = loader_worker(before)
+            worker.send_signal(signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+            until(lambda worker=worker: worker.status() == psutil.STATUS_ZOMBIE)
+            finished.append(batch.indices)
+        del feed
+    assert finished == [(0, 1)]
+    assert stop.signal == signal.SIGTERM
+
+
+@pytest.mark.slow
+def test_a_loader_worker_that_dies_by_itself_is_noticed() -> None:
+    before = set(psutil.Process().children())
+    with FakeServer() as server:
+        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=20.0), CPU, loader_workers=1)
+        batches = feed.epochs(0, 2)
+        assert next(batches).indices == (0, 1)
+        loader_worker(before).kill()
+        with pytest.raises(RuntimeError, match="exited unexpectedly"), StopRequest() as stop:
+            list(stop.until(batches))
+        del batches, feed
