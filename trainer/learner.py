@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -62,6 +63,13 @@ class Learner:
         before, now = target[:, first - 1 : -1].flatten(0, 1), target[:, first:].flatten(0, 1)
         pair = (before, now) if self.loss.temporal.as_published else (now, before)
         return torch.unflatten(self.flow(*pair), 0, (len(target), -1))
+
+    def end_epoch(self) -> None:
+        """The learning rate of the next one."""
+        with warnings.catch_warnings():
+            # PyTorch does not know of the steps that were made before a checkpoint.
+            warnings.filterwarnings("ignore", "Detected call of `lr_scheduler.step", UserWarning)
+            self.scheduler.step()
 
     def checkpoint(self, step: int, stream: Mapping[str, Any] | None, config: TrainConfig) -> Checkpoint:
         """Everything that decides the next losses; ``stream`` is the resume state of the last batch trained on."""

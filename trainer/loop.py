@@ -56,6 +56,10 @@ def train(
         step, epoch, position = resume.step, resume.epoch, resume.stream
         if position is not None:
             dataset.load_state_dict(position)
+        if dataset.epoch > epoch:
+            # Under this batch size or number of ranks, nothing but what an epoch drops was left of the one before.
+            learner.end_epoch()
+            epoch, position = dataset.epoch, dataset.state_dict()
     feed = Feed(dataset, device, config.stream.loader_workers)
     batches = feed.epochs(epoch, run.epochs)
     if run.steps:
@@ -98,7 +102,7 @@ def train(
                 learner.average.update(learner.network, step)
             epoch_ends = position["epoch"] > epoch
             if epoch_ends:
-                learner.scheduler.step()
+                learner.end_epoch()
 
             # What is said and kept of it.
             meter.add(losses | {"gradient_norm": norm})

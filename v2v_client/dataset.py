@@ -213,7 +213,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
     # --- position -----------------------------------------------------------------------------------------------------
 
     def set_epoch(self, epoch: int) -> None:
-        """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded."""
+        """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded.
+
+        Under a larger batch size or more ranks, less than a global batch may be left of a loaded state's epoch. Then
+        the next iteration delivers the epoch after it, or nothing where the state's own epoch is set.
+        """
         self._position.set_epoch(_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:

@@ -105,15 +105,19 @@ class Consumer:
         share = LoaderShare(loader.worker, loader.workers, self.batch_size, done)
         return ResumeState(stream, self.seed, begun.epoch, origin, position, self.world_size, share, quarantine)
 
-    def taken_up(self, saved: ResumeState) -> ResumeState:
-        """A saved state under this world size; where nothing but what an epoch drops is left, the next epoch."""
+    def rest(self, saved: ResumeState) -> ResumeState:
+        """A saved state under this world size; its epoch may hold no whole global batch any more."""
         origin, position = resumed(
             origin=saved.origin,
             position=saved.position,
             saved_world_size=saved.world_size,
             world_size=self.world_size,
         )
-        state = dataclasses.replace(saved, origin=origin, position=position, world_size=self.world_size)
+        return dataclasses.replace(saved, origin=origin, position=position, world_size=self.world_size)
+
+    def taken_up(self, saved: ResumeState) -> ResumeState:
+        """A saved state under this world size; where nothing but what an epoch drops is left, the next epoch."""
+        state = self.rest(saved)
         begun = state.position + state.origin > 0
         if begun and state.stream is not None and self.plan(state.stream, state).batches == 0:
             return dataclasses.replace(state, epoch=state.epoch + 1, origin=0, position=0, share=None)
@@ -146,6 +150,7 @@ class Position:
         self._iterations = 0
         self._here: ResumeState | None = None  # after the last batch of this process; None where the log says
         self._loaded: ResumeState | None = None  # of this loader worker, from a stateful loader
+        self._empty_rest: ResumeState | None = None  # what was loaded, where the next epoch was taken up instead
 
     def standing(self) -> Standing:
         """What the copies agree on now."""
@@ -153,9 +158,20 @@ class Position:
 
     def set_epoch(self, epoch: int) -> None:
         """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded."""
-        standing = self.standing()
-        self._progress.set(epoch, standing.state if standing.epoch == epoch else None)
+        standing, rest = self.standing(), self._empty_rest
+        state = standing.state if standing.epoch == epoch else None
+        if rest is not None and rest.epoch == epoch and self._is_at_the_beginning_of(epoch + 1, standing):
+            # Whoever loads a state and then names its epoch has had these samples: all of them, but for a rest.
+            state = rest
+        self._progress.set(epoch, state)
         self._here = None
+
+    def _is_at_the_beginning_of(self, epoch: int, standing: Standing) -> bool:
+        """Whether a state was loaded that begins there, and no batch has come out since."""
+        return not standing.stale and all(
+            state is not None and (state.epoch, state.origin, state.position) == (epoch, 0, 0)
+            for state in (self._here, standing.state)
+        )
 
     def state(self, consumer: Consumer) -> ResumeState:
         """After the last batch that this process took.
@@ -185,6 +201,7 @@ class Position:
         shared = dataclasses.replace(state, share=None)
         if loader is None:
             self._progress.set(state.epoch, shared)
+            self._empty_rest = consumer.rest(saved) if state.epoch > saved.epoch else None
         else:
             self._progress.set(state.epoch, shared, iteration=self._name(loader))
             self._loaded = state

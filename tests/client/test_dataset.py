@@ -292,6 +292,41 @@ def test_a_rest_that_holds_no_batch_begins_the_next_epoch(server):
     assert places(again) == epoch_places(1, 0, 16)
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_set_epoch_to_a_loaded_epoch_whose_rest_holds_no_batch_repeats_nothing(server, workers):
+    """As every training loop over epochs has it: load_state_dict(state), then set_epoch(state["epoch"])."""
+    batches = iter(dataset(server))
+    state = [next(batches).resume_state for _ in range(4)][-1]
+    again = dataset(server, batch_size=8)
+    again.load_state_dict(state)
+    loader = DataLoader(again, batch_size=None, num_workers=workers)
+    again.set_epoch(0)
+    again.set_epoch(0)
+    assert len(again) == 0
+    assert places(loader) == []
+    for epoch in (1, 0):
+        again.set_epoch(epoch)
+        assert places(loader) == epoch_places(epoch, 0, 16)
+
+
+def test_an_epoch_whose_rest_was_left_out_comes_whole_once_the_next_has_begun(server):
+    batches = iter(dataset(server))
+    state = [next(batches).resume_state for _ in range(4)][-1]
+    again = dataset(server, batch_size=8)
+    again.load_state_dict(state)
+    iter(again)  # nothing has come out of it
+    again.set_epoch(0)
+    assert places(again) == []
+    again.load_state_dict(state)
+    assert next(iter(again)).epoch == 1
+    again.set_epoch(0)
+    assert places(again) == epoch_places(0, 0, 16)
+    again.load_state_dict(state)
+    again.set_epoch(5)
+    again.set_epoch(0)
+    assert places(again) == epoch_places(0, 0, 16)
+
+
 def test_set_epoch_to_the_loaded_epoch_keeps_the_position(server):
     batches = iter(dataset(server))
     state = next(batches).resume_state

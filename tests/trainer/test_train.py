@@ -85,6 +85,22 @@ def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: 
     assert losses(run) == losses(whole)
 
 
+def test_a_larger_batch_does_not_repeat_an_epoch_of_which_less_is_left(tmp_path: Path) -> None:
+    """16 of 23 samples are trained on, and 7 are no batch of 8: the next epoch begins, with its learning rate."""
+    with FakeServer(sequences=23) as server:
+        run = trained(tmp_path, server.address, "run", run__steps=4)
+        asked = len(server.wants)
+        # Nothing is left to do the first time, and the second goes on from what that one saved.
+        for steps in (4, 7):
+            trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=steps, stream__batch_size=8)
+        assert not [epoch for epoch, _ in server.wants[asked:] if epoch == 0]
+    readings = losses(run)
+    assert [(record["step"], record["epoch"]) for record in readings] == [
+        *((step, 0) for step in (1, 2, 3, 4)), *((5, 1), (6, 1), (7, 2)),
+    ]  # fmt: skip
+    assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] + [0.0025] * 2
+
+
 def test_a_finished_run_has_nothing_left(server: FakeServer, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__epochs=1)
     before = load_checkpoint(run / LAST)
