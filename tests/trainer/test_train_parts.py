@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -221,6 +222,22 @@ def test_one_process_is_a_rank_by_itself() -> None:
         assert not mine.any(False)
         assert mine.from_first("address") == "address"
         assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt, SystemExit])
+def test_a_rank_with_an_error_does_not_wait_for_the_others(
+    monkeypatch: pytest.MonkeyPatch, error: type[BaseException] | None
+) -> None:
+    left = []
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
+    monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: left.append(True))
+    with pytest.raises(error) if error else nullcontext(), ranks("cpu") as mine:
+        assert (mine.rank, mine.world_size) == (1, 2)
+        if error:
+            raise error
+    assert left == ([] if error else [True])
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
