@@ -53,28 +53,22 @@ class Checkpoint:
     config: Mapping[str, Any]
 
 
-def capture_rng() -> dict[str, Any]:
-    """State of PyTorch's generators, on the CPU and on every GPU that this process sees."""
-    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+def capture_rng(device: torch.device) -> dict[str, Any]:
+    """State of PyTorch's generators on the CPU and, where ``device`` is a GPU, on that one: "cuda" lists it."""
+    cuda = [torch.cuda.get_rng_state(device)] if device.type == "cuda" else []
     return {"torch": torch.get_rng_state(), "cuda": cuda}
 
 
-def restore_rng(state: Mapping[str, Any]) -> None:
-    """Set the generators back to what :func:`capture_rng` saw.
+def restore_rng(state: Mapping[str, Any], device: torch.device) -> None:
+    """Set the generators back to what :func:`capture_rng` saw, as far as ``device`` has them.
 
-    Raises:
-        UsageError: the state is of another number of GPUs; drop "cuda" from it to go on with fresh ones.
+    Earlier releases listed all GPUs that the process saw, by their number.
     """
-    cuda = state["cuda"]
-    devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if cuda and len(cuda) != devices:
-        raise UsageError(
-            f"the checkpoint has random states of {len(cuda)} GPUs, this process sees {devices}: the run cannot be "
-            "continued bit for bit here"
-        )
     torch.set_rng_state(state["torch"])
-    if cuda:
-        torch.cuda.set_rng_state_all(cuda)
+    cuda = state["cuda"]
+    if cuda and device.type == "cuda":
+        index = device.index or 0
+        torch.cuda.set_rng_state(cuda[index if index < len(cuda) else 0], device)
 
 
 def _plain(value: Any, place: str) -> Any:

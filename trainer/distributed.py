@@ -63,6 +63,11 @@ class Ranks:
         return carrier[0]
 
 
+def on_gpu(device: str) -> bool:
+    """Whether ``compute.device`` = ``device`` is a GPU here."""
+    return device != "cpu" and torch.cuda.is_available() and torch.cuda.device_count() > 0
+
+
 @contextmanager
 def ranks(device: str) -> Iterator[Ranks]:
     """This process's place, from the variables that torchrun sets.
@@ -73,22 +78,22 @@ def ranks(device: str) -> Iterator[Ranks]:
     Raises:
         UsageError: "cuda" without a GPU, or more ranks on this host than GPUs.
     """
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if device == "cuda" and not gpus:
+    with_gpu = on_gpu(device)
+    if device == "cuda" and not with_gpu:
         raise UsageError("compute.device = cuda: PyTorch sees no GPU here; give cpu or auto")
-    on_gpu = device != "cpu" and gpus > 0
+    gpus = torch.cuda.device_count() if with_gpu else 0
     world_size = int(os.environ.get("WORLD_SIZE", "1"))
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     here = int(os.environ.get("LOCAL_WORLD_SIZE", str(world_size)))
-    if on_gpu and here > gpus:
+    if with_gpu and here > gpus:
         raise UsageError(f"{here} ranks on this host, but {gpus} GPUs: start one rank per GPU, or compute.device=cpu")
-    mine = torch.device("cuda", local_rank) if on_gpu else torch.device("cpu")
-    if on_gpu:
+    mine = torch.device("cuda", local_rank) if with_gpu else torch.device("cpu")
+    if with_gpu:
         torch.cuda.set_device(mine)
     if world_size == 1:
         yield Ranks(0, 1, mine)
         return
-    distributed.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo")
+    distributed.init_process_group("cpu:gloo,cuda:nccl" if with_gpu else "gloo")
     yield Ranks(distributed.get_rank(), world_size, mine, hosts=-(-world_size // here))
     # Not on the way out of an error: NCCL would wait for ranks that wait for this one, and nobody would read the error.
     # A process that ends leaves the group by itself.

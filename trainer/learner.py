@@ -49,6 +49,11 @@ class Learner:
     average: AveragedNetwork | None
 
     @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.network.parameters()).device
+
+    @property
     def trained(self) -> ReconstructionNetwork:
         """The network to look at: the averaged one where there is one."""
         return self.network if self.average is None else self.average.network
@@ -80,7 +85,7 @@ class Learner:
             optimizer=self.optimizer.state_dict(),
             scheduler=self.scheduler.state_dict(),
             ema=None if self.average is None else self.average.state_dict(),
-            rng=capture_rng(),
+            rng=capture_rng(self.device),
             stream=stream,
             config=config.to_dict(),
         )
@@ -93,7 +98,7 @@ class Learner:
             self.scheduler.load_state_dict(dict(checkpoint.scheduler))
         if self.average is not None and checkpoint.ema is not None:
             self.average.load_state_dict(checkpoint.ema)
-        restore_rng(checkpoint.rng)
+        restore_rng(checkpoint.rng, self.device)
 
 
 def build(config: TrainConfig, ranks: Ranks) -> Learner:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from trainer.checkpoint import Checkpoint
 from trainer.config import TrainConfig, differences
+from trainer.distributed import on_gpu
 from v2v_protocol.errors import UsageError
 
 LAST = "last.pt"
@@ -39,7 +40,8 @@ def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
             f"--resume: the checkpoint is of another run ({'; '.join(refused)}). Give its settings, or start a new run "
             "from its weights with network.weights"
         )
-    return list(shown.values())
+    drawn = ["cuda" if gpu else "cpu" for gpu in (checkpoint.rng["cuda"], on_gpu(config.compute.device))]
+    return [*shown.values(), *([f"random generator: {drawn[0]} -> {drawn[1]}"] if drawn[0] != drawn[1] else [])]
 
 
 def require_fresh(out: Path) -> None:

@@ -22,6 +22,8 @@ from trainer.unpickle import Placeholder, read_torch_file
 from trainer.weights import e2vid_options, load_into, load_weights
 from v2v_protocol.errors import UsageError
 
+CPU = torch.device("cpu")
+
 
 class ConfigParser:
     """Stands for the class of that name in published checkpoints, which a reader does not have."""
@@ -303,7 +305,7 @@ class Run:
             optimizer=self.optimizer.state_dict(),
             scheduler=self.scheduler.state_dict(),
             ema=None,
-            rng=capture_rng(),
+            rng=capture_rng(CPU),
             stream={
                 "version": 1,
                 "stream": {"spec": {"seed": 2**64 - 1}, "list": ["a", 0.5, None]},
@@ -319,7 +321,7 @@ class Run:
         assert checkpoint.stream is not None
         self.scheduler.load_state_dict(dict(checkpoint.scheduler))
         self.position = checkpoint.stream["at"]
-        restore_rng(checkpoint.rng)
+        restore_rng(checkpoint.rng, CPU)
 
 
 def test_a_resumed_run_has_the_losses_of_the_uninterrupted_one(tmp_path: Path) -> None:
@@ -419,15 +421,32 @@ def _written(path: Path, content: bytes) -> Path:
     return path
 
 
-def test_random_states_of_another_number_of_gpus_are_refused() -> None:
-    state = capture_rng() | {"cuda": [torch.get_rng_state()] * (torch.cuda.device_count() + 1)}
-    with pytest.raises(UsageError, match="random states of"):
-        restore_rng(state)
+def test_random_states_of_another_number_of_gpus_are_no_hindrance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each rank has one GPU, and the CPU has none; a list of all of them is of an earlier release."""
+    generators = [torch.tensor([number], dtype=torch.uint8) for number in range(4)]
+    monkeypatch.setattr("torch.cuda.get_rng_state", lambda device: generators[device.index])
+    restored = []
+    monkeypatch.setattr("torch.cuda.set_rng_state", lambda state, device: restored.append((state, device)))
+    second = torch.device("cuda", 1)
+    one, every = capture_rng(second), capture_rng(CPU) | {"cuda": generators}
+    assert one["cuda"] == [generators[1]]
+    assert capture_rng(CPU)["cuda"] == []
+    expected = torch.rand(3)
+    for state in (one, every):
+        restore_rng(state, CPU)
+        assert torch.equal(torch.rand(3), expected)
+    assert restored == []
+    for state, device in ((one, second), (one, torch.device("cuda", 3)), (every, second), (every, CPU)):
+        restore_rng(state, device)
+    assert restored == [(generators[1], second), (generators[1], torch.device("cuda", 3)), (generators[1], second)]
+    restore_rng(every, torch.device("cuda", 7))
+    restore_rng(capture_rng(CPU), second)
+    assert restored[3:] == [(generators[0], torch.device("cuda", 7))]
 
 
 def test_the_generator_goes_on_where_it_was() -> None:
-    state = capture_rng()
+    state = capture_rng(CPU)
     expected = torch.rand(3)
     torch.rand(5)
-    restore_rng(state)
+    restore_rng(state, CPU)
     assert torch.equal(torch.rand(3), expected)

@@ -187,6 +187,20 @@ def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: 
     assert "stream.seed: 0 -> 9" in message
 
 
+def test_a_checkpoint_of_another_machine_is_gone_on_from(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One of a release that kept the generators of all GPUs, where none of them is."""
+    run = trained(tmp_path, server.address, "run", run__steps=1)
+    saved = load_checkpoint(run / LAST)
+    gpus = {"cuda": [torch.zeros(16, dtype=torch.uint8)] * 8}
+    save_checkpoint(tmp_path / "gpu.pt", dataclasses.replace(saved, rng={**saved.rng, **gpus}))
+    trained(tmp_path, server.address, "run", resume="gpu.pt", run__steps=2)
+    assert "changed since the checkpoint: random generator: cuda -> cpu" in capsys.readouterr().err
+    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=3)
+    assert "random generator" not in capsys.readouterr().err
+
+
 def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeServer(sequences=23) as server:
         trained(tmp_path, server.address, "run", run__steps=1)

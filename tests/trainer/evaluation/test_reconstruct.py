@@ -94,7 +94,7 @@ def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
     config = {"network": {"name": "firenet", "options": {"base_channels": 4, "normalize_voxels": True}, "weights": ""}}
     save_checkpoint(
         tmp_path / "last.pt",
-        Checkpoint(0, 0, network.state_dict(), {}, None, None, capture_rng(), None, config),
+        Checkpoint(0, 0, network.state_dict(), {}, None, None, capture_rng(torch.device("cpu")), None, config),
     )
     loaded, name = load_network(tmp_path / "last.pt")
     assert (name, loaded.normalizes) == ("firenet", True)
