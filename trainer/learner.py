@@ -93,7 +93,7 @@ class Learner:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from there; the configurations must agree (see :func:`trainer.resume.require_same_run`)."""
         self.network.load_state_dict(checkpoint.model)
-        self.optimizer.load_state_dict(dict(checkpoint.optimizer))
+        _restore_optimizer(self.optimizer, checkpoint.optimizer)
         if checkpoint.scheduler is not None:
             self.scheduler.load_state_dict(dict(checkpoint.scheduler))
         if self.average is not None and checkpoint.ema is not None:
@@ -125,6 +125,23 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     if config.compute.compile:
         model = torch.compile(model)  # type: ignore[assignment]
     return Learner(network, model, loss, flow, optimizer, scheduler, average)
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
+    """Its moments and settings, for this device and memory format.
+
+    PyTorch would take over the kernel of the saving device, and the memory order of the saved moments; a fused kernel
+    goes through parameter, gradient and moments as through lists of numbers, and would mix them up.
+    """
+    groups = [
+        {**group, "fused": ours["fused"]}
+        for group, ours in zip(saved["param_groups"], optimizer.param_groups, strict=True)
+    ]
+    optimizer.load_state_dict({**saved, "param_groups": groups})
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape and value.stride() != parameter.stride():
+                state[name] = torch.empty_like(parameter).copy_(value)
 
 
 def _network(config: TrainConfig) -> ReconstructionNetwork:
