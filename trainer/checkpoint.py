@@ -9,9 +9,7 @@ Writing is atomic: a reader, or the next start after a power cut, sees the old f
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from trainer.replacing import replacing
 from trainer.unpickle import read_torch_file
 from v2v_protocol.errors import UsageError
 
@@ -99,22 +98,8 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     for item in dataclasses.fields(checkpoint):
         content[item.name] = _plain(getattr(checkpoint, item.name), item.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with temporary.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    # The rename is an entry of the folder: without this it can be lost although the file is not.
-    with contextlib.suppress(PermissionError):  # Windows opens no folders
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    with replacing(path) as file:
+        torch.save(content, file)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

@@ -19,7 +19,9 @@ from torch.utils.tensorboard import SummaryWriter
 from trainer.config import TrainConfig
 from trainer.distributed import Ranks
 from trainer.preview import contact_sheet, write_png, write_video
+from trainer.replacing import replacing
 from v2v_client import V2VStreamDataset
+from v2v_protocol.errors import UsageError
 
 METRICS = "metrics.jsonl"
 
@@ -72,6 +74,9 @@ class Reporter:
         out: folder of the run.
         speaks: this is the first rank.
         step: where the run goes on; what an earlier one wrote of later steps is dropped.
+
+    Raises:
+        UsageError: what an earlier one wrote is damaged, and not merely torn at its end.
     """
 
     def __init__(self, out: Path, *, speaks: bool, step: int = 0) -> None:
@@ -163,8 +168,29 @@ _GROUPS = {
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The records of a ``metrics.jsonl``."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    """The records of a ``metrics.jsonl``.
+
+    A last line that has no end is left out: it is still being written, or whoever wrote it was killed.
+
+    Raises:
+        UsageError: another line is no record; the message says which.
+    """
+    *lines, torn = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    records = [_record(line) for line in [*lines, torn]]
+    if records[-1] is None:
+        del records[-1]
+    for number, record in enumerate(records, start=1):
+        if record is None:
+            raise UsageError(f"{path}, line {number}, is no record of a run: take the line out, or the file away")
+    return [record for record in records if record is not None]
+
+
+def _record(line: str) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and "step" in record else None
 
 
 def _planned_steps(dataset: V2VStreamDataset, config: TrainConfig) -> int | None:
@@ -180,7 +206,8 @@ def _drop_after(path: Path, step: int) -> None:
     """A run that goes on from an earlier checkpoint repeats the steps after it."""
     if path.exists():
         kept = [json.dumps(record) + "\n" for record in read_metrics(path) if record["step"] <= step]
-        path.write_text("".join(kept), encoding="utf-8")
+        with replacing(path) as file:
+            file.write("".join(kept).encode())
 
 
 def _clock(seconds: float) -> str:

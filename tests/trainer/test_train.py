@@ -85,6 +85,14 @@ def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: 
     assert losses(run) == losses(whole)
 
 
+def test_a_reading_that_a_crash_cut_off_hinders_nobody(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=3)
+    with (run / METRICS).open("a", encoding="utf-8") as file:
+        file.write('{"step": 4, "epo')
+    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=4)
+    assert losses(run) == losses(whole)[:4]
+
+
 def test_a_larger_batch_does_not_repeat_an_epoch_of_which_less_is_left(tmp_path: Path) -> None:
     """16 of 23 samples are trained on, and 7 are no batch of 8: the next epoch begins, with its learning rate."""
     with FakeServer(sequences=23) as server:

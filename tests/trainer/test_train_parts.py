@@ -20,7 +20,7 @@ from trainer.ema import AveragedNetwork, decay_at
 from trainer.interruption import StopRequest
 from trainer.models import FireNet
 from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
-from trainer.reporting import Meter, read_metrics
+from trainer.reporting import METRICS, Meter, Reporter, read_metrics
 from v2v_protocol.errors import ServerLost, UsageError
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -213,6 +213,40 @@ def test_metrics_are_lines_of_json(tmp_path: Path) -> None:
     path = tmp_path / "m.jsonl"
     path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps({"step": 2}) + "\n")
     assert read_metrics(path) == [{"step": 1}, {"step": 2}]
+
+
+@pytest.mark.parametrize("torn", ['{"step": 3, "to', "{", "\0\0\0", "\ufffd"])
+def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path, torn: str) -> None:
+    path = tmp_path / "m.jsonl"
+    path.write_text('{"step": 1}\n{"step": 2}\n' + torn)
+    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
+    path.write_text('{"step": 1}\n{"step": 2}')
+    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
+    path.write_text(torn)
+    assert read_metrics(path) == []
+
+
+@pytest.mark.parametrize("damaged", ['{"step": 3, "to', "", "3", '{"epoch": 0}'])
+def test_a_line_that_nobody_cut_off_is_said(tmp_path: Path, damaged: str) -> None:
+    path = tmp_path / "m.jsonl"
+    for after in ("", '{"step": 4}\n', '{"ste'):
+        path.write_text(f'{{"step": 1}}\n{damaged}\n{after}')
+        with pytest.raises(UsageError, match=r"m\.jsonl, line 2, is no record"):
+            read_metrics(path)
+
+
+def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / METRICS
+    path.write_text('{"step": 1}\n{"step": 2}\n{"st')
+    old = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        Reporter(tmp_path, speaks=True, step=1)
+    assert path.read_bytes() == old
+    assert [entry.name for entry in tmp_path.iterdir()] == [METRICS]
 
 
 def test_one_process_is_a_rank_by_itself() -> None:
