@@ -265,5 +265,5 @@ class Position:
             self._progress.set(begun.epoch + 1, None)
             self._here = None
         else:
-            self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers, begun.epoch)
+            self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers)
             self._here = consumer.beginning(self.standing().stream, begun.epoch + 1)

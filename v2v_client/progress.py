@@ -10,7 +10,8 @@ answers. It has no name, so that it is gone with the last process that has it op
     set     an epoch to be in, and the state to start it from: from the user, or a state that was loaded
     main    the original itself iterates
     start   a loader worker begins an iteration; the first of an iteration to do so decides the epoch for all of it
-    finish  a loader worker has delivered its share; when all have, the next epoch begins
+    finish  a loader worker has delivered its share; when all have, the next epoch begins, unless an epoch was set since
+            their iteration began: then theirs was left early, and what they prefetched of it says nothing
     stream  what a server offered first; all others must offer the same
 
 The order of the lines is the order of the events; no lock, no clock.
@@ -53,6 +54,8 @@ class Standing:
     tokens: set[str] = field(default_factory=set)
     starts: dict[tuple[str, int], int] = field(default_factory=dict)
     decisions: dict[tuple[str, int], tuple[int, ResumeState | None]] = field(default_factory=dict)
+    beginnings: int = 0
+    decided_after: dict[tuple[str, int], int] = field(default_factory=dict)  # so many beginnings
     finished: dict[tuple[str, int], set[int]] = field(default_factory=dict)
 
     def apply(self, line: Mapping[str, Any]) -> None:
@@ -69,11 +72,14 @@ class Standing:
             case "start":
                 mine = (line["iteration"], line["worker"])
                 self.starts[mine] = self.starts.get(mine, 0) + 1
-                self.decisions.setdefault((line["iteration"], self.starts[mine]), (self.epoch, self.state))
+                iteration = (line["iteration"], self.starts[mine])
+                self.decisions.setdefault(iteration, (self.epoch, self.state))
+                self.decided_after.setdefault(iteration, self.beginnings)
                 self.stale = True
             case "finish":
-                if line["epoch"] == self.epoch:
-                    workers = self.finished.setdefault((line["iteration"], line["round"]), set())
+                iteration = (line["iteration"], line["round"])
+                if self.decided_after.get(iteration) == self.beginnings:
+                    workers = self.finished.setdefault(iteration, set())
                     workers.add(line["worker"])
                     if len(workers) == line["workers"]:
                         self._begin(self.epoch + 1, None)
@@ -81,6 +87,7 @@ class Standing:
                 self.stream = self.stream or Stream(**line["stream"])
 
     def _begin(self, epoch: int, state: Mapping[str, Any] | None) -> None:
+        self.beginnings += 1
         self.epoch = epoch
         self.state = None if state is None else ResumeState.from_dict(state)
         self.finished = {}
@@ -150,9 +157,9 @@ class Progress:
         number = standing.starts[iteration, worker]
         return number, *standing.decisions[iteration, number]
 
-    def finish(self, iteration: str, number: int, worker: int, workers: int, epoch: int) -> None:
-        """A loader worker has delivered its share of ``epoch``."""
-        self._append(kind="finish", iteration=iteration, round=number, worker=worker, workers=workers, epoch=epoch)
+    def finish(self, iteration: str, number: int, worker: int, workers: int) -> None:
+        """A loader worker has delivered its share of the epoch that was decided for that start."""
+        self._append(kind="finish", iteration=iteration, round=number, worker=worker, workers=workers)
 
     def pin(self, stream: Stream) -> None:
         """A server offered ``stream``."""
