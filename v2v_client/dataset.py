@@ -84,8 +84,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses),
     SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream than the one begun),
-    ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a loader worker,
-    PyTorch turns RemoteError and SampleUnavailable into RuntimeError with the same text.
+    ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a loader worker they
+    come out as the same kinds, with the worker's trace in their text; one that was killed is a RuntimeError of PyTorch.
 
     Raises:
         UsageError: an argument outside its range.

@@ -20,6 +20,8 @@ A message says what is wrong, the number, the limit and what to do about it.
 
 from __future__ import annotations
 
+import re
+
 
 class V2VError(Exception):
     """Root of the tree: everything the project raises on purpose."""
@@ -87,21 +89,29 @@ class RemoteError(V2VError):
     """The server refused a request.
 
     Attributes:
-        code: a short stable word, see ``v2v_protocol.messages.ErrorCode``.
+        code: a short stable word, see ``v2v_protocol.messages.ErrorCode``; "unknown" where a message names none.
         text: the server's explanation.
     """
 
     def __init__(self, code: str, text: str | None = None) -> None:
         if text is None:
-            # PyTorch builds an exception of a loader worker again from its message alone.
-            text, _, rest = code.rpartition(" [")
-            code = rest.removesuffix("]")
+            # PyTorch builds an exception of a loader worker again from one text: the trace of the worker, at whose end
+            # the message stands.
+            text, code = _taken_apart(code)
         self.code = code
         self.text = text
         super().__init__(f"{text} [{code}]")
 
     def __reduce__(self) -> tuple[type[RemoteError], tuple[str, str]]:
         return type(self), (self.code, self.text)
+
+
+def _taken_apart(message: str) -> tuple[str, str]:
+    """The text and the code of a :class:`RemoteError` from its message; what stands around it is text as well."""
+    found = list(re.finditer(r" \[([a-z-]+)\]$", message, re.MULTILINE))
+    if not found:
+        return message, "unknown"
+    return (message[: found[-1].start()] + message[found[-1].end() :]).rstrip(), found[-1][1]
 
 
 class SampleUnavailable(RemoteError):

@@ -10,6 +10,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from torch._utils import ExceptionWrapper
 from torch.utils.data import DataLoader
 
 from tests.client.fake_server import SPEC, FakeServer, expected
@@ -622,6 +623,19 @@ def test_an_error_in_a_loader_worker_comes_out(server):
     stream.load_state_dict(state)
     with pytest.raises(StateMismatch, match=r"catalogue-2.*catalogue-1"):
         list(loader(stream, 1))
+
+
+@pytest.mark.parametrize("kind", [RemoteError, SampleUnavailable])
+def test_a_refusal_comes_out_of_a_loader_worker_with_its_code(kind):
+    """As PyTorch carries it: its kind, and its trace as a text."""
+    try:
+        raise kind("unknown-session", "the server refused [twice]: say Hello again")
+    except kind:
+        carried = ExceptionWrapper(where="in DataLoader worker process 0")
+    with pytest.raises(kind, match=r"(?s)worker process 0.*say Hello again \[unknown-session\]$") as caught:
+        carried.reraise()
+    assert caught.value.code == "unknown-session"
+    assert caught.value.text.endswith("the server refused [twice]: say Hello again")
 
 
 def test_a_copy_is_a_dataset_of_its_own(server):

@@ -24,3 +24,17 @@ def test_errors_survive_pickling(error: V2VError) -> None:
     assert type(again) is type(error)
     assert str(again) == str(error)
     assert vars(again) == vars(error)
+
+
+@pytest.mark.parametrize(
+    ("message", "text", "code"),
+    [
+        ("no video [spec]", "no video", "spec"),
+        ("Trace:\n  a = b[c]\nError: no video [busy]\n", "Trace:\n  a = b[c]\nError: no video", "busy"),
+        ("RemoteError: no video [spec]\nwith a note", "RemoteError: no video\nwith a note", "spec"),
+        ("no video", "no video", "unknown"),
+    ],
+)
+def test_a_refusal_is_read_from_its_message(message: str, text: str, code: str) -> None:
+    error = RemoteError(message)
+    assert (error.text, error.code, str(error)) == (text, code, f"{text} [{code}]")
