@@ -75,9 +75,16 @@ class Batch:
         """This batch with its tensors on ``device``.
 
         Args:
-            non_blocking: True returns before the copy is done; it only helps from page-locked memory.
+            non_blocking: True returns before the copy is done, if this batch is in page-locked memory or on a device.
+                A copy from other memory is waited for: once this batch is dropped, samples are put there again.
         """
-        return self._with({name: item.to(device, non_blocking=non_blocking) for name, item in self.arrays.items()})
+
+        def moved(item: torch.Tensor) -> torch.Tensor:
+            # PyTorch keeps page-locked memory until the copy is done; of ours it knows nothing.
+            safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
+            return item.to(device, non_blocking=safe)
+
+        return self._with({name: moved(item) for name, item in self.arrays.items()})
 
     def _with(self, arrays: dict[str, torch.Tensor]) -> Batch:
         named: dict[str, Any] = dict(arrays)

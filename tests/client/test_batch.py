@@ -1,0 +1,46 @@
+"""A batch on its way to a device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from v2v_client import Batch
+
+
+class Somewhere:
+    """A tensor of which only the place matters."""
+
+    def __init__(self, device: str, *, pinned: bool) -> None:
+        self.device = torch.device(device)
+        self.pinned = pinned
+        self.moves: list[tuple[str, bool]] = []
+
+    def is_pinned(self) -> bool:
+        return self.pinned
+
+    def to(self, device: str, non_blocking: bool) -> Somewhere:
+        self.moves.append((device, non_blocking))
+        return self
+
+
+def of(voxels: Any) -> Batch:
+    return Batch(
+        voxels=voxels, frames=None, flow=None, flow_valid=None, indices=(0,), epoch=0, provenance=(), resume_state={},
+        wait_seconds=0.0, cpu_seconds=0.0, decodes=1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("device", "pinned", "returns_early"), [("cpu", False, False), ("cpu", True, True), ("cuda:1", False, True)]
+)
+def test_only_memory_that_waits_for_the_copy_is_copied_behind_our_back(
+    device: str, pinned: bool, returns_early: bool
+) -> None:
+    """Memory of our own is lent to other processes the moment the batch is dropped."""
+    voxels = Somewhere(device, pinned=pinned)
+    of(voxels).to("cuda:0", non_blocking=True)
+    of(voxels).to("cuda:0")
+    assert voxels.moves == [("cuda:0", returns_early), ("cuda:0", False)]
