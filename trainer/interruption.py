@@ -94,8 +94,9 @@ class StopRequest:
                 item = None if self.wanted else self.next(iterator)
             except (ServerLost, RemoteError) as error:
                 self.failure = error
-            except RuntimeError:
-                # What reached this process reached its loader workers too, and PyTorch says that one is gone.
+            except (RuntimeError, EOFError, OSError):
+                # What reached this process reached its loader workers too: PyTorch says that one is gone, or its pipe
+                # ended in the middle of a batch.
                 if not self.signal:
                     raise
             if self._agree(self.wanted) or item is None:

@@ -171,19 +171,22 @@ def test_a_lost_server_is_kept_for_later() -> None:
     assert isinstance(stop.failure, ServerLost)
 
 
-def test_workers_that_the_signal_ended_as_well_are_no_error() -> None:
+@pytest.mark.parametrize(
+    "error", [RuntimeError("DataLoader worker (pid 7) exited unexpectedly"), EOFError(), ConnectionResetError("gone")]
+)
+def test_workers_that_the_signal_ended_as_well_are_no_error(error: Exception) -> None:
     def items(number: int) -> Iterator[int]:
         yield 0
         try:
             if number:
                 os.kill(os.getpid(), number)
         finally:
-            raise RuntimeError("DataLoader worker (pid 7) exited unexpectedly")
+            raise error
 
     with StopRequest() as stop:
         assert list(stop.until(items(signal.SIGTERM))) == [0]
     assert stop.signal == signal.SIGTERM
-    with StopRequest() as stop, pytest.raises(RuntimeError, match="exited"):
+    with StopRequest() as stop, pytest.raises(type(error)):
         list(stop.until(items(0)))
 
 
