@@ -26,6 +26,7 @@ from v2v_server.progress import catalogue_progress
 from v2v_server.video import prepare
 from v2v_server.video.catalogue import open_catalogue
 from v2v_server.video.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
+from v2v_server.video.report import Report
 from v2v_server.video.rows import Rows
 
 _SHOWN = 20
@@ -104,18 +105,26 @@ def _run(arguments: argparse.Namespace) -> bool:
     for line in summary(report, encoding, time.monotonic() - started):
         print(line)
     if arguments.json is not None:
-        records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in report.unusable]
+        problems = (*report.not_looked_at, *report.unusable)
+        records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in problems]
         write_json(arguments.json, records)
     return report.complete
 
 
-def summary(report: prepare.Report, encoding: Encoding, seconds: float) -> list[str]:
+def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
     """Lines that say what was made, what it saved, what failed and why."""
     prepared = report.prepared
     lines = [
         f"{len(prepared)} of {len(report.videos)} videos prepared as {encoding} ({report.kept} of them earlier) "
         f"in {seconds:.0f} s"
     ]
+    if report.looked_at:
+        lines.append(f"{report.looked_at} were prepared earlier: only the statistics of their scenes were added")
+    if report.aside:
+        lines.append(
+            f"{report.aside} others that were prepared earlier are set aside: not served, and not made again when a "
+            "run asks for them"
+        )
     if prepared:
         before, after = report.source_bytes, report.prepared_bytes
         change = "saves" if after <= before else "costs"
@@ -134,6 +143,10 @@ def summary(report: prepare.Report, encoding: Encoding, seconds: float) -> list[
         [(video.id, f"{video.psnr_db:.1f} dB") for video in report.below_floor],
     )
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
+    lines += _listed(
+        "have no statistics of their scenes (their files stay):",
+        [(problem.id, problem.reason) for problem in report.not_looked_at],
+    )
     lines += _listed("cannot be used at all:", [(problem.id, problem.reason) for problem in report.unusable])
     return lines
 

@@ -23,8 +23,9 @@ from v2v_server.video.encode import CODECS, Encoding, encode_luma, limited_table
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.luma import range_table
 from v2v_server.video.manifest import MANIFEST_NAME, read_manifest
-from v2v_server.video.prepare import Report, prepare
+from v2v_server.video.prepare import prepare
 from v2v_server.video.probe import probe
+from v2v_server.video.report import Report
 from v2v_server.video.rows import Rows
 from v2v_server.video.transcode import HIGHEST_PSNR_DB
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -18,13 +19,13 @@ from tests.clips import panned_luma, write_clip
 from tests.video.test_prepare import opened, psnr_db, run, whole
 from tests.video.test_prepare_isolate import children
 from tests.waiting import until
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.prepare_cli import main
 from v2v_server.video.encode import Encoding
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.video.probe import probe
-from v2v_server.video.transcode import PARTIAL_SUFFIX
+from v2v_server.video.transcode import PARTIAL_SUFFIX, Transcoding
 
 _KILLED_SECONDS = 60.0
 
@@ -55,6 +56,71 @@ def test_a_second_run_keeps_everything(source: Path, tmp_path: Path) -> None:
     assert (first.kept, second.kept) == (0, 5)
     assert second.videos == first.videos
     assert inodes(tmp_path / "out") == before
+
+
+def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
+    """Whether a list leaves the others out, or their folder is away that day."""
+    out = tmp_path / "out"
+    first = run(source, out)
+    before, digest = inodes(out), opened(out).digest
+    (tmp_path / "part.txt").write_text("1.mp4\nsub/4.mp4\n")
+    part = run(source, out, list_file=tmp_path / "part.txt")
+    assert (part.kept, part.aside, len(part.videos)) == (2, 3, 2)
+    served = opened(out)  # finished, and exactly what was asked for last
+    assert [video.id for video in served.videos] == ["1.mp4", "sub/4.mp4"]
+    assert "3 prepared videos are set aside" in served.notes[0]
+    (tmp_path / "other.txt").write_text("0.mp4\n1.mp4\n")
+    assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").problems[0].reason
+    (source / "sub").rename(tmp_path / "away")
+    away = run(source, out)
+    assert (away.kept, away.aside) == (4, 1)
+    (tmp_path / "away").rename(source / "sub")
+    whole_again = run(source, out)
+    assert (whole_again.kept, whole_again.aside) == (5, 0)
+    assert whole_again.videos == first.videos
+    assert inodes(out) == before
+    assert opened(out).digest == digest
+
+
+class _Stop(Exception):
+    pass
+
+
+def test_what_is_cut_off_forgets_nothing(source: Path, tmp_path: Path) -> None:
+    """Statistics are added to a finished folder, and the run ends after the first."""
+    out = tmp_path / "out"
+    first = run(source, out)
+    before = inodes(out)
+
+    def stop_after_one(done: int, total: int) -> None:
+        if done:
+            raise _Stop
+
+    with pytest.raises(_Stop):
+        run(source, out, scene=True, progress=stop_after_one)
+    records = read_manifest(out).videos
+    assert len(opened(out).videos) == 5
+    assert sum(bool(record.scene) for record in records.values()) == 1
+    assert [replace(record, scene="") for _, record in sorted(records.items())] == list(first.videos)
+    last = run(source, out, scene=True)
+    assert (last.kept, last.looked_at, last.complete) == (1, 4, True)
+    assert inodes(out) == before
+
+
+def test_a_look_that_fails_costs_no_prepared_file(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    first = run(source, out)
+
+    def refuse(job: Transcoding) -> None:
+        raise VideoError(str(job.source), 3, "is damaged")
+
+    monkeypatch.setattr("v2v_server.video.prepare.look_again", refuse)
+    report = run(source, out, scene=True)
+    assert report.videos == first.videos == tuple(video for _, video in sorted(read_manifest(out).videos.items()))
+    assert [problem.reason for problem in report.not_looked_at] == ["frame 3: is damaged"] * 5
+    assert not report.complete
 
 
 def test_ctrl_c_says_that_the_same_command_goes_on(

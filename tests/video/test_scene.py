@@ -313,17 +313,20 @@ def test_a_prepared_folder_has_the_scenes_of_its_source(folder: Path, tmp_path: 
             assert [video.runs for video in prepared.videos] == [video.runs for video in source.videos]
 
 
-def test_a_folder_prepared_without_scenes_is_prepared_again_where_they_are_asked_for(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path, tmp_path: Path) -> None:
     (folder / "broken.mp4").unlink()
     target = tmp_path / "prepared"
     with opened(folder, scene=False) as source:
         plain = prepare(source, target, Encoding("h264", 30, 12), processes=0)
         assert "scene" not in (target / MANIFEST_NAME).read_text()
+        before = {path.name: path.stat().st_ino for path in target.glob("*.mp4")}
         again = prepare(source, target, Encoding("h264", 30, 12), processes=0, scene=True)
         assert (plain.kept, again.kept) == (0, 0)
+        assert again.looked_at == 2
+        assert {path.name: path.stat().st_ino for path in target.glob("*.mp4")} == before
         assert all(video.scene for video in again.prepared)
+        afresh = prepare(source, tmp_path / "afresh", Encoding("h264", 30, 12), processes=0, scene=True)
+        assert [video.scene for video in again.prepared] == [video.scene for video in afresh.prepared]
         assert prepare(source, target, Encoding("h264", 30, 12), processes=0, scene=True).kept == 2
         # Without them, what is there with them will do.
         assert prepare(source, target, Encoding("h264", 30, 12), processes=0).kept == 2

@@ -294,6 +294,12 @@ def _snapshot(
             raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
         reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
         notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{_told(reasons)}"]
+    if manifest is not None and manifest.aside:
+        notes = [
+            *notes,
+            f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
+            "them; run it once for all to have them served",
+        ]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     digest = _digest(rows, videos)

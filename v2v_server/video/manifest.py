@@ -3,18 +3,20 @@
 One JSON object a line. The first describes the folder, each of the others one video, failed ones too. Lines are only
 ever appended; a last line that a killed process left unfinished counts as not written, and where an id comes twice, the
 later line holds.
+
+A folder stands for the corpus of the run that wrote its first line last. What earlier runs made of videos that this
+corpus does not have (a list left them out, their folder could not be read that day) is set aside: its lines stay, so
+that a run that asks for it again need not make it again, but it is not served.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from base64 import b64decode
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
@@ -35,7 +37,8 @@ class Header:
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
         codec, quality, gop, tile_px, tile_overlap_px: see :class:`v2v_server.video.encode.Encoding`.
-        videos: how many videos the source corpus has; the folder is finished when it has a record of each.
+        videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
+            that are set aside do not count.
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
         version: of this format.
@@ -105,11 +108,13 @@ class Manifest:
         root: the prepared folder.
         header: see :class:`Header`.
         videos: by id.
+        aside: by id, those of earlier runs that the last one was not asked for; no corpus has them.
     """
 
     root: Path
     header: Header
     videos: dict[str, PreparedVideo]
+    aside: dict[str, PreparedVideo] = field(default_factory=dict)
 
     def check_served(self, rows: Rows | None) -> None:
         """Make sure that the folder can be served, and its rows are not to be cut again.
@@ -137,7 +142,9 @@ class Manifest:
         """
         wanted = sorted(self.videos) if listed is None else list(listed)
         for id in wanted:
-            if id not in self.videos:
+            if id in self.aside:
+                refused[id] = "is prepared, but the last v2v-prepare was not asked for it; run it once for all of them"
+            elif id not in self.videos:
                 refused[id] = "is not in the prepared folder's manifest: the source had no such usable video"
             elif not self.videos[id].height_px:
                 refused[id] = f"was not prepared: {self.videos[id].problem}"
@@ -206,63 +213,20 @@ def read_manifest(root: Path) -> Manifest:
     lines.pop()  # empty behind the last line's end; else the beginning of a line whose writer was killed
     if not lines:
         raise CorpusError(f"{path}: holds no whole line; prepare another folder")
-    videos = {}
+    videos: dict[str, PreparedVideo] = {}
+    aside: dict[str, PreparedVideo] = {}
     for number, line in enumerate(lines, 1):
         try:
             if number == 1:
                 header = _header(line)
             else:
-                video = _video(line)
-                videos[video.id] = video
+                video, is_aside = _video(line)
+                for records in (videos, aside):
+                    records.pop(video.id, None)
+                (aside if is_aside else videos)[video.id] = video
         except (ValueError, TypeError, UsageError) as error:
             raise CorpusError(f"{path}, line {number}: {error}; prepare another folder") from error
-    return Manifest(root, header, videos)
-
-
-class ManifestWriter:
-    """Writes a manifest: first afresh and in one piece, then line by line.
-
-    Args:
-        root: the prepared folder.
-        header: its first line.
-        videos: what is known already.
-
-    Raises:
-        OSError: the folder cannot be written to.
-    """
-
-    def __init__(self, root: Path, header: Header, videos: Iterable[PreparedVideo]) -> None:
-        path = root / MANIFEST_NAME
-        fresh = path.with_name(f".{MANIFEST_NAME}.new")
-        with fresh.open("wb") as file:
-            file.write(_line(header))
-            file.writelines(map(_line, videos))
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(path)
-        self._file = path.open("ab")
-
-    def add(self, video: PreparedVideo) -> None:
-        """Append one record, and make sure that it stays."""
-        self._file.write(_line(video))
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def __enter__(self) -> ManifestWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-
-def _line(item: Header | PreparedVideo) -> bytes:
-    values = asdict(item)
-    for newer in ("scene", "tile_px", "tile_overlap_px"):  # earlier versions of this program know no such field
-        if not values.get(newer, True):
-            del values[newer]
-    return json.dumps(values, allow_nan=False).encode() + b"\n"
+    return Manifest(root, header, videos, aside)
 
 
 def _header(line: bytes) -> Header:
@@ -277,8 +241,10 @@ def _header(line: bytes) -> Header:
     return header
 
 
-def _video(line: bytes) -> PreparedVideo:
+def _video(line: bytes) -> tuple[PreparedVideo, bool]:
+    """The record, and whether it is set aside."""
     data = _object(line)
+    aside = data.pop("aside", False) is True
     unknown = data.keys() - {field.name for field in fields(PreparedVideo)}
     if unknown:
         raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
@@ -294,7 +260,7 @@ def _video(line: bytes) -> PreparedVideo:
             Scene.from_bytes(b64decode(video.scene, validate=True))
         except ProtocolError as error:
             raise ValueError(f"{video.id}: {error}") from error
-    return video
+    return video, aside
 
 
 def _object(line: bytes) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 
 import av
@@ -112,6 +113,19 @@ def transcode(job: Transcoding) -> Made:
     finally:
         partial.unlink(missing_ok=True)
     return replace(made, scene=seen.scene()) if job.scene else made
+
+
+def look_again(job: Transcoding) -> Scene:
+    """The statistics that :func:`transcode` takes with ``scene``, from the source alone and without a prepared file.
+
+    Raises:
+        VideoError: the source is not what was catalogued, or a frame of it does not decode.
+    """
+    check_fingerprint(job.source, job.fingerprint)
+    seen = Look()
+    for frame in islice(luma_frames(job.source, FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES):
+        seen.add(frame)
+    return seen.scene()
 
 
 def _watched(frames: Iterator[npt.NDArray[np.uint8]], seen: Look) -> Iterator[npt.NDArray[np.uint8]]:

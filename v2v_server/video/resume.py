@@ -1,0 +1,91 @@
+"""What earlier runs of `v2v-prepare` left in a folder, and which folders it takes at all."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+from collections.abc import Iterator
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, VideoError
+from v2v_server.video.catalogue import Catalogue, VideoEntry
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
+from v2v_server.video.transcode import PARTIAL_SUFFIX
+
+_LOCK_NAME = ".v2v-prepare.lock"
+
+
+def refuse_overlap(catalogue: Catalogue, target: Path) -> None:
+    """Make sure that source and destination share no file.
+
+    Raises:
+        CorpusError: they do, or the source is prepared itself.
+    """
+    root = catalogue.root
+    if catalogue.prepared is not None:
+        raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
+    if target == root or target.is_relative_to(root) or root.is_relative_to(target):
+        raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
+    for video in catalogue.videos:
+        if (root / video.id).resolve().is_relative_to(target):
+            raise CorpusError(f"{target}: {video.id} of the source is a link into it; choose another destination")
+
+
+@contextlib.contextmanager
+def locked(target: Path) -> Iterator[None]:
+    """Keeps other processes out of the folder; the system lets go of the lock however this one ends.
+
+    Raises:
+        CorpusError: another process is at work there.
+        OSError: the folder cannot be written to.
+    """
+    with (target / _LOCK_NAME).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CorpusError(f"{target}: another v2v-prepare is at work there; wait for its end") from None
+        yield
+
+
+def known_records(target: Path, header: Header) -> dict[str, PreparedVideo]:
+    """The records of all earlier runs, also those set aside, after clearing away what they left unfinished.
+
+    Raises:
+        CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings.
+        OSError: it cannot be read, or what is unfinished cannot be removed.
+    """
+    if not (target / MANIFEST_NAME).exists():
+        for folder in target.parents:
+            if (folder / MANIFEST_NAME).exists():
+                raise CorpusError(f"{target} lies in the prepared folder {folder}; choose another destination")
+        foreign = sorted(entry.name for entry in target.iterdir() if not entry.name.startswith("."))
+        if foreign:
+            raise CorpusError(
+                f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
+                "empty or a new folder"
+            )
+        return {}
+    manifest = read_manifest(target)
+    if not manifest.header.same_settings(header):
+        # One header holds for all files of a folder, so two settings cannot lie in one; and to make all of them anew
+        # unasked may cost days.
+        made = sum(video.problem is None for records in (manifest.videos, manifest.aside) for video in records.values())
+        raise CorpusError(
+            f"{target} was prepared with {manifest.header.settings()}, and now {header.settings()} is asked for, which "
+            f"its {made} prepared videos are not; choose another folder, or delete this one to have all made anew"
+        )
+    for partial in target.rglob(f".*{PARTIAL_SUFFIX}"):
+        partial.unlink()
+    return manifest.aside | manifest.videos
+
+
+def stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
+    """Whether the prepared file is there, unchanged, and that of this state of the source."""
+    record = known.get(video.id)
+    if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
+        return False
+    try:
+        return fingerprint(target / video.id) == record.fingerprint
+    except VideoError:
+        return False
