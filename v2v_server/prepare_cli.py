@@ -65,6 +65,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
     )  # fmt: skip
     parser.add_argument(
+        "--frame-floor", type=float, metavar="DB",
+        help="the same for the worst frame of a clip, which the clip's PSNR hides "
+        f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
+    )  # fmt: skip
+    parser.add_argument(
         "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
     )
     parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
@@ -99,6 +104,7 @@ def _run(arguments: argparse.Namespace) -> bool:
             encoding,
             processes=arguments.workers,
             floor_db=arguments.floor,
+            frame_floor_db=arguments.frame_floor,
             scene=arguments.scene != "off",
             progress=progress,
         )
@@ -138,9 +144,19 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
             f"PSNR of a clip to its source: median {statistics.median(quality.values()):.1f} dB, "
             f"lowest {quality[worst]:.1f} dB ({worst})"
         )
+        frames = {video.id: video.worst_psnr_db or 0.0 for video in prepared}
+        worst = min(frames, key=lambda id: frames[id])
+        lines.append(
+            f"PSNR of the worst frame: {frames[worst]:.1f} dB ({worst}); the floors are {report.floor_db:g} dB for a "
+            f"clip and {report.frame_floor_db:g} dB for a frame"
+        )
     lines += _listed(
-        f"below the floor of {report.floor_db:g} dB (kept; a lower --quality makes them better):",
-        [(video.id, f"{video.psnr_db:.1f} dB") for video in report.below_floor],
+        f"below the floor of {report.floor_db:g} dB, or a frame below {report.frame_floor_db:g} dB (kept; a lower "
+        "--quality makes them better):",
+        [
+            (video.id, f"{video.psnr_db:.1f} dB, worst frame {video.worst_psnr_db:.1f} dB")
+            for video in report.below_floor
+        ],
     )
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(

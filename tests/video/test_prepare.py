@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Iterator
 from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
@@ -212,6 +213,33 @@ def test_the_floor(source: Path, tmp_path: Path) -> None:
     assert not poor.complete
     again = run(tmp_path / "source", tmp_path / "out", Encoding("h264", 45, 12), floor_db=1.0)
     assert (again.kept, again.complete) == (1, True)
+
+
+def test_one_ruined_frame_in_a_thousand_is_below_the_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lower quarter of grey, as a decoder leaves it."""
+
+    def ruining(path: Path, frames: Iterator[npt.NDArray[np.uint8]], *settings: object, **more: object) -> None:
+        def ruined() -> Iterator[npt.NDArray[np.uint8]]:
+            for number, frame in enumerate(frames):
+                if number == 700:
+                    frame = np.concatenate([frame[:36], np.full_like(frame[36:], 128)])
+                yield frame
+
+        encode_luma(path, ruined(), *settings, **more)  # type: ignore[arg-type]
+
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "long.mp4", np.tile(panned_luma(50, 48, 64), (20, 1, 1)))
+    monkeypatch.setattr("v2v_server.video.transcode.encode_luma", ruining)
+    report = run(tmp_path / "source", tmp_path / "out")
+    (video,) = report.below_floor
+    assert video.psnr_db is not None
+    assert video.psnr_db > 38  # the clip as a whole does not show it
+    assert video.worst_psnr_db is not None
+    assert 10 < video.worst_psnr_db < report.frame_floor_db == 30
+    assert not report.complete
+    assert run(tmp_path / "source", tmp_path / "out", frame_floor_db=10.0).complete
+    with pytest.raises(UsageError, match="frame floor nan"):
+        run(tmp_path / "source", tmp_path / "out", frame_floor_db=math.nan)
 
 
 @pytest.mark.parametrize("crash", [0, 2])

@@ -31,6 +31,9 @@ from v2v_server.video.scene import Scene
 from v2v_server.video.transcode import Made, Transcoding, look_again, transcode
 
 DEFAULT_FLOOR_DB = 35.0
+DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
+"""How far below the clip's floor a frame may lie. The worst frame of a sound clip is some 5 dB worse than the clip at
+most; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
 
 Progress = Callable[[int, int], None]
 """(source frames dealt with, source frames in all)."""
@@ -43,6 +46,7 @@ def prepare(
     *,
     processes: int = 1,
     floor_db: float = DEFAULT_FLOOR_DB,
+    frame_floor_db: float | None = None,
     scene: bool = False,
     progress: Progress | None = None,
 ) -> Report:
@@ -54,6 +58,7 @@ def prepare(
         encoding: codec settings.
         processes: how many transcode at a time, spawned; 0 transcodes in this one.
         floor_db: least PSNR of a clip for ``Report.below_floor``.
+        frame_floor_db: least PSNR of each frame for the same; None: 5 dB below ``floor_db``.
         scene: also take the statistics of what each video shows; those of one prepared without them are taken from
             its source, and its file stays.
         progress: told at the start and after each video.
@@ -63,8 +68,13 @@ def prepare(
             settings, another process is at work there, or the source is prepared itself.
         UsageError: a number outside its limits.
     """
-    if processes < 0 or not math.isfinite(floor_db):
-        raise UsageError(f"{processes} processes, floor {floor_db:g} dB: give 0 or more, and a finite number")
+    if frame_floor_db is None:
+        frame_floor_db = floor_db - DEFAULT_FRAME_FLOOR_BELOW_DB
+    if processes < 0 or not math.isfinite(floor_db) or not math.isfinite(frame_floor_db):
+        raise UsageError(
+            f"{processes} processes, floor {floor_db:g} dB, frame floor {frame_floor_db:g} dB: give 0 or more, and "
+            "finite numbers"
+        )
     target = Path(destination).resolve()
     refuse_overlap(catalogue, target)
     header = Header(
@@ -104,6 +114,7 @@ def prepare(
         kept=len(finished),
         unusable=catalogue.problems,
         floor_db=floor_db,
+        frame_floor_db=frame_floor_db,
         looked_at=len(made.keys() & standing.keys()),
         aside=len(aside),
         not_looked_at=tuple(not_looked_at),

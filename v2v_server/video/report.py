@@ -21,12 +21,14 @@ class Report:
         not_looked_at: prepared videos whose statistics could not be taken, and why. What they had stays.
         unusable: files of the source that no server takes in either.
         floor_db: least PSNR of a clip.
+        frame_floor_db: least PSNR of each of its frames.
     """
 
     videos: tuple[PreparedVideo, ...]
     kept: int
     unusable: tuple[Problem, ...]
     floor_db: float
+    frame_floor_db: float
     looked_at: int = 0
     aside: int = 0
     not_looked_at: tuple[Problem, ...] = ()
@@ -43,9 +45,14 @@ class Report:
 
     @property
     def below_floor(self) -> tuple[PreparedVideo, ...]:
-        """Those whose PSNR is below the floor, worst first. Their files are kept, and served."""
-        low = [video for video in self.prepared if _psnr(video) < self.floor_db]
-        return tuple(sorted(low, key=_psnr))
+        """Those whose PSNR, or that of one of their frames, is below its floor, the worst frame first. Their files are
+        kept, and served."""
+        low = [
+            video
+            for video in self.prepared
+            if _known(video.psnr_db) < self.floor_db or _known(video.worst_psnr_db) < self.frame_floor_db
+        ]
+        return tuple(sorted(low, key=lambda video: _known(video.worst_psnr_db)))
 
     @property
     def source_bytes(self) -> int:
@@ -63,5 +70,5 @@ class Report:
         return not (self.failed or self.below_floor or self.unusable or self.not_looked_at)
 
 
-def _psnr(video: PreparedVideo) -> float:
-    return math.inf if video.psnr_db is None else video.psnr_db
+def _known(psnr_db: float | None) -> float:
+    return math.inf if psnr_db is None else psnr_db
