@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from v2v_server.video.encode import Encoding
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.video.probe import probe
+from v2v_server.video.resume import refuse_overlap
 from v2v_server.video.transcode import PARTIAL_SUFFIX, Transcoding
 
 _KILLED_SECONDS = 60.0
@@ -80,6 +82,46 @@ def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     assert whole_again.videos == first.videos
     assert inodes(out) == before
     assert opened(out).digest == digest
+
+
+def test_finished_files_are_looked_at_together_and_told_of(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waiting for one disk after the other, in silence, would look hung where there are many."""
+    out = tmp_path / "out"
+    run(source, out)
+    inside, several = [], threading.Event()
+
+    def among_others(path: Path) -> str:
+        inside.append(path)
+        if len(inside) > 1:
+            several.set()
+        assert several.wait(1), "the files are read one after the other"
+        return fingerprint(path)
+
+    monkeypatch.setattr("v2v_server.video.resume.fingerprint", among_others)
+    steps: list[tuple[int, int]] = []
+    assert run(source, out, progress=lambda *step: steps.append(step)).kept == 5
+    assert steps == [(0, 126), (24, 126), (48, 126), (72, 126), (96, 126), (126, 126)]
+
+
+def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    resolved: list[Path] = []
+    resolve = Path.resolve
+    monkeypatch.setattr(Path, "resolve", lambda path: (resolved.append(path), resolve(path))[1])
+    catalogue = opened(source)
+    resolved.clear()
+    refuse_overlap(catalogue, out)
+    assert resolved == [source, source / "sub"]
+    (source / "sub" / "5.mp4").symlink_to(out / "0.mp4")
+    with pytest.raises(CorpusError, match=r"sub/5\.mp4 of the source is a link into it"):
+        refuse_overlap(opened(source), out)
+    (source / "sub" / "5.mp4").unlink()
+    (source / "linked").symlink_to(out / "sub")
+    with pytest.raises(CorpusError, match=r"linked/4\.mp4 of the source is a link into it"):
+        refuse_overlap(opened(source), out)
 
 
 class _Stop(Exception):

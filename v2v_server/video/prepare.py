@@ -14,6 +14,7 @@ import math
 import os
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from v2v_server.video.manifest import Header, PreparedVideo
 from v2v_server.video.manifest_writer import ManifestWriter
 from v2v_server.video.orientation import Window
 from v2v_server.video.report import Report
-from v2v_server.video.resume import known_records, locked, refuse_overlap, stands
+from v2v_server.video.resume import known_records, locked, refuse_overlap, standing_files
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import Scene
 from v2v_server.video.transcode import Made, Transcoding, look_again, transcode
@@ -61,7 +62,7 @@ def prepare(
         frame_floor_db: least PSNR of each frame for the same; None: 5 dB below ``floor_db``.
         scene: also take the statistics of what each video shows; those of one prepared without them are taken from
             its source, and its file stays.
-        progress: told at the start and after each video.
+        progress: told at the start, after each video whose file was looked for, and after each that was done.
 
     Raises:
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
@@ -75,6 +76,9 @@ def prepare(
             f"{processes} processes, floor {floor_db:g} dB, frame floor {frame_floor_db:g} dB: give 0 or more, and "
             "finite numbers"
         )
+    tell = progress or (lambda done, total: None)
+    total = sum(video.frames for video in catalogue.videos)
+    tell(0, total)
     target = Path(destination).resolve()
     refuse_overlap(catalogue, target)
     header = Header(
@@ -87,15 +91,20 @@ def prepare(
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
             known = known_records(target, header)
-            standing = {video.id: known[video.id] for video in catalogue.videos if stands(target, video, known)}
-            finished = {id for id, record in standing.items() if record.scene or not scene}
+            standing: dict[str, PreparedVideo] = {}
+            finished: set[str] = set()
+            done = 0
+            with closing(standing_files(target, catalogue.videos, known)) as files:
+                for video, stands in files:
+                    if stands:
+                        standing[video.id] = known[video.id]
+                    if stands and (known[video.id].scene or not scene):
+                        finished.add(video.id)
+                        done += video.frames
+                    tell(done, total)
             left = [video for video in catalogue.videos if video.id not in finished]
             wanted = {video.id for video in catalogue.videos}
             aside = [record for id, record in known.items() if id not in wanted]
-            total = sum(video.frames for video in catalogue.videos)
-            done = total - sum(video.frames for video in left)
-            if progress is not None:
-                progress(done, total)
             with ManifestWriter(target, header, standing.values(), aside) as manifest:
                 for video, outcome in _outcomes(catalogue, left, standing, target, encoding, scene, processes):
                     if isinstance(outcome, Problem):
@@ -104,8 +113,7 @@ def prepare(
                         manifest.add(outcome)
                         made[outcome.id] = outcome
                     done += video.frames
-                    if progress is not None:
-                        progress(done, total)
+                    tell(done, total)
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     records = standing | made

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-from collections.abc import Iterator
+import os
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, VideoError
@@ -14,6 +16,9 @@ from v2v_server.video.manifest import MANIFEST_NAME, Header, PreparedVideo, read
 from v2v_server.video.transcode import PARTIAL_SUFFIX
 
 _LOCK_NAME = ".v2v-prepare.lock"
+_READERS = 16
+_AT_A_TIME = 1024
+"""Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
 
 
 def refuse_overlap(catalogue: Catalogue, target: Path) -> None:
@@ -27,8 +32,14 @@ def refuse_overlap(catalogue: Catalogue, target: Path) -> None:
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
     if target == root or target.is_relative_to(root) or root.is_relative_to(target):
         raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
+    # To resolve a path asks the system about each of its parts: done for every folder once, and for links among files.
+    inside: dict[str, bool] = {}
     for video in catalogue.videos:
-        if (root / video.id).resolve().is_relative_to(target):
+        path = root / video.id
+        folder = os.path.dirname(video.id)
+        if folder not in inside:
+            inside[folder] = path.parent.resolve().is_relative_to(target)
+        if inside[folder] or (path.is_symlink() and path.resolve().is_relative_to(target)):
             raise CorpusError(f"{target}: {video.id} of the source is a link into it; choose another destination")
 
 
@@ -80,8 +91,23 @@ def known_records(target: Path, header: Header) -> dict[str, PreparedVideo]:
     return manifest.aside | manifest.videos
 
 
-def stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
-    """Whether the prepared file is there, unchanged, and that of this state of the source."""
+def standing_files(
+    target: Path, videos: Sequence[VideoEntry], known: dict[str, PreparedVideo]
+) -> Generator[tuple[VideoEntry, bool], None, None]:
+    """Whether the prepared file of each video is there, unchanged, and that of this state of the source; in order.
+
+    Beginning and end of each file are read, many files at a time: what this waits for is the disk.
+    """
+    pool = ThreadPoolExecutor(_READERS)
+    try:
+        for start in range(0, len(videos), _AT_A_TIME):
+            some = videos[start : start + _AT_A_TIME]
+            yield from zip(some, pool.map(lambda video: _stands(target, video, known), some), strict=True)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
     record = known.get(video.id)
     if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
         return False
