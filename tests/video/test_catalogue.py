@@ -170,6 +170,23 @@ def test_the_digest_knows_rows_and_thresholds_but_not_the_place(corpus: Path, op
     assert opener(corpus, list_file=listed).digest != plain.digest
 
 
+def test_what_a_list_names_is_not_opened_unless_it_is_a_file(corpus: Path, opener: Opener) -> None:
+    """A named pipe would be waited for until somebody writes into it."""
+    os.mkfifo(corpus / "pipe.mp4")
+    (corpus / "endless.mp4").symlink_to("/dev/zero")
+    (corpus / "folder.mp4").mkdir()
+    listed = corpus / "list.txt"
+    listed.write_text("pipe.mp4\nendless.mp4\nfolder.mp4\na.mp4\ngone.mp4\n")
+    catalogue = opener(listed)
+    assert ids(catalogue) == ["a.mp4"]
+    reasons = {problem.id: problem.reason for problem in catalogue.problems}
+    assert reasons.pop("gone.mp4").startswith("cannot be read: No such file")
+    assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is no regular file")
+    listed.write_text("pipe.mp4\n")
+    with pytest.raises(CorpusError, match=r"no video found.*pipe\.mp4: is no regular file"):
+        opener(listed)
+
+
 def test_lists(corpus: Path, opener: Opener) -> None:
     listed = corpus / "list.txt"
     listed.write_text("sub/b.mp4 99 0.2 0.3\na.mp4\ngone.mp4 5\n")

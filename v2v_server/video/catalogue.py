@@ -11,7 +11,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
 from v2v_server.video.index import FrameIndex, unseekable
-from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list, regular_files
 from v2v_server.video.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.refresh import Progress, index_path, up_to_date
 from v2v_server.video.rows import Rows
@@ -228,7 +228,7 @@ def open_catalogue(
         rows = None
         ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
     else:
-        ids = tuple(video_files(root, refused)) if listed is None else tuple(entry.id for entry in listed)
+        ids = tuple(video_files(root, refused)) if listed is None else regular_files(root, listed, refused)
         refuse_prepared_below(root, ids)
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")

@@ -11,7 +11,8 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -72,6 +73,30 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
     if not found:
         raise CorpusError(f"list {path}: names no video; write one a line: path [frames [c+ [c-]]]")
     return tuple(found)
+
+
+def regular_files(root: Path, entries: Iterable[ListEntry], refused: dict[str, str]) -> tuple[str, ...]:
+    """The ids of a list but for those that name something else than a file.
+
+    To open a named pipe waits for somebody to write into it, for ever if need be, and a device may not end. An id that
+    names nothing stays: whoever reads it says why it cannot.
+
+    Args:
+        root: the folder that ids are relative to.
+        entries: of the list.
+        refused: receives, by id, why one cannot be taken in.
+    """
+    ids = []
+    for entry in entries:
+        try:
+            is_regular = stat.S_ISREG(os.stat(root / entry.id).st_mode)
+        except OSError:
+            is_regular = True
+        if is_regular:
+            ids.append(entry.id)
+        else:
+            refused[entry.id] = "is no regular file"
+    return tuple(ids)
 
 
 def _comma_columns(line: str) -> list[str]:
