@@ -257,6 +257,23 @@ def test_a_video_that_cannot_be_written_fails_alone(source: Path, tmp_path: Path
     assert [video.id for video in report.prepared] == ["y.mp4"]
 
 
+def test_a_source_that_is_waited_for_in_vain_fails_alone(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "source").mkdir()
+    for name in ("x.mp4", "y.mp4"):
+        shutil.copy(source / "b.mp4", tmp_path / "source" / name)
+    monkeypatch.setattr("v2v_server.video.prepare._deadline_seconds", lambda job: {"x.mp4": 0.1}.get(job.video.id, 60))
+    with closing(open_catalogue(tmp_path / "source", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        (tmp_path / "source" / "x.mp4").unlink()
+        os.mkfifo(tmp_path / "source" / "x.mp4")
+        report = prepare(catalogue, tmp_path / "out", H264, processes=1)
+    assert [(video.id, video.problem) for video in report.failed] == [
+        ("x.mp4", "hangs the transcoder: ended after 0 s without a result")
+    ]
+    assert [video.id for video in report.prepared] == ["y.mp4"]
+
+
 def test_rows_that_a_picture_has_not(source: Path, tmp_path: Path) -> None:
     report = run(source, tmp_path / "out", rows="top:50px")
     assert {video.id for video in report.failed} == {"a turned.mov", "dir/odd.avi", "dir/pc.mkv", CORRUPT}

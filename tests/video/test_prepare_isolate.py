@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -45,6 +46,26 @@ def test_a_crash_costs_one_job() -> None:
     assert results == {n: n * n for n in (0, 1, 2, 4, 6, 7, 8)}
     assert dict(run_isolated(square_or_die, [1, 2], processes=0)) == {1: 1, 2: 4}
     assert dict(run_isolated(square_or_die, [], processes=2)) == {}
+
+
+def square_or_wait(job: tuple[int, str]) -> int:
+    """Waits for somebody to write into the named pipe."""
+    number, pipe = job
+    if pipe:
+        Path(pipe).read_bytes()
+    return number * number
+
+
+def test_a_job_that_waits_for_ever_costs_itself(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    jobs = [(1, ""), (2, str(tmp_path / "pipe")), (3, ""), (4, "")]
+    allowed = {job: 1.0 if job[1] else 60.0 for job in jobs}
+    results = {job[0]: result for job, result in run_isolated(square_or_wait, jobs, 1, allowed.__getitem__)}
+    hung = results.pop(2)
+    assert hung == Died(-signal.SIGKILL, 1.0)
+    assert isinstance(hung, Died)
+    assert (hung.how, hung.from_outside) == ("ended after 1 s without a result", False)
+    assert results == {1: 1, 3: 9, 4: 16}
 
 
 def test_leaving_early_ends_the_processes() -> None:

@@ -155,9 +155,12 @@ def _outcomes(
                 target, target / id, scene,
             )  # fmt: skip
 
-    for (job, _), result in run_isolated(_attempt, transcodings(), processes):
+    for (job, _), result in run_isolated(_attempt, transcodings(), processes, lambda job: _deadline_seconds(job[0])):
         if isinstance(result, Died):
-            result = f"crashes the transcoder: its process died ({result.how})"
+            if result.overdue_seconds:
+                result = f"hangs the transcoder: {result.how}"
+            else:
+                result = f"crashes the transcoder: its process died ({result.how})"
         if isinstance(result, Scene) and job.standing is not None:
             yield job.video, replace(job.standing, scene=_text(result))
         elif isinstance(result, str) and job.standing is not None:
@@ -179,6 +182,12 @@ class _Job:
 def _window(video: VideoEntry, rows: Rows) -> Window:
     top, bottom = rows.bounds(video.height_px)
     return top, 0, bottom - top, video.width_px
+
+
+def _deadline_seconds(job: _Job) -> float:
+    """Some fifty times as long as a core takes to transcode and verify it: for one that waits for a file for ever."""
+    video = job.video
+    return 600 + video.frames * (0.5 + 5e-6 * video.width_px * video.height_px)
 
 
 def _attempt(job: tuple[_Job, Transcoding]) -> Made | Scene | str:
