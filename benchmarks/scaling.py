@@ -18,7 +18,6 @@ more than four cores), both within a turn; a broker below 1 GB/s; a broker above
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 import time
@@ -39,6 +38,7 @@ from v2v_protocol.messages import Hello, Want, Welcome
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_protocol.wire import decode, encode
+from v2v_server.process import usable_cores
 
 LEAST_GAIN_OF_TWO = 1.75
 LEAST_BYTES_PER_SECOND = 1e9
@@ -231,13 +231,13 @@ def work(asked: argparse.Namespace) -> int:
     records = end_to_end(asked)
     records += [broker_alone(asked, recipe, workers) for workers in asked.null_workers]
     records.append(stalled(asked, recipe, max(asked.null_workers)))
-    records = [record | {"batch_size": asked.batch_size, "cores": os.cpu_count()} for record in records]
+    records = [record | {"batch_size": asked.batch_size, "cores": usable_cores()} for record in records]
     show(records, _COLUMNS)
     print(*extrapolated(records), sep="\n")
     write(records, asked.json)
     if asked.plot is not None:
         plot(asked.plot, records)
-    return say_missed(missed_bars(records, os.cpu_count() or 1))
+    return say_missed(missed_bars(records, usable_cores()))
 
 
 def plot(file: Path, records: Sequence[dict[str, Any]]) -> None:

@@ -11,7 +11,6 @@ which a preset with several samples of a decode exceeds. Bars are on ratios, by 
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ from benchmarks.plots import bars, panels
 from benchmarks.records import Column, parser_of, run, say_missed, show, write
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import SPEED_PRESETS
+from v2v_server.process import usable_cores
 
 BARS = {"exact, source": 3.3, "exact, h264": 11.0, "exact, mpeg4": 14.0, "fast, h264": 20.0, "fast, mpeg4": 20.0}
 """Least multiple of the baseline, by the clock and by processor time; `mpeg4` stands for `mpeg4-tiles`, too."""
@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--presets", default=",".join(SPEED_PRESETS), metavar="A,B", help="default: all")
     parser.add_argument("--rows", default="top:0.54", help="of --videos")
-    parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument("--workers", type=int, default=min(2, usable_cores()))
     parser.add_argument("--batch-size", type=int, default=12)
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--warmup-batches", type=int, default=4)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import statistics
 import sys
 import time
@@ -22,6 +21,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
 from v2v_server.cli import new_parser, run_command
+from v2v_server.process import usable_cores
 from v2v_server.progress import catalogue_progress
 from v2v_server.video import prepare
 from v2v_server.video.catalogue import open_catalogue
@@ -57,7 +57,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="let each tile share PX columns with the next, so that a crop no wider touches one (default 0)",
     )  # fmt: skip
     parser.add_argument(
-        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default: one a core)"
+        "--workers",
+        type=int,
+        default=usable_cores(),
+        metavar="N",
+        help="processes (default: one a core that it may use)",
     )
     parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts SRC")
     parser.add_argument(

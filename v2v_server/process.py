@@ -1,4 +1,4 @@
-"""What we ask of the operating system: memory that stays, long turns on a core, children that die with their parent."""
+"""What we ask of the operating system: memory that stays, cores, long turns, children that die with their parent."""
 
 from __future__ import annotations
 
@@ -71,6 +71,14 @@ def take_long_turns() -> bool:
         return False
     attributes.runtime_ns = round(_TURN_SECONDS * 1e9)
     return bool(kernel.syscall(set_, 0, ctypes.byref(attributes), 0) == 0)
+
+
+def usable_cores() -> int:
+    """How many cores this process may run on: of a container, a batch system or ``taskset``, where they give fewer than
+    the machine has; of the machine where the system does not say."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def give_way() -> None:

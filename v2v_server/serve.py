@@ -22,7 +22,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.dispatcher import Dispatcher
 from v2v_server.instructions import GiveUp, Instruction, LookFor, Record
 from v2v_server.pool import Pool
-from v2v_server.process import keep_freed_memory
+from v2v_server.process import keep_freed_memory, usable_cores
 from v2v_server.progress import catalogue_progress
 from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.sequences import SequenceTable
@@ -46,7 +46,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             rows=Rows.parse(config.rows),
             cache_dir=config.cache_dir or None,
             scene=config.spec.scene != "off",
-            processes=max(1, min(config.workers, os.cpu_count() or 1)),
+            processes=max(1, min(config.workers, usable_cores())),
             progress=progress,
         )
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import sys
 
 import pytest
 
-from v2v_server import process
+from v2v_protocol.errors import CorpusError
+from v2v_server import prepare_cli, process
+from v2v_server.config import ServeConfig
+from v2v_server.serve import load_catalogue
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 
@@ -20,6 +24,35 @@ def _in_a_process(code: str) -> list[str]:
 
 def _kernel() -> tuple[int, ...]:
     return tuple(int(part) for part in platform.release().split("-")[0].split(".")[:2])
+
+
+def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = _in_a_process(
+        "import os\n"
+        "from v2v_server.process import usable_cores\n"
+        "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "print(usable_cores())\n"
+    )
+    assert said == ["1"]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 9})
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    processes = []
+
+    def refuse(*_: object, **asked: object) -> None:
+        processes.append(asked["processes"])
+        raise CorpusError("seen enough")
+
+    monkeypatch.setattr("v2v_server.serve.open_catalogue", refuse)
+    monkeypatch.setattr("v2v_server.prepare_cli.open_catalogue", refuse)
+    with pytest.raises(CorpusError):
+        load_catalogue(ServeConfig(videos="videos", workers=16))
+    with pytest.raises(SystemExit):
+        prepare_cli.main(["videos", "prepared"])
+    assert processes == [3, 3]
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert process.usable_cores() == 64
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert process.usable_cores() == 1
 
 
 def test_long_turns_leave_niceness_and_policy_alone() -> None:
