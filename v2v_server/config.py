@@ -23,7 +23,7 @@ DEFAULT_BIND = "tcp://127.0.0.1:5555"
 
 @dataclass(frozen=True, slots=True)
 class ServeConfig:
-    """Settings of one server. Keys of a YAML file are these names; flags are these names with dashes.
+    """Settings of one server. Flags are these names with dashes; keys of a YAML file are these names with either.
 
     Attributes:
         videos: folder tree, single video, or list file.
@@ -97,11 +97,15 @@ class ServeConfig:
         """The configuration from an optional YAML file and the flags that were given (None: not given).
 
         Raises:
-            UsageError: the file cannot be read, or see the class.
+            UsageError: the file cannot be read, it has a key twice, or see the class.
         """
         values: dict[str, Any] = {}
-        if file is not None:
-            values |= read_yaml_mapping("--config", file)
+        for key, value in ({} if file is None else read_yaml_mapping("--config", file)).items():
+            # Who copies a flag writes it as the flag is written.
+            name = key.replace("-", "_")
+            if name in values:
+                raise UsageError(f"--config {file}: {name} is there twice, with dashes and with underscores; keep one")
+            values[name] = value
         values |= {name: value for name, value in flags.items() if value is not None}
         known = {item.name: item for item in dataclasses.fields(cls) if item.init}
         for key, value in values.items():

@@ -55,6 +55,17 @@ on_bad_video: raise
     assert load(tmp_path, text, recipe="paper").spec.recipe == Recipe()
 
 
+def test_keys_may_be_written_as_the_flags_are(tmp_path: Path) -> None:
+    text = "videos: a\nworker-bind: 'tcp://127.0.0.1:5556'\nlease-deadline-seconds: 5\nvoxel_dtype: int16\n"
+    config = load(tmp_path, text)
+    assert (config.worker_bind, config.lease_deadline_seconds) == ("tcp://127.0.0.1:5556", 5)
+    assert config.spec.voxel_dtype == "int16"
+    with pytest.raises(UsageError, match="port_file is there twice, with dashes and with underscores"):
+        load(tmp_path, "videos: a\nport-file: a\nport_file: b\n")
+    with pytest.raises(UsageError, match=r"unknown key 'worker_bin' \(did you mean 'worker_bind'\?\)"):
+        load(tmp_path, "videos: a\nworker-bin: a\n")
+
+
 def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
     assert load(tmp_path, "", videos="a") == ServeConfig(videos="a")
 
