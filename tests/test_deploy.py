@@ -1,0 +1,48 @@
+"""What `deploy/` says of the commands holds of the commands."""
+
+from __future__ import annotations
+
+import re
+from configparser import RawConfigParser
+from pathlib import Path
+
+import pytest
+import yaml
+
+from v2v_server.cli import serve
+from v2v_server.config import ServeConfig
+from v2v_server.quarantine_cli import main as quarantine
+
+UNIT = Path(__file__).parents[1] / "deploy" / "systemd" / "v2v-serve.service"
+
+
+@pytest.fixture(scope="module")
+def service() -> dict[str, str]:
+    parser = RawConfigParser(strict=True)
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    parser.read_string(UNIT.read_text())
+    return dict(parser["Service"])
+
+
+def test_the_unit_does_not_start_again_over_a_mistyped_key(
+    service: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "serve.yaml").write_text("video: /data/webvid\n")
+    with pytest.raises(SystemExit) as ended:
+        serve(["--config", str(tmp_path / "serve.yaml")])
+    assert "did you mean 'videos'" in capsys.readouterr().err
+    assert service["Restart"] == "on-failure"
+    assert str(ended.value.code) in service["RestartPreventExitStatus"].split()
+
+
+def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dict[str, str], tmp_path: Path) -> None:
+    notes = "".join(line for line in UNIT.read_text().splitlines(True) if line.startswith("#"))
+    venv = service["ExecStart"].partition("/bin/")[0]
+    assert f"-m venv {venv}\n" in notes
+    assert re.search(rf"useradd .* {service['User']}\n", notes)
+    state = f"/var/lib/{service['StateDirectory']}"
+    assert service["Environment"] == f"V2V_CACHE_DIR={state}"
+    assert f"v2v-quarantine --videos /data/webvid --cache-dir {state}\n" in notes
+    quarantine(["--videos", str(tmp_path), "--cache-dir", str(tmp_path)])
+    written = re.findall(r"^#   (\w+: .*)$", notes, re.MULTILINE)
+    assert ServeConfig(**yaml.safe_load("\n".join(written))).workers == 8
