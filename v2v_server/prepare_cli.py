@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -26,6 +27,7 @@ from v2v_server.progress import catalogue_progress
 from v2v_server.video import prepare
 from v2v_server.video.catalogue import open_catalogue
 from v2v_server.video.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
+from v2v_server.video.listfile import LIST_SUFFIXES
 from v2v_server.video.report import Report
 from v2v_server.video.rows import Rows
 
@@ -110,6 +112,7 @@ def _run(arguments: argparse.Namespace) -> bool:
             floor_db=arguments.floor,
             frame_floor_db=arguments.frame_floor,
             scene=arguments.scene != "off",
+            single=_is_video(Path(arguments.source)),
             progress=progress,
         )
     for line in summary(report, encoding, time.monotonic() - started):
@@ -119,6 +122,10 @@ def _run(arguments: argparse.Namespace) -> bool:
         records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in problems]
         write_json(arguments.json, records)
     return report.complete
+
+
+def _is_video(source: Path) -> bool:
+    return source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
 
 
 def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:

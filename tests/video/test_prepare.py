@@ -18,6 +18,7 @@ import pytest
 from benchmarks.prepare import DECODERS, MOST_FRAMES, SETTINGS, main
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_server.prepare_cli import main as prepare_main
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.encode import CODECS, Encoding, encode_luma, limited_table
@@ -302,6 +303,29 @@ def test_refused_places(source: Path, prepared: tuple[Path, Report], tmp_path: P
     (tmp_path / "linked" / "b.mp4").symlink_to(corpus / "b.mp4")
     with pytest.raises(CorpusError, match="is a link into it"):
         run(tmp_path / "linked", corpus)
+
+
+def test_one_video_may_be_prepared_in_its_own_folder(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    films = tmp_path / "films"
+    films.mkdir()
+    shutil.copy(source / "b.mp4", films)
+    shutil.copy(source / "b.mp4", films / "other.mp4")
+    more = ["--workers", "1", "--cache-dir", str(tmp_path / "cache")]
+    prepare_main([str(films / "b.mp4"), str(films / "prepared"), *more])
+    assert "1 of 1 videos prepared" in capsys.readouterr().out
+    assert [video.id for video in opened(films / "prepared").videos] == ["b.mp4"]
+    before = snapshot(films)
+    (films / "list.txt").write_text("b.mp4\n")
+    for place, target in ((films / "b.mp4", films), (films / "b.mp4", tmp_path), (films / "list.txt", films / "more")):
+        with pytest.raises(SystemExit):
+            prepare_main([str(place), str(target), *more])
+        assert "in one another" in capsys.readouterr().err
+    (films / "list.txt").unlink()
+    assert snapshot(films) == before
+    with pytest.raises(CorpusError, match="prepared is a prepared folder"):  # and the whole is no corpus unnoticed
+        opened(films)
 
 
 def test_a_link_in_the_destination_is_not_followed(source: Path, tmp_path: Path) -> None:

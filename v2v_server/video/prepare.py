@@ -49,6 +49,7 @@ def prepare(
     floor_db: float = DEFAULT_FLOOR_DB,
     frame_floor_db: float | None = None,
     scene: bool = False,
+    single: bool = False,
     progress: Progress | None = None,
 ) -> Report:
     """Transcode a corpus; a video that cannot be is recorded with the reason, and the others go on.
@@ -62,6 +63,7 @@ def prepare(
         frame_floor_db: least PSNR of each frame for the same; None: 5 dB below ``floor_db``.
         scene: also take the statistics of what each video shows; those of one prepared without them are taken from
             its source, and its file stays.
+        single: the source is one video, so the destination may lie in its folder.
         progress: told at the start, after each video whose file was looked for, and after each that was done.
 
     Raises:
@@ -80,7 +82,7 @@ def prepare(
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total)
     target = Path(destination).resolve()
-    refuse_overlap(catalogue, target)
+    refuse_overlap(catalogue, target, single)
     header = Header(
         str(catalogue.rows), encoding.codec, encoding.quality, encoding.gop, len(catalogue.videos),
         catalogue.root.name, catalogue.digest, tile_px=encoding.tile_px, tile_overlap_px=encoding.tile_overlap_px,

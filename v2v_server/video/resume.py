@@ -21,8 +21,13 @@ _AT_A_TIME = 1024
 """Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
 
 
-def refuse_overlap(catalogue: Catalogue, target: Path) -> None:
-    """Make sure that source and destination share no file.
+def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
+    """Make sure that source and destination share no file, now or when the source is searched again.
+
+    Args:
+        catalogue: the source.
+        target: the destination, resolved.
+        single: the source is one video: nothing else of its folder will be taken for one.
 
     Raises:
         CorpusError: they do, or the source is prepared itself.
@@ -30,7 +35,8 @@ def refuse_overlap(catalogue: Catalogue, target: Path) -> None:
     root = catalogue.root
     if catalogue.prepared is not None:
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
-    if target == root or target.is_relative_to(root) or root.is_relative_to(target):
+    below = target != root and target.is_relative_to(root)
+    if root.is_relative_to(target) or (below and not single):
         raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
     # To resolve a path asks the system about each of its parts: done for every folder once, and for links among files.
     inside: dict[str, bool] = {}
