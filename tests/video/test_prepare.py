@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
@@ -326,6 +327,14 @@ def test_one_video_may_be_prepared_in_its_own_folder(
     assert snapshot(films) == before
     with pytest.raises(CorpusError, match="prepared is a prepared folder"):  # and the whole is no corpus unnoticed
         opened(films)
+
+
+def test_the_table_has_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        prepare_main(["--help"])
+    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("options:")[0]))
+    table = (Path(__file__).parents[2] / "docs" / "prepare.md").read_text()
+    assert {flag for flag in flags if f"| `{flag}` |" not in table} == {"--debug"}
 
 
 def test_a_link_in_the_destination_is_not_followed(source: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import shutil
 from contextlib import closing
 from fractions import Fraction
@@ -97,6 +98,16 @@ def test_tiles_make_up_the_picture(cutting: tuple[int, int, int]) -> None:
 def test_what_is_not_worth_cutting_stays_whole(width: int, tile: int) -> None:
     assert split(width, 0) == ()
     assert (split(width, tile) == ()) == (round(width / tile) < 2)
+
+
+def test_which_pictures_stay_whole_is_as_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "prepare.md").read_text()
+    told = re.findall(r"below (\d+)[a-z ]* with `--tile-width (\d+)(?: --tile-overlap (\d+))?`", text)
+    assert len(told) == 2
+    for narrowest, *asked in told:
+        tile, overlap = (int(number or 0) for number in asked)
+        assert split(int(narrowest) - 1, tile, overlap) == ()
+        assert len(split(int(narrowest), tile, overlap)) == 2
 
 
 @given(cuttings(), st.data())

@@ -47,7 +47,7 @@ def split(width_px: int, tile_px: int, overlap_px: int = 0) -> tuple[Tile, ...]:
     """The tiles of a picture, from left to right: as near ``tile_px`` wide as whole blocks allow.
 
     Each shares ``overlap_px`` columns with the next, so that a window no wider than that lies in one tile. Empty where
-    the picture is not worth cutting (less than one and a half tiles), or ``tile_px`` is 0.
+    the picture is not worth cutting (narrower than one and a half tiles less half an overlap), or ``tile_px`` is 0.
     """
     rest, step = width_px - overlap_px, tile_px - overlap_px
     count = min(round(rest / step), MOST_TILES) if tile_px else 0
