@@ -1,7 +1,7 @@
 """The command line of `v2v-prepare`: arguments -> settings -> call.
 
-Exit status: 0 every video file of the source was prepared, 1 some were not or fall below the floor, 2 wrong usage or
-input, 130 interrupted. Errors are one line on stderr; `--debug` shows the trace.
+Exit status: 0 every video file of the source was prepared, 1 some were not, fall below a floor or lack the statistics
+that were asked for, 2 wrong usage or input, 130 interrupted. Errors are one line on stderr; `--debug` shows the trace.
 """
 
 from __future__ import annotations

@@ -352,7 +352,10 @@ def test_a_link_in_the_destination_is_not_followed(source: Path, tmp_path: Path)
 
 def test_other_settings_need_another_folder(source: Path, prepared: tuple[Path, Report]) -> None:
     for encoding, rows in ((Encoding("h264", 20, 12), "top:0.54"), (H264, "full")):
-        with pytest.raises(CorpusError, match="was prepared with"):
+        with pytest.raises(
+            CorpusError,
+            match=r"was prepared with .*which its 4 prepared videos are not; choose another folder, or delete",
+        ):
             run(source, prepared[0], encoding, rows)
 
 

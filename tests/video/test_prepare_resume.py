@@ -16,12 +16,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import damaged, panned_luma, write_clip
 from tests.video.test_prepare import opened, psnr_db, run, whole
 from tests.video.test_prepare_isolate import children
 from tests.waiting import until
 from v2v_protocol.errors import CorpusError, VideoError
-from v2v_server.prepare_cli import main
+from v2v_server.prepare_cli import main, summary
 from v2v_server.video.encode import Encoding
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.manifest import MANIFEST_NAME, read_manifest
@@ -71,6 +71,7 @@ def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     served = opened(out)  # finished, and exactly what was asked for last
     assert [video.id for video in served.videos] == ["1.mp4", "sub/4.mp4"]
     assert "3 prepared videos are set aside" in served.notes[0]
+    assert "3 others that were prepared earlier are set aside" in summary(part, Encoding("h264", 18, 12), 0.0)[1]
     (tmp_path / "other.txt").write_text("0.mp4\n1.mp4\n")
     assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").problems[0].reason
     (source / "sub").rename(tmp_path / "away")
@@ -124,7 +125,7 @@ def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: py
         refuse_overlap(opened(source), out)
 
 
-class _Stop(Exception):
+class _Stop(BaseException):
     pass
 
 
@@ -146,7 +147,27 @@ def test_what_is_cut_off_forgets_nothing(source: Path, tmp_path: Path) -> None:
     assert [replace(record, scene="") for _, record in sorted(records.items())] == list(first.videos)
     last = run(source, out, scene=True)
     assert (last.kept, last.looked_at, last.complete) == (1, 4, True)
+    assert "4 were prepared earlier: only the statistics" in summary(last, Encoding("h264", 18, 12), 0.0)[1]
     assert inodes(out) == before
+
+
+def test_a_finished_folder_with_a_failure_stays_finished(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when a run that tries the failed one again is cut off."""
+    out = tmp_path / "out"
+    write_clip(source / "1.mp4", panned_luma(24), gop=24)
+    damaged(source / "1.mp4", source / "0.mp4", 12)
+    assert [video.id for video in run(source, out).failed] == ["0.mp4"]
+    before = opened(out).digest
+
+    def stop(job: Transcoding) -> None:
+        raise _Stop
+
+    monkeypatch.setattr("v2v_server.video.prepare.transcode", stop)
+    with pytest.raises(_Stop):
+        run(source, out)
+    assert opened(out).digest == before
 
 
 def test_a_look_that_fails_costs_no_prepared_file(

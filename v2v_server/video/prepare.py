@@ -26,7 +26,7 @@ from v2v_server.video.manifest import Header, PreparedVideo
 from v2v_server.video.manifest_writer import ManifestWriter
 from v2v_server.video.orientation import Window
 from v2v_server.video.report import Report
-from v2v_server.video.resume import known_records, locked, refuse_overlap, standing_files
+from v2v_server.video.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import Scene
 from v2v_server.video.transcode import Made, Transcoding, look_again, transcode
@@ -93,21 +93,13 @@ def prepare(
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
             known = known_records(target, header)
-            standing: dict[str, PreparedVideo] = {}
-            finished: set[str] = set()
-            done = 0
-            with closing(standing_files(target, catalogue.videos, known)) as files:
-                for video, stands in files:
-                    if stands:
-                        standing[video.id] = known[video.id]
-                    if stands and (known[video.id].scene or not scene):
-                        finished.add(video.id)
-                        done += video.frames
-                    tell(done, total)
+            earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total))
+            standing, finished = earlier.standing, earlier.finished
             left = [video for video in catalogue.videos if video.id not in finished]
+            done = total - sum(video.frames for video in left)
             wanted = {video.id for video in catalogue.videos}
             aside = [record for id, record in known.items() if id not in wanted]
-            with ManifestWriter(target, header, standing.values(), aside) as manifest:
+            with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
                 for video, outcome in _outcomes(catalogue, left, standing, target, encoding, scene, processes):
                     if isinstance(outcome, Problem):
                         not_looked_at.append(outcome)
@@ -129,6 +121,39 @@ def prepare(
         aside=len(aside),
         not_looked_at=tuple(not_looked_at),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Earlier:
+    """What earlier runs did of the videos that this one is asked for.
+
+    Attributes:
+        standing: records by id, whose prepared file is there.
+        finished: ids of those that lack nothing.
+        failed: records without a file. They stay until the video was tried again: a finished folder stays finished.
+    """
+
+    standing: dict[str, PreparedVideo]
+    finished: set[str]
+    failed: list[PreparedVideo]
+
+
+def _earlier(
+    target: Path, catalogue: Catalogue, known: dict[str, PreparedVideo], scene: bool, tell: Callable[[int], None]
+) -> _Earlier:
+    earlier = _Earlier({}, set(), [])
+    done = 0
+    with closing(standing_files(target, catalogue.videos, known)) as files:
+        for video, stands in files:
+            if stands:
+                record = earlier.standing[video.id] = known[video.id]
+                if record.scene or not scene:
+                    earlier.finished.add(video.id)
+                    done += video.frames
+            elif has_failed(video, known):
+                earlier.failed.append(known[video.id])
+            tell(done)
+    return earlier
 
 
 def _outcomes(

@@ -113,6 +113,12 @@ def standing_files(
         pool.shutdown(cancel_futures=True)
 
 
+def has_failed(video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
+    """Whether an earlier run could not prepare this state of the source."""
+    record = known.get(video.id)
+    return record is not None and record.problem is not None and record.source_fingerprint == video.fingerprint
+
+
 def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
     record = known.get(video.id)
     if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
