@@ -125,6 +125,25 @@ def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: py
         refuse_overlap(opened(source), out)
 
 
+def test_a_prepared_file_that_cannot_be_read_is_not_given_up(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    manifest, before = (out / MANIFEST_NAME).read_bytes(), inodes(out)
+
+    def refuse(path: Path) -> str:
+        if path.name == "3.mp4":
+            raise VideoError(str(path), None, "cannot be read: Permission denied") from PermissionError(13, "denied")
+        return fingerprint(path)
+
+    monkeypatch.setattr("v2v_server.video.resume.fingerprint", refuse)
+    with pytest.raises(CorpusError, match=r"3\.mp4 cannot be read: Permission denied, .* nothing was changed"):
+        run(source, out)
+    assert (out / MANIFEST_NAME).read_bytes() == manifest
+    assert inodes(out) == before
+
+
 class _Stop(BaseException):
     pass
 

@@ -68,7 +68,8 @@ def prepare(
 
     Raises:
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
-            settings, another process is at work there, or the source is prepared itself.
+            settings, a prepared file cannot be read, another process is at work there, or the source is prepared
+            itself.
         UsageError: a number outside its limits.
     """
     if frame_floor_db is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 from collections.abc import Generator, Iterator, Sequence
@@ -16,6 +17,7 @@ from v2v_server.video.manifest import MANIFEST_NAME, Header, PreparedVideo, read
 from v2v_server.video.transcode import PARTIAL_SUFFIX
 
 _LOCK_NAME = ".v2v-prepare.lock"
+_NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
 _READERS = 16
 _AT_A_TIME = 1024
 """Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
@@ -103,6 +105,9 @@ def standing_files(
     """Whether the prepared file of each video is there, unchanged, and that of this state of the source; in order.
 
     Beginning and end of each file are read, many files at a time: what this waits for is the disk.
+
+    Raises:
+        CorpusError: a file is there and cannot be read.
     """
     pool = ThreadPoolExecutor(_READERS)
     try:
@@ -125,5 +130,10 @@ def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) ->
         return False
     try:
         return fingerprint(target / video.id) == record.fingerprint
-    except VideoError:
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
+            raise CorpusError(
+                f"{target / video.id} {error.reason}, so nobody can tell whether it is still what was prepared, and "
+                "nothing was changed; make it readable, or delete it to have it made anew"
+            ) from error
         return False
