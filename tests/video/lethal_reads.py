@@ -30,3 +30,10 @@ def always_killed(root: str, id: str) -> Record:
     """Is killed from outside over every file."""
     os.kill(os.getpid(), signal.SIGKILL)
     return examine(root, id)
+
+
+def waiting(root: str, id: str) -> Record:
+    """Waits for ever over files of that name, as over storage that does not answer."""
+    if "waiting" in id:
+        signal.pause()
+    return examine(root, id)

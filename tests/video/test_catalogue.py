@@ -14,7 +14,7 @@ import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
 from tests.video.failing_storage import failing_opens
-from tests.video.lethal_reads import always_killed, killed_once, lethal
+from tests.video.lethal_reads import always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.video import catalogue as catalogue_module
 from v2v_server.video.catalogue import Catalogue, open_catalogue
@@ -304,6 +304,15 @@ def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) ->
     (record,) = survey(corpus, ["a.mp4"], 2, always_killed)
     assert "from outside or for want of memory (signal SIGKILL)" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again
+
+
+@pytest.mark.slow
+def test_a_file_that_is_waited_for_in_vain_costs_only_itself(corpus: Path) -> None:
+    names = ["a.mp4", "waiting.mp4", "sub/b.mp4"]
+    records = {record.id: record for record in survey(corpus, names, 2, waiting, longest_seconds=10.0)}
+    assert [id for id, record in records.items() if record.problem is not None] == ["waiting.mp4"]
+    assert records["waiting.mp4"].size_bytes == -1  # to be tried again
+    assert "ended after 10 s without a result; the next start" in str(records["waiting.mp4"].problem)
 
 
 def test_fingerprints(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.video.store import Record, Store
+from v2v_server.video.survey import LONGEST_SECONDS
 
 _WRITE_EVERY = 64
 
@@ -114,14 +115,16 @@ class Looking:
 
         look = partial(_look_at, os.fspath(root))
         suspects = []
-        for job, scene in run_isolated(look, jobs(), processes):
+        for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS):
+            if isinstance(scene, Died) and scene.overdue_seconds:
+                continue  # the next start tries again
             if isinstance(scene, Died) or not scene:
                 suspects.append(job)
             else:
                 yield by_id[job.id], Scene.from_bytes(scene)
         # Once more, alone: it may have been killed from outside, or for want of memory, or its storage failed for a
         # moment. A second failure is not kept: of such a video nothing is known, and the next start tries again.
-        for job, scene in run_isolated(look, suspects, 1):
+        for job, scene in run_isolated(look, suspects, 1, lambda job: LONGEST_SECONDS):
             if not isinstance(scene, Died) and scene:
                 yield by_id[job.id], Scene.from_bytes(scene)
 

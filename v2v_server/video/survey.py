@@ -14,6 +14,9 @@ from v2v_server.video.isolate import Died, run_isolated
 from v2v_server.video.probe import VideoFacts, probe
 from v2v_server.video.store import Record
 
+LONGEST_SECONDS = 3600.0
+"""For reading a file from end to end, on slow storage: who needs longer waits for a file that never comes."""
+
 Examine = Callable[[str, str], Record]
 """(root, id) -> what is known of that file; see :func:`examine`."""
 
@@ -75,7 +78,13 @@ def _facts(path: Path) -> VideoFacts:
         raise
 
 
-def survey(root: Path, ids: Iterable[str], processes: int, examine: Examine = examine) -> Generator[Record, None, None]:
+def survey(
+    root: Path,
+    ids: Iterable[str],
+    processes: int,
+    examine: Examine = examine,
+    longest_seconds: float = LONGEST_SECONDS,
+) -> Generator[Record, None, None]:
     """A record for each id, in any order.
 
     A file at which a process died is examined once more when all others are done, alone: the process may have been
@@ -87,15 +96,18 @@ def survey(root: Path, ids: Iterable[str], processes: int, examine: Examine = ex
         processes: processes to probe in, spawned and ended here; 0 probes in this one, where a file that crashes the
             decoder takes the caller along.
         examine: what is done with each file; must be picklable.
+        longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
     """
     look = partial(examine, os.fspath(root))
     suspects: list[str] = []
-    for id, found in run_isolated(look, ids, processes):
-        if isinstance(found, Died):
+    for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds):
+        if isinstance(found, Died) and found.overdue_seconds:
+            yield Record(id, -1, 0, problem=f"cannot be probed: {found.how}; the next start tries again")
+        elif isinstance(found, Died):
             suspects.append(id)
         else:
             yield found
-    for id, found in run_isolated(look, suspects, 1):
+    for id, found in run_isolated(look, suspects, 1, lambda id: longest_seconds):
         yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 
