@@ -84,9 +84,11 @@ def remake(
         )
         try:
             return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
-        except VideoUnreadable:
-            raise
         except VideoError as error:
+            # A prepared folder keeps the places of videos that could not be prepared: a server refuses them as well.
+            left_out = catalogue.prepared is not None and not catalogue.path(lease.video).exists()
+            if isinstance(error, VideoUnreadable) and not left_out:
+                raise
             task = next_candidate(task, lease.video, error.frame, error.reason)
     raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
 

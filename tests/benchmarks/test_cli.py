@@ -36,4 +36,4 @@ def test_an_error_of_the_system_is_one_line_too(
 
 def test_what_is_unknown_is_named_with_what_is_known(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["nothing"]) == 2
-    assert "no benchmark 'nothing'; known: chaos, corpus" in capsys.readouterr().err
+    assert "no benchmark 'nothing'; known: chaos, chaos_check, corpus, " in capsys.readouterr().err
