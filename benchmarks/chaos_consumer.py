@@ -12,7 +12,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,8 +82,12 @@ def log_path(folder: Path) -> Path:
     return folder / "log.jsonl"
 
 
-def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float) -> None:
+def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, told: Callable[[], bool]) -> None:
     """Streams until the process is told to end.
+
+    Args:
+        address, asked, folder, timeout_seconds: as on the command line.
+        told: whether it was: Python drops an exception that a signal's handler raises within a finalizer.
 
     Raises:
         V2VError: what the dataset raises: nothing that the chaos test does may cause it.
@@ -112,8 +116,10 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float) 
     log = LogWriter(log_path(folder))
     try:
         log.append(LifeLine(lives, committed, time.monotonic()))
-        while True:
+        while not told():
             for batch in dataset:
+                if told():
+                    return
                 arrays = {name: tensor.numpy() for name, tensor in batch.arrays.items()}
                 samples = tuple(
                     sighting({name: array[row] for name, array in arrays.items()}, batch.provenance[row])
@@ -143,10 +149,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--timeout-seconds", type=float, default=60.0)
     asked = parser.parse_args(arguments)
-    # An exception, so that the dataset and its socket are closed as at the end of any program.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    told = False
+
+    def leave(number: int, frame: object) -> None:
+        nonlocal told
+        told = True
+        sys.exit(0)  # an exception, so that the dataset and its socket are closed as at the end of any program
+
+    signal.signal(signal.SIGTERM, leave)
     try:
-        consume(asked.address, profile(asked.profile), asked.folder, asked.timeout_seconds)
+        consume(asked.address, profile(asked.profile), asked.folder, asked.timeout_seconds, lambda: told)
     except V2VError as error:
         print(f"consumer {asked.profile}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
