@@ -85,12 +85,15 @@ def remake(
         try:
             return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
         except VideoError as error:
-            # A prepared folder keeps the places of videos that could not be prepared: a server refuses them as well.
-            left_out = catalogue.prepared is not None and not catalogue.path(lease.video).exists()
-            if isinstance(error, VideoUnreadable) and not left_out:
+            if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                 raise
             task = next_candidate(task, lease.video, error.frame, error.reason)
     raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
+
+
+def _is_left_out(catalogue: Catalogue, video: str) -> bool:
+    """Whether a prepared folder only keeps the video's place, because it could not be prepared: no server has it."""
+    return catalogue.prepared is not None and not catalogue.path(video).exists()
 
 
 def simulate_to_file(
