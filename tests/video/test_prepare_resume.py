@@ -85,6 +85,27 @@ def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     assert opened(out).digest == digest
 
 
+def test_another_corpus_is_not_taken_for_a_changed_source(source: Path, tmp_path: Path) -> None:
+    """Every video of the same name would be replaced, and every other set aside."""
+    out = tmp_path / "out"
+    run(source, out)
+    before = inodes(out)
+    other = tmp_path / "other"
+    other.mkdir()
+    write_clip(other / "0.mp4", panned_luma(24, step=(2, 3)))
+    with pytest.raises(CorpusError, match="folder called source, and none of its 5 videos is one of the 1 of other"):
+        run(other, out)
+    assert inodes(out) == before
+    assert len(opened(out).videos) == 5
+
+    # The same corpus under another name has something in common, and a source that keeps its name may change wholly.
+    renamed = source.rename(tmp_path / "renamed")
+    assert run(renamed, out).kept == 5
+    shutil.rmtree(renamed)
+    other.rename(renamed)
+    assert (run(renamed, out).kept, len(opened(out).videos)) == (0, 1)
+
+
 def test_finished_files_are_looked_at_together_and_told_of(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

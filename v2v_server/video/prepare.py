@@ -68,8 +68,8 @@ def prepare(
 
     Raises:
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
-            settings, a prepared file cannot be read, another process is at work there, or the source is prepared
-            itself.
+            settings or from another source, a prepared file cannot be read, another process is at work there, or the
+            source is prepared itself.
         UsageError: a number outside its limits.
     """
     if frame_floor_db is None:
@@ -93,7 +93,7 @@ def prepare(
     try:
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
-            known = known_records(target, header)
+            known = known_records(target, header, catalogue.videos)
             earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total))
             standing, finished = earlier.standing, earlier.finished
             left = [video for video in catalogue.videos if video.id not in finished]

@@ -67,11 +67,17 @@ def locked(target: Path) -> Iterator[None]:
         yield
 
 
-def known_records(target: Path, header: Header) -> dict[str, PreparedVideo]:
+def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:
     """The records of all earlier runs, also those set aside, after clearing away what they left unfinished.
 
+    Args:
+        target: the destination.
+        header: what this run asks for.
+        videos: of its source.
+
     Raises:
-        CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings.
+        CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings or
+            from another source.
         OSError: it cannot be read, or what is unfinished cannot be removed.
     """
     if not (target / MANIFEST_NAME).exists():
@@ -94,9 +100,27 @@ def known_records(target: Path, header: Header) -> dict[str, PreparedVideo]:
             f"{target} was prepared with {manifest.header.settings()}, and now {header.settings()} is asked for, which "
             f"its {made} prepared videos are not; choose another folder, or delete this one to have all made anew"
         )
+    known = manifest.aside | manifest.videos
+    _refuse_other_source(target, manifest.header.source, header.source, known, videos)
     for partial in target.rglob(f".*{PARTIAL_SUFFIX}"):
         partial.unlink()
-    return manifest.aside | manifest.videos
+    return known
+
+
+def _refuse_other_source(
+    target: Path, earlier: str, now: str, known: dict[str, PreparedVideo], videos: Sequence[VideoEntry]
+) -> None:
+    """Another corpus would pass for this one with every video changed or removed, and its files would replace those
+    of the same names, which may have taken days. A source that keeps its name, or some video, is the same one."""
+    if earlier == now or not known:
+        return
+    if any(video.id in known and known[video.id].source_fingerprint == video.fingerprint for video in videos):
+        return
+    raise CorpusError(
+        f"{target} was prepared from a folder called {earlier}, and none of its {len(known)} videos is one of the "
+        f"{len(videos)} of {now}; choose another folder for another corpus. If it is the same one renamed, begin with "
+        "all of its videos, or with its old name"
+    )
 
 
 def standing_files(
