@@ -6,6 +6,6 @@ Pure data: the standard library, numpy and msgpack only. Nothing here opens a so
 PROTOCOL_VERSION = 3
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""
 
-NUMERICS_VERSION = 2
+NUMERICS_VERSION = 3
 """Version of everything that turns (spec, catalogue, seed, epoch, index) into bytes: permutation, draws,
 kernel. It is part of a sample's identity; a change that alters any byte of any sample raises it."""

@@ -83,13 +83,14 @@ def draft_of(lease: Lease, index: int) -> Draft:
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
+    core_left_px = window.left_px  # what the view takes is the same with flow and without
     plan = _plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if plan is not None and plan.still:
             flow = replace(flow, margin_px=0)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
+    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window, core_left_px), flow, plan)
 
 
 def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:

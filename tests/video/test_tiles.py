@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 import shutil
@@ -129,6 +130,40 @@ def test_parts_make_up_the_window(cutting: tuple[int, int, int], data: st.DataOb
     assert all(part.window[3] for part in found)  # none is touched for nothing
     if width <= overlap:
         assert len(found) == 1
+
+
+@given(cuttings(), st.data())
+def test_a_window_within_another_comes_from_the_same_tiles(cutting: tuple[int, int, int], data: st.DataObject) -> None:
+    tiles = split(*cutting)
+    core = data.draw(st.integers(0, cutting[0] - 1))
+    width = data.draw(st.integers(1, cutting[0] - core))
+    left = data.draw(st.integers(0, core))
+    right = data.draw(st.integers(core + width, cutting[0]))
+    alone, around = parts((2, core, 3, width), tiles), parts((2, left, 3, right - left), tiles, core)
+    tracks = [part.track for part in around]
+    assert tracks == sorted(set(tracks))  # one part a tile
+    owners = [
+        np.repeat([part.track for part in found], [part.window[3] for part in found]) for found in (alone, around)
+    ]
+    np.testing.assert_array_equal(owners[1][core - left :][:width], owners[0])
+    at = 0
+    for part in around:
+        assert (part.left, tiles[part.track].left_px + part.window[1]) == (at, left + at)
+        at += part.window[3]
+    assert at == right - left
+
+
+def test_flow_changes_no_other_array(overlapping: Path, tmp_path: Path) -> None:
+    """What lies around a crop is of other tiles than the crop, and some of them hold columns of the crop too."""
+    spec = dataclasses.replace(SPEC, flow_method="dis-ultrafast")
+    with closing(open_catalogue(overlapping, cache_dir=tmp_path, processes=0)) as catalogue:
+        for seed in range(8):
+            without, with_flow = (
+                remake(catalogue, spec, seed=seed, epoch=0, index=0, arrays=arrays)
+                for arrays in (("voxels", "frames"), ("voxels", "frames", "flow"))
+            )
+            for name, array in without.arrays.items():
+                np.testing.assert_array_equal(with_flow.arrays[name], array)
 
 
 def test_the_picture_is_whole(clip: Path, oracle: npt.NDArray[np.uint8]) -> None:

@@ -24,10 +24,13 @@ class Cut:
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+        core_left_px: the column from which on the window is, in every bit, what a window that begins there would be;
+            None: its first (:func:`v2v_server.video.tiles.parts`).
     """
 
     count: int
     window: Window | None = None
+    core_left_px: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

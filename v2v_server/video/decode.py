@@ -97,7 +97,7 @@ def decode_cuts(
     """
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
-    checked = [Cut(cut.count, _checked(cut.window, index)) for cut in cuts]
+    checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
     decode = _decode_tiles if index.tiles else _decode_track
     taken, codec = decode(Task(os.fspath(path), index, start, stride, loop_filter), checked)
     return tuple(
@@ -126,7 +126,7 @@ def _decode_tiles(task: Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.
     whole = [np.empty((cut.count, *window_of(cut)[2:]), np.uint8) for cut in cuts]
     needed: dict[int, list[tuple[int, Part]]] = {}
     for number, cut in enumerate(cuts):
-        for part in parts(window_of(cut), task.index.tiles):
+        for part in parts(window_of(cut), task.index.tiles, cut.core_left_px):
             needed.setdefault(part.track, []).append((number, part))
     codec = ""
     for track, wanted in needed.items():

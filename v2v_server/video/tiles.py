@@ -58,19 +58,27 @@ def split(width_px: int, tile_px: int, overlap_px: int = 0) -> tuple[Tile, ...]:
     return tuple(Tile(left, right - left) for left, right in zip(lefts, rights, strict=True))
 
 
-def parts(window: Window, tiles: Sequence[Tile]) -> list[Part]:
+def parts(window: Window, tiles: Sequence[Tile], core_left_px: int | None = None) -> list[Part]:
     """The parts that make up a window of the whole picture, from left to right: no more than it takes.
+
+    Where tiles overlap, two of them hold a column, each with its own error of the codec.
 
     Args:
         window: inside the picture.
         tiles: that make up the picture.
+        core_left_px: a column of the window; a window that begins there is made of these parts too, whatever lies to
+            its left here. None: there is no such window.
     """
     top, left, height, width = window
-    found, at = [], left
-    while at < left + width:
+    found: list[Part] = []
+    at, core, end = left, left if core_left_px is None else core_left_px, left + width
+    while at < end:
         track = max(number for number, tile in enumerate(tiles) if tile.left_px <= at < tile.right_px)
-        last = min(left + width, tiles[track].right_px)
-        found.append(Part(track, (top, at - tiles[track].left_px, height, last - at), at - left))
+        last = min(end if at >= core else core, tiles[track].right_px)
+        begin = at
+        if found and found[-1].track == track:
+            begin = found.pop().left + left
+        found.append(Part(track, (top, begin - tiles[track].left_px, height, last - begin), begin - left))
         at = last
     return found
 
