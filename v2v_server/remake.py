@@ -115,7 +115,7 @@ def simulate_to_file(
 
     Args:
         source, list_file, rows: the corpus, as for a server.
-        out: the .npz file.
+        out: the .npz file; a name that does not end so gets it added.
         picture: a .png file to draw it into, or None.
         spec: fields of the StreamSpec; None in any takes the default.
         arrays, seed, epoch, index: see :func:`remake`.
@@ -143,6 +143,8 @@ def simulate_to_file(
         quarantine=quarantine,
         snapshot=snapshot,
     )
+    if not out.name.endswith(".npz"):
+        out = Path(f"{out}.npz")  # as numpy would, which does not say so
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:

@@ -155,3 +155,13 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
     }[damage]
     with pytest.raises(VideoError, match=r"^a\.mp4.*: the server's index of it is damaged: "):
         decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.root)
+
+
+@pytest.mark.parametrize("file", ["sample", "sample.npz", "sample.mp4"])
+def test_a_sample_lies_where_it_is_said_to(
+    file: str, catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
+    simulate([str(catalogue.root / "a.mp4"), f"--out={tmp_path / file}", f"--cache-dir={tmp_path}", *recipe])
+    with np.load(capsys.readouterr().out.split("written to ")[1].strip()) as content:
+        assert sorted(content) == ["frames", "provenance", "voxels"]
