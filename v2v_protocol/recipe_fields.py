@@ -107,7 +107,8 @@ def check_limits(values: Mapping[str, Any]) -> None:
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise RecipeError(f"recipe {name} = {value!r}: give a number")
+        why = ", not text (which 1e-3 is in YAML: write 1.0e-3)" if isinstance(value, str) else ""
+        raise RecipeError(f"recipe {name} = {value!r}: give a number{why}")
     try:
         number = float(value)
     except OverflowError:
