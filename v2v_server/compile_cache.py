@@ -1,8 +1,12 @@
-"""Where numba keeps the compiled kernels: a folder of its own for every state of their sources.
+"""Where numba keeps the compiled kernels: a folder of its own for every state of their sources and every processor.
 
 Numba takes compiled code for fresh while the one file that defines the function is unchanged. A kernel of ours holds
 functions and constants of several files, so after a change of one of them numba would go on with the old kernel, and
 with other numbers, without a word. Another digest of all these files is another folder.
+
+Numba numbers the files of compiled code, and its index says which of them is for which processor. Two hosts that share
+a folder and compile at the same time may both take the same number: then the index leads one of them to the code of the
+other, whose instructions it may lack, at every start from then on. So the processor is in the digest too.
 """
 
 from __future__ import annotations
@@ -14,13 +18,19 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import takewhile
 from pathlib import Path
 
 SOURCES = Path(__file__).parent / "simulation"
 """The folder of every file from which something can get into a kernel."""
 
+PROCESSORS = Path("/proc/cpuinfo")
+"""What Linux says of the processors. Asking LLVM, as numba does, would mean loading it in every process."""
+
 _VARIABLE = "NUMBA_CACHE_DIR"
+_KIND = re.compile(r"(vendor_id|cpu family|model|flags|Features|CPU (implementer|architecture|variant|part)|isa)\s*:")
 _OURS = re.compile(r"numba-[0-9a-f]{12}")
 
 
@@ -58,11 +68,19 @@ def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> 
 
 
 def sources_digest(folder: Path = SOURCES) -> str:
-    """Names a state of the kernels' sources and the version of numba: 12 hexadecimal digits."""
-    digest = hashlib.sha256(version("numba").encode())
+    """Names a state of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
+    digest = hashlib.sha256(version("numba").encode() + _processor())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:12]
+
+
+def _processor() -> bytes:
+    """What kind of processor this is and which instructions it has, as far as the system tells."""
+    told = [os.uname().machine]
+    with suppress(OSError), PROCESSORS.open(encoding="utf-8", errors="replace") as file:
+        told += filter(_KIND.match, takewhile(str.strip, file))  # the first one ends with an empty line
+    return "\n".join(told).encode()
 
 
 def _is_users(folder: str) -> bool:

@@ -123,6 +123,20 @@ def test_every_source_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     assert sources_digest(tmp_path) == seen[-1]
 
 
+def test_the_processor_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(compile_cache, "PROCESSORS", tmp_path / "cpuinfo")
+    own = "processor\t: 0\nmodel\t\t: 1\ncpu MHz\t\t: 2445.4\nflags\t\t: fpu avx2\n"
+
+    def seen(text: str) -> str:
+        (tmp_path / "cpuinfo").write_text(text)
+        return sources_digest()
+
+    unknown = sources_digest()
+    assert len({unknown, seen(own), seen(own.replace("avx2", "avx2 avx512f")), seen(own.replace(": 1", ": 2"))}) == 4
+    # And nothing else does: neither how fast it runs, nor how many there are.
+    assert seen(own.replace("2445.4", "1497.0") + "\nprocessor\t: 1\nmodel\t\t: 1\n") == seen(own)
+
+
 @pytest.mark.parametrize("first", ["v2v_server", "numba"])
 def test_numba_keeps_the_kernels_there_whoever_is_imported_first(first: str) -> None:
     code = f"import {first}; from v2v_server.simulation.pixel import words; print(words.stats.cache_path)"
