@@ -9,7 +9,11 @@ from typing import Any
 from v2v_client.state import Stream
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, StreamSpec
+
+# What is left to the server may be anything, so that it is no reason to refuse what goes with some of it.
+_ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE)
+_LONGEST = Recipe(voxels_per_clip=1_000_000, bins=1)
 
 
 class Options:
@@ -20,15 +24,21 @@ class Options:
         fields: see :meth:`v2v_protocol.spec.StreamSpec.from_dict`; ``recipe`` may be a Recipe.
 
     Raises:
-        UsageError: a value outside its limits, or an unknown array: here, and not by the server.
+        UsageError: a value outside its limits, or an unknown array: here, and not by the server. What only the server's
+            own spec can tell is left to it.
     """
 
     def __init__(self, arrays: tuple[str, ...], **fields: Any) -> None:
         recipe = fields.get("recipe")
         fields = fields | {"recipe": recipe.to_dict() if isinstance(recipe, Recipe) else recipe}
         self._asked = {name: value for name, value in fields.items() if value is not None}
-        spec = StreamSpec.from_dict(self._asked)
+        others = {name: value for name, value in self._asked.items() if name != "flow_from"}
+        spec = StreamSpec.from_dict(others, default=_ANY)
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
+        asked = self._asked.get("recipe", {})
+        is_ours = isinstance(asked, str) or not {"preset", "voxels_per_clip"}.isdisjoint(asked)
+        clip = StreamSpec(recipe=spec.recipe if is_ours else _LONGEST)
+        StreamSpec.from_dict({"flow_from": self._asked.get("flow_from")}, default=clip)
 
     def spec(self, pinned: Stream | None, side: str) -> Mapping[str, Any]:
         """What to ask the server for: a pinned stream's spec, which must be what the options say.

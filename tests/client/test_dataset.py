@@ -211,11 +211,22 @@ def test_options_reach_the_server(server):
         ({"rank": 1}, "give both"),
         ({"rank": 2, "world_size": 2}, "rank 2"),
         ({"timeout_seconds": 0.0}, "timeout_seconds"),
+        ({"flow_from": -1}, "flow_from"),
+        ({"flow_from": 41, "recipe": "paper"}, "flow_from"),
+        ({"flow_from": 4, "recipe": {"voxels_per_clip": 3}}, "flow_from"),
+        ({"sibling_spacing": 8, "samples_per_decode": 1}, "sibling_spacing"),
+        ({"sibling_spacing": 8, "preset": "exact"}, "sibling_spacing"),
     ],
 )
 def test_wrong_options_are_refused_at_once(options, word):
     with pytest.raises(UsageError, match=word):
         V2VStreamDataset("tcp://127.0.0.1:1", **options)
+
+
+def test_what_only_the_servers_own_spec_can_tell_is_left_to_it():
+    """It may make clips of 80 voxels, and four samples of a decode."""
+    for recipe in (None, {"bins": 3}):
+        V2VStreamDataset("tcp://127.0.0.1:1", recipe=recipe, flow_from=60, sibling_spacing=48)
 
 
 def test_an_address_that_is_none_says_what_to_give():
