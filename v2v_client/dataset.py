@@ -53,7 +53,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
     Args:
         address: of the server, ``tcp://host:port``.
         batch_size: samples of one rank's batch.
-        arrays: which of "voxels" and "frames" to receive. It never changes what they hold.
+        arrays: which of "voxels", "frames", "flow" and "flow_valid" to receive. It never changes what they hold.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
         seed: of all random draws and of the order.
         epoch: the first one.
