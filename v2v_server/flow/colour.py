@@ -33,7 +33,7 @@ def _wheel() -> npt.NDArray[np.float64]:
 
 
 def draw_flow(flow: npt.NDArray[np.floating], largest_px: float | None = None) -> Image:
-    """A field as a picture: white does not move, red moves right, yellow down, cyan left, blue up.
+    """A field as a picture: white does not move, red moves right, yellow down, blue-cyan left, violet up.
 
     Args:
         flow: [2, H, W], (x, y), px.
