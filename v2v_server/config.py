@@ -153,10 +153,10 @@ def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
     """The mapping in a YAML file.
 
     Raises:
-        UsageError: it cannot be read, or holds something else; the message names the flag.
+        UsageError: it cannot be read, has a key twice, or holds something else; the message names the flag.
     """
     try:
-        values = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        values = yaml.load(Path(file).read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise UsageError(f"{flag} {file}: {error.strerror}") from error
     except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that does not exist
@@ -166,6 +166,20 @@ def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise UsageError(f"{flag} {file}: expected keys and values, found {type(values).__name__}")
     return values
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a mapping that has a key twice, of which SafeLoader would take the last without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue  # no key of ours
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def _check_address(flag: str, address: str, insecure: bool) -> None:
