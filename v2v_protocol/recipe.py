@@ -194,13 +194,29 @@ class Recipe:
     @property
     def most_events(self) -> float:
         """:func:`most_events` of the worst draw; what is stated per second, at one frame a second."""
-        smallest, largest = pixel_thresholds(*self.smallest_and_largest_threshold, self.threshold_mismatch_sigma[1])
-        nominal = self.smallest_and_largest_threshold[1]
+        return self.worst_events(1.0)
+
+    def worst_events(self, step_seconds: float, thresholds: tuple[float, float] | None = None) -> float:
+        """:func:`most_events` of the worst draw.
+
+        Args:
+            step_seconds: from one frame to the next, all along the clip.
+            thresholds: those that are stated for the video, which hold where ``threshold_source`` is "video"; None
+                where none are.
+        """
+        low, high = self.smallest_and_largest_threshold
+        if thresholds is not None and self.threshold_source == "video":
+            low, high = thresholds
+        nominal = max(low, high)
+        smallest, largest = pixel_thresholds(min(low, high), nominal, self.threshold_mismatch_sigma[1])
         sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
         ends = math.log(self.log_eps), math.log1p(self.log_eps)
-        leak = self.leak_hz[1] * largest
-        return most_events(self.steps, ends, (smallest, largest), self.steps * (sigma + hot + leak))
+        unit = step_seconds if self.noise_unit == "second" else 1.0
+        leak = self.leak_hz[1] * largest * step_seconds
+        return most_events(
+            self.steps, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as plain values (ranges as lists), in a stable order."""

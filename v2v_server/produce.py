@@ -25,6 +25,7 @@ from v2v_server.scene_choice import FlowPlan, plan_flow
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
+from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts
@@ -197,6 +198,20 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             scene="" if draft.plan is None else draft.plan.reason,
         ),
     )
+
+
+def kernels_of(lease: Lease) -> frozenset[Variant]:
+    """The compiled kernels that a lease's sample may need."""
+    if "voxels" not in lease.arrays:
+        return frozenset()
+    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds)
+
+
+@lru_cache(maxsize=64)
+def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[str, ...]) -> frozenset[Variant]:
+    spec = _spec(canonical)
+    step_seconds = spec.recipe.frame_stride / frames_per_second
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _thresholds(thresholds))
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,4 @@
-"""The kernels of a worker at its start: one process compiles them, the others load what it has left in the cache.
+"""The kernels of a worker: one process compiles them, the others load what it has left in the cache.
 
 Compiling takes tens of seconds of processor time. Workers that are all started at once on a new host would each spend
 them, since none finds the work of another. So the first takes a lock, which the operating system gives back should it
@@ -8,6 +8,8 @@ Both are hints. If that file is wrong, because somebody has emptied the cache ar
 that file system, or the holder of the lock does not get on, each process compiles for itself.
 
 The compiler needs about 90 MB that it never gives back. They go with the child process in which it runs.
+
+Kernels that only some streams need (``simulation/variants.py``) are had in the same way, when the first of them comes.
 """
 
 from __future__ import annotations
@@ -28,29 +30,58 @@ from v2v_server.compile_cache import sources_digest
 from v2v_server.process import die_with_parent
 from v2v_server.simulation.clip import warm_up
 from v2v_server.simulation.pixel import simulate_pixels
+from v2v_server.simulation.variants import Variant, load
 
 _LONGEST_WAIT_SECONDS = 300.0
 _POLL_SECONDS = 0.1
 
 
 def warm_up_in_turn() -> None:
-    """Loads the kernels; before that, compiles them or waits for another process that does."""
-    kernel: Any = simulate_pixels
-    # Numba keeps apart what was compiled by other Pythons and for other processors, and so do we.
-    processor = kernel.targetctx.codegen().magic_tuple()
-    key = repr((sources_digest(), sys.implementation.cache_tag, processor))
-    folder = Path(kernel.stats.cache_path)
-    with one_compiles(folder, hashlib.sha256(key.encode()).hexdigest()[:12]) as is_to_compile:
+    """Loads what every worker runs; before that, compiles it or waits for another process that does."""
+    with one_compiles(*_place()) as is_to_compile:
         if is_to_compile:
-            # Should it fail, so will the next line, or it does the work.
-            subprocess.run([sys.executable, "-m", __name__, str(os.getpid())], stdin=subprocess.DEVNULL, check=False)
+            _compile_apart()
         load_kernels()
+
+
+def load_in_turn(variant: Variant) -> None:
+    """The same for a variant of the kernels that is not among the usual ones."""
+    with one_compiles(*_place(variant)) as is_to_compile:
+        if is_to_compile:
+            print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
+            _compile_apart(*map(str, (variant.voxel_dtype, int(variant.effects), variant.precision)))
+        load(variant)
+
+
+def is_compiled(variant: Variant) -> bool:
+    """Whether a process is known to have compiled it, so that to load it takes no time to speak of."""
+    folder, key = _place(variant)
+    return _mark(folder, key).exists()
 
 
 def load_kernels() -> None:
     """Loads from the cache, or compiles, what every worker runs."""
     warm_up()
     import_module("v2v_server.simulation.full_range")  # importing it compiles, or loads, what is in it
+
+
+def _place(variant: Variant | None = None) -> tuple[Path, str]:
+    """Where the compiled code is kept, and a name for what is compiled."""
+    kernel: Any = simulate_pixels
+    # Numba keeps apart what was compiled by other Pythons and for other processors, and so do we.
+    processor = kernel.targetctx.codegen().magic_tuple()
+    key = repr((sources_digest(), sys.implementation.cache_tag, processor, *(variant or ())))
+    return Path(kernel.stats.cache_path), hashlib.sha256(key.encode()).hexdigest()[:12]
+
+
+def _compile_apart(*variant: str) -> None:
+    """Compiles in a child process. Should that fail, so will the caller's loading, or it does the work."""
+    command = [sys.executable, "-m", __name__, str(os.getpid()), *variant]
+    subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
+
+
+def _mark(folder: Path, key: str) -> Path:
+    return folder / f"{key}.complete"
 
 
 @contextmanager
@@ -65,7 +96,7 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
     Yields:
         whether none is known to have come to its end.
     """
-    complete = folder / f"{key}.complete"
+    complete = _mark(folder, key)
     with ExitStack() as turn:
         if not complete.exists():
             turn.enter_context(_lock(folder / f"{key}.lock", longest_wait_seconds))
@@ -102,4 +133,7 @@ def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
 
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
-    load_kernels()
+    if asked := sys.argv[2:]:
+        load(Variant(asked[0], asked[1] == "1", asked[2]))
+    else:
+        load_kernels()

@@ -47,8 +47,9 @@ from v2v_server.clips import Clips
 from v2v_server.handover import room_for, sample_message
 from v2v_server.logbook import IDLE, note
 from v2v_server.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
-from v2v_server.produce import make_sample, sample_layout
-from v2v_server.warm_up import warm_up_in_turn
+from v2v_server.produce import kernels_of, make_sample, sample_layout
+from v2v_server.simulation.variants import USUAL
+from v2v_server.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 CREDIT = 2
 _PING_SECONDS = 5.0
@@ -79,6 +80,7 @@ class Worker:
         self._clips = Clips(root)
         self._leases: deque[Lease] = deque()
         self._begun = 0  # the lease that was last said to be begun
+        self._kernels = set(USUAL)  # that are loaded
         self._hellos = 0
         self._unsent: list[tuple[int, Frames]] = []  # leases that are done, and what is to be said of their samples
         self._unsent_since = 0.0
@@ -161,8 +163,29 @@ class Worker:
                 pass
 
     def _begin(self) -> None:
+        if not self._is_ready(self._leases[0]):
+            self._get_ready()
+            return
         self._begun = self._leases[0].lease
         self._send(encode(Begun(self._begun)))
+
+    def _is_ready(self, lease: Lease) -> bool:
+        return kernels_of(lease) <= self._kernels
+
+    def _get_ready(self) -> None:
+        """Has the kernels of the next lease. While they are compiled its leases are for others: that takes seconds,
+        many where cores are few, and a video is not to be blamed for them, nor a worker."""
+        missing = kernels_of(self._leases[0]) - self._kernels
+        away = not all(map(is_compiled, missing))
+        if away:
+            self._send(encode(Goodbye()))
+        for variant in missing:
+            load_in_turn(variant)
+        self._kernels |= missing
+        if away:
+            self._receive(0.0)  # what was on its way when the server heard of it
+            self._leases.clear()
+            self._say_hello()
 
     def _work(self, lease: Lease) -> None:
         if not self._unsent:
@@ -195,7 +218,8 @@ class Worker:
         """Says what is done, and along with it what is begun next."""
         if not self._unsent:
             return
-        self._begun = self._leases[0].lease if self._leases and not self._stopping else 0
+        may_go_on = self._leases and not self._stopping and self._is_ready(self._leases[0])
+        self._begun = self._leases[0].lease if may_go_on else 0
         begun = [*(number for number, _ in self._unsent[1:]), self._begun]
         for (number, frames), next_one in zip(self._unsent, begun, strict=True):
             self._send([*encode(Result(number, next_one)), *frames])

@@ -33,6 +33,7 @@ from v2v_protocol.wire import decode, encode
 from v2v_server import worker as worker_module
 from v2v_server.clips import Clips
 from v2v_server.handover import Room
+from v2v_server.simulation.variants import Variant
 from v2v_server.worker import Worker
 
 WAIT_MS = 20_000
@@ -205,6 +206,44 @@ def test_a_sample_for_a_server_that_was_restarted_is_dropped(server: Server) -> 
     assert server.heard() == Begun(1)
     server.lets_it_finish()
     assert server.heard() == Result(1, begins=0)
+
+
+class TestKernels:
+    """From lease 2 on a kernel is needed that the worker has not."""
+
+    VARIANT = Variant("int16", True, "float32")
+
+    @pytest.fixture(params=[False, True])
+    def is_there(self, request: pytest.FixtureRequest) -> bool:
+        """Whether another process has compiled it."""
+        return bool(request.param)
+
+    @pytest.fixture(autouse=True)
+    def loaded(self, monkeypatch: pytest.MonkeyPatch, is_there: bool) -> list[Variant]:
+        needed = {number: frozenset({self.VARIANT} if number > 1 else ()) for number in range(5)}
+        loaded: list[Variant] = []
+        monkeypatch.setattr(worker_module, "kernels_of", lambda lease: needed[lease.lease])
+        monkeypatch.setattr(worker_module, "is_compiled", lambda variant: is_there)
+        monkeypatch.setattr(worker_module, "load_in_turn", loaded.append)
+        return loaded
+
+    def test_are_there_before_a_sample_is_begun(self, loaded: list[Variant], server: Server, is_there: bool) -> None:
+        """What is begun is timed, and blamed if it takes too long; and compiling takes long."""
+        server.lease(1)
+        assert server.heard() == Begun(1)
+        server.lease(2)
+        server.lets_it_finish(after_post=True)
+        assert server.heard() == Result(1, begins=0)
+        if not is_there:
+            assert server.heard() == Goodbye()
+            assert isinstance(server.heard(), WorkerHello)
+            server.lease(3)
+        assert server.heard() == Begun(2 if is_there else 3)
+        assert loaded == [self.VARIANT]
+        server.lease(4)
+        server.lets_it_finish(after_post=True)
+        assert server.heard() == Result(2 if is_there else 3, begins=4)
+        assert loaded == [self.VARIANT]
 
 
 class TestSiblings:

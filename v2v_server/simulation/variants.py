@@ -1,0 +1,63 @@
+"""The compiled forms of the kernels: which a stream may need, and having them.
+
+Each takes seconds to compile, and there are a dozen. A worker has the usual ones from its start (``warm_up`` in
+``clip.py``); the others are made ready where a stream needs them, and before the work on its first sample begins.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import VOXEL_DTYPES
+from v2v_server.simulation.clip import simulate
+from v2v_server.simulation.precision import EFFECTS_MARGIN, LIMITS
+
+
+class Variant(NamedTuple):
+    """One compiled form."""
+
+    voxel_dtype: str
+    effects: bool
+    precision: str
+
+    def __str__(self) -> str:
+        return f"{self.voxel_dtype} voxels{' with effects' if self.effects else ''} in {self.precision}"
+
+
+USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
+"""What ``warm_up`` loads."""
+
+
+def variants(
+    recipe: Recipe, voxel_dtype: str, step_seconds: float = 1.0, thresholds: tuple[float, float] | None = None
+) -> frozenset[Variant]:
+    """What the draws of a recipe may need, as far as that can be told without them.
+
+    It cannot where something is stated per second and time stamps are irregular: such a clip may turn out to need
+    float64 after all, and waits for the compiler then.
+
+    Args:
+        recipe: the recipe.
+        voxel_dtype: "int8", "int16" or "float32".
+        step_seconds: from one frame to the next; matters only where something is stated per second.
+        thresholds: those that a list file states for the video; None where it states none.
+    """
+    events = recipe.worst_events(step_seconds, thresholds) * (EFFECTS_MARGIN if recipe.has_effects else 1.0)
+    precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
+    return frozenset(Variant(voxel_dtype, recipe.has_effects, precision) for precision in precisions)
+
+
+def load(variant: Variant) -> None:
+    """Loads one from numba's cache, or compiles it."""
+    simulate(
+        np.zeros((2, 1, 1), np.uint8),
+        threshold_pos=0.2,
+        bins=1,
+        dtype=variant.voxel_dtype,
+        precision=variant.precision,
+        frames_per_second=1.0,
+        shot_noise_hz=1.0 if variant.effects else 0.0,
+    )
