@@ -26,6 +26,8 @@ from v2v_server.quarantine import Verdict
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``reception.MOST_CREDIT``)."""
 _TICK_SECONDS = 0.1
+_LONGEST_TURN_SECONDS = 1.0
+"""Of the loop; what goes beyond is time in which nobody was listened to."""
 # Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -94,7 +96,8 @@ class Broker:
         poller = zmq.Poller()
         poller.register(self._consumers, zmq.POLLIN)
         poller.register(self._workers, zmq.POLLIN)
-        next_tick = time.monotonic()
+        clock = _Clock()
+        next_tick = clock()
 
         def carry_out(instructions: list[Instruction]) -> None:
             todo = deque(instructions)
@@ -105,18 +108,18 @@ class Broker:
                             dispatcher.consumer_lost(identity)
                     case ToWorker(identity, frames):
                         if not _send(self._workers, identity, frames) and not watched(identity):
-                            todo.extend(dispatcher.worker_unreachable(identity, time.monotonic()))
+                            todo.extend(dispatcher.worker_unreachable(identity, clock()))
                     case GiveUp() as hopeless:
                         loss = give_up(hopeless)
-                        todo.extend(dispatcher.worker_lost(hopeless.identity, loss, time.monotonic()))
+                        todo.extend(dispatcher.worker_lost(hopeless.identity, loss, clock()))
                     case Record() as verdict:
-                        todo.extendleft(reversed(dispatcher.recorded(verdict, record(verdict), time.monotonic())))
+                        todo.extendleft(reversed(dispatcher.recorded(verdict, record(verdict), clock())))
                     case LookFor() as missing:
-                        todo.extend(dispatcher.looked_for(missing, look_for(missing), time.monotonic()))
+                        todo.extend(dispatcher.looked_for(missing, look_for(missing), clock()))
 
         while not stopping():
             ready = dict(poller.poll(int(_TICK_SECONDS * 1000)))
-            now = time.monotonic()
+            now = clock()
             # One message of each side a turn, so that neither can shut the other out.
             if self._workers in ready and (message := _receive(self._workers)) is not None:
                 carry_out(dispatcher.from_worker(*message, now))
@@ -136,6 +139,23 @@ class Broker:
     def close(self) -> None:
         """Closes both sockets; what was not sent is dropped."""
         self._context.destroy(linger=0)
+
+
+class _Clock:
+    """Seconds, as far as this process was there to listen.
+
+    While it is stopped (in a terminal, by a batch system, with its whole machine) it hears no answer, and those who owe
+    one may be stopped as well: a deadline that runs out meanwhile is nobody's fault.
+    """
+
+    def __init__(self) -> None:
+        self._seen = time.monotonic()
+        self._away = 0.0
+
+    def __call__(self) -> float:
+        seen, self._seen = self._seen, time.monotonic()
+        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
+        return self._seen - self._away
 
 
 def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:

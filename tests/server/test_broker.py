@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from v2v_protocol.messages import Pong, Stop
 from v2v_protocol.wire import encode
+from v2v_server import broker as broker_module
 from v2v_server.blame import Cause, Loss
 from v2v_server.broker import Broker
 from v2v_server.dispatcher import Dispatcher
@@ -119,3 +121,28 @@ def test_a_farewell_to_nobody_is_no_error() -> None:
         broker.say_farewell([ToWorker(b"w", encode(Stop())), ToConsumer(b"c", encode(Pong()))])
     finally:
         broker.close()
+
+
+def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its workers were stopped along with it, or have answered to nobody: no deadline may run out."""
+    ticks: list[float] = []
+
+    def every_tick(now: float) -> list[Instruction]:
+        ticks.append(now)
+        return []
+
+    monkeypatch.setattr(broker_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(ticks)))
+    broker = Broker("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    try:
+        broker.run(
+            cast(Dispatcher, Scripted([])),
+            give_up=lambda hopeless: HUNG,
+            record=lambda verdict: [],
+            look_for=lambda missing: True,
+            watched=lambda identity: False,
+            every_tick=every_tick,
+            stopping=lambda: len(ticks) == 3,
+        )
+    finally:
+        broker.close()
+    assert ticks == [50.0, 51.0, 52.0]
