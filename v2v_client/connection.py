@@ -245,6 +245,7 @@ class Connection:
             seconds = min(seconds, max(0.0, self._welcome_due - now))
         link = self._open_link()
         frames = link.receive(seconds)
+        self._liveness.woke(self._clock(), now + seconds)
         if frames is None:
             if link.remade():
                 self._resume()

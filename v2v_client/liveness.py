@@ -10,6 +10,9 @@ from enum import Enum
 
 from v2v_protocol.errors import UsageError
 
+_STOPPED_SECONDS = 1.0
+"""A wait that takes so much longer than was asked for: this process did not run."""
+
 
 class Due(Enum):
     """What the silence calls for."""
@@ -58,10 +61,18 @@ class Liveness:
 
     def listen(self, now: float) -> None:
         """The caller begins to listen; the time since :meth:`pause` does not count."""
-        away = max(0.0, now - self._listened_until)
-        self._heard += away
-        self._answered += away
-        self._pinged += away
+        self._leave_out(max(0.0, now - self._listened_until))
+
+    def woke(self, now: float, due: float) -> None:
+        """The caller waited for post, until ``due`` at the latest. If that is long ago, this process was stopped (in a
+        terminal, by a batch system), and the server could not be heard."""
+        if now - due > _STOPPED_SECONDS:
+            self._leave_out(now - due)
+
+    def _leave_out(self, seconds: float) -> None:
+        self._heard += seconds
+        self._answered += seconds
+        self._pinged += seconds
 
     def pause(self, now: float) -> None:
         """The caller stops listening."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from types import FrameType
@@ -67,6 +68,25 @@ def test_a_session_is_opened_again_under_the_newest_snapshot_of_any_sample_that_
         connection.want([2])
         assert _next(connection) == 2
         assert [again.quarantine for again in server.hellos[greeted:]] == [7]
+
+
+def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For hours perhaps, with its server: what it could not hear meanwhile is no silence of the server's."""
+    stopped = [0.0]
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
+        connection.open()
+        listen = link.Link.receive
+
+        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+            if len(stopped) < 3:
+                stopped.append(3600.0)
+                return None
+            return listen(self, seconds)
+
+        monkeypatch.setattr(link.Link, "receive", receive)
+        connection.want([0])
+        assert _next(connection) == 0
 
 
 @pytest.mark.timeout(20)

@@ -44,6 +44,15 @@ def test_time_spent_elsewhere_is_no_silence(away, listened):
     assert liveness.silence(listened + away) == pytest.approx(listened, abs=1e-6)
 
 
+def test_a_time_in_which_this_process_was_stopped_is_no_silence():
+    liveness = Liveness(PATIENCE, 0.0)
+    liveness.woke(1.5, due=1.0)
+    assert liveness.silence(1.5) == 1.5
+    liveness.woke(1000.0, due=2.0)
+    assert liveness.silence(1000.0) == 2.0
+    assert liveness.due(1000.0) is Due.PING
+
+
 @pytest.mark.parametrize("name", ["timeout_seconds", "ping_seconds", "rewant_seconds"])
 def test_times_are_positive(name):
     with pytest.raises(UsageError, match=name):
