@@ -37,6 +37,7 @@ from v2v_protocol.messages import (
     Lease,
     Message,
     Ping,
+    Pong,
     Refused,
     Result,
     Stop,
@@ -53,6 +54,9 @@ from v2v_server.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 CREDIT = 2
 _PING_SECONDS = 5.0
+_MOST_SILENCES = 64
+"""Of so many seconds each, until a silent server is asked again; before that, after 1, 2, 4, 8 ... of them. ZeroMQ
+keeps what is said to a server that is away, which hears all of it when it is back."""
 _TOGETHER_SECONDS = 0.1
 """What is done waits for a sibling if less time than this has gone by since the first of them was begun. Not since it
 was done: where samples take long the server's clocks, which run from result to result, must see each of them."""
@@ -82,6 +86,8 @@ class Worker:
         self._begun = 0  # the lease that was last said to be begun
         self._kernels = set(USUAL)  # that are loaded
         self._hellos = 0
+        self._unheard = False  # nothing says yet that the server took in our last hello
+        self._silences = 0  # since something was heard
         self._unsent: list[tuple[int, Frames]] = []  # leases that are done, and what is to be said of their samples
         self._unsent_since = 0.0
         self._stopping = False
@@ -131,6 +137,7 @@ class Worker:
     def _say_hello(self) -> None:
         self._begun = 0  # a server that does not know us counts its leases anew
         self._hellos += 1
+        self._unheard = True
         hello = WorkerHello(self._name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT)
         self._send(encode(hello))
 
@@ -138,9 +145,13 @@ class Worker:
         """Takes every message that is there, waiting for the first one at most this long."""
         timeout = int(wait_seconds * 1000)
         if timeout and not self._poller.poll(timeout):
-            self._send(encode(Ping()))
+            self._unheard = False  # it may be lost
+            self._silences += 1
+            if self._silences.bit_count() == 1 or self._silences % _MOST_SILENCES == 0:
+                self._send(encode(Ping()))
             return
         while self._poller.poll(0):
+            self._silences = 0
             first, *_ = self._socket.recv_multipart()
             try:
                 self._handle(decode(first))
@@ -150,9 +161,14 @@ class Worker:
     def _handle(self, message: Message) -> None:
         match message:
             case Lease():
+                self._unheard = False
                 self._leases.append(message)
+            case Pong():
+                self._unheard = False
             case Stop():
                 self._stopping = True
+            case Refused(ErrorCode.UNKNOWN_SESSION) if self._unheard:
+                pass  # what it refuses was said before; another hello would take back the leases that this one brings
             case Refused(ErrorCode.UNKNOWN_SESSION):
                 # The server was restarted, or had given us up: what we hold has been given to others.
                 self._leases.clear()

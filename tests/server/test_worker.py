@@ -23,6 +23,7 @@ from v2v_protocol.messages import (
     JobFailed,
     Lease,
     Message,
+    Ping,
     Refused,
     Result,
     Stop,
@@ -206,6 +207,36 @@ def test_a_sample_for_a_server_that_was_restarted_is_dropped(server: Server) -> 
     assert server.heard() == Begun(1)
     server.lets_it_finish()
     assert server.heard() == Result(1, begins=0)
+
+
+def test_a_server_that_knows_us_no_more_is_greeted_once_whatever_it_refuses(server: Server) -> None:
+    """It refuses all that it was sent while it was away, and a second hello takes back what the first one brought."""
+    server.lease(1)
+    assert server.heard() == Begun(1)
+    for _ in range(9):
+        server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you?"))
+    server.lets_it_finish(after_post=True)
+    assert isinstance(server.heard(), WorkerHello)
+    server.lease(1)
+    assert server.heard() == Begun(1)
+    server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you now?"))
+    server.lets_it_finish(after_post=True)
+    assert isinstance(server.heard(), WorkerHello)
+
+
+def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(tmp_path: Path) -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        router.setsockopt(zmq.LINGER, 0)
+        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+        for _ in range(200):
+            worker._receive(0.001)
+        worker._send(encode(Goodbye()))
+        said = []
+        while Goodbye() not in said:
+            assert router.poll(WAIT_MS)
+            said.append(decode(router.recv_multipart()[1]))
+        worker._context.destroy(linger=0)
+    assert said == [Ping()] * 9 + [Goodbye()]  # after 1, 2, 4, 8, 16, 32, 64, 128 and 192
 
 
 class TestKernels:
