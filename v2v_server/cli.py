@@ -72,7 +72,7 @@ def worker(argv: Sequence[str] | None = None) -> None:
     parser = new_parser("v2v-worker", "Work for a server: take leases, make samples.")
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
     parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus folder on this host")
-    parser.add_argument("--name", help="unique name (default: host and process id)")
+    parser.add_argument("--name", help="unique name (default: one with host and process id)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
 

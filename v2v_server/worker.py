@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gc
 import os
+import secrets
 import signal
 import socket
 import sys
@@ -273,13 +274,18 @@ class Worker:
         self._socket.send(last, copy=False)
 
 
+def _name() -> str:
+    """A name that no other worker has. Host and process id are for its operator: in containers they may be the same."""
+    return f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
 def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:
     """Runs one worker in this process until the server stops it.
 
     Args:
         address: where the server listens for workers.
         root: the corpus folder on this host.
-        name: unique name; by default host and process id.
+        name: unique name; by default host, process id and something random.
         parent_pid: the server, when this is one of its own processes: we die with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.logbook`.
 
@@ -300,7 +306,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    worker = Worker(name or f"{socket.gethostname()}-{os.getpid()}", root, address, logbook)
+    worker = Worker(name or _name(), root, address, logbook)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.
     take_long_turns()

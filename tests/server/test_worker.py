@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -35,7 +37,7 @@ from v2v_server import worker as worker_module
 from v2v_server.clips import Clips
 from v2v_server.handover import Room
 from v2v_server.simulation.variants import Variant
-from v2v_server.worker import Worker
+from v2v_server.worker import Worker, run_worker
 
 WAIT_MS = 20_000
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
@@ -237,6 +239,30 @@ def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(tmp_p
             said.append(decode(router.recv_multipart()[1]))
         worker._context.destroy(linger=0)
     assert said == [Ping()] * 9 + [Goodbye()]  # after 1, 2, 4, 8, 16, 32, 64, 128 and 192
+
+
+def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each is process 1 there, as here. Of two of one name the server hears one, and the other waits for ever."""
+    names: list[str] = []
+
+    class Named(Worker):
+        def __init__(self, name: str, root: Path, address: str, logbook: int | None) -> None:
+            names.append(name)
+
+        def run(self) -> None:
+            pass
+
+    monkeypatch.setattr(worker_module, "Worker", Named)
+    for asks_the_system in ("keep_freed_memory", "warm_up_in_turn", "take_long_turns"):
+        monkeypatch.setattr(worker_module, asks_the_system, lambda: None)
+    monkeypatch.setattr(worker_module, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
+    monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
+    monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
+    for name in (None, None, "mine"):
+        run_worker("tcp://127.0.0.1:5556", tmp_path, name, None)
+    assert len(set(names)) == 3
+    assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
+    assert names[2] == "mine"
 
 
 class TestKernels:
