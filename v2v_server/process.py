@@ -5,14 +5,17 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import resource
 import signal
 import sys
+from contextlib import suppress
 
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
 _LARGEST_THRESHOLD_BYTES = 32 << 20  # glibc refuses more (HEAP_MAX_SIZE / 2)
 _PR_SET_PDEATHSIG = 1
 _TURN_SECONDS = 0.1  # the longest that Linux grants
+_MOST_FILES = 1 << 16  # a connection of each consumer and worker that a server takes, and a logbook of each worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 
 
@@ -71,6 +74,19 @@ def take_long_turns() -> bool:
         return False
     attributes.runtime_ns = round(_TURN_SECONDS * 1e9)
     return bool(kernel.syscall(set_, 0, ctypes.byref(attributes), 0) == 0)
+
+
+def open_many_files() -> None:
+    """Lets this process have as many files and connections open as the system allows, up to what a server can need.
+
+    By default that is 1024, for the sake of programs that use select(2). With all of them taken ZeroMQ lets nobody in
+    any more, without a word, or ends the process when a local worker connects.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        with suppress(OSError, ValueError):  # a system may allow fewer than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def usable_cores() -> int:

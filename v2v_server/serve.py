@@ -22,7 +22,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.dispatcher import Dispatcher
 from v2v_server.instructions import GiveUp, Instruction, LookFor, Record
 from v2v_server.pool import Pool
-from v2v_server.process import keep_freed_memory, usable_cores
+from v2v_server.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.progress import catalogue_progress
 from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.sequences import SequenceTable
@@ -60,6 +60,7 @@ def serve(config: ServeConfig) -> None:
         WorkerCrashLoop: the workers die without finishing anything.
     """
     keep_freed_memory()
+    open_many_files()
     catalogue = load_catalogue(config)
     for note in catalogue.notes:
         _say(note)

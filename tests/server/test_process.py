@@ -12,7 +12,8 @@ import pytest
 from v2v_protocol.errors import CorpusError
 from v2v_server import prepare_cli, process
 from v2v_server.config import ServeConfig
-from v2v_server.serve import load_catalogue
+from v2v_server.serve import load_catalogue, serve
+from v2v_server.video.catalogue import Catalogue
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 
@@ -53,6 +54,30 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
     assert process.usable_cores() == 64
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert process.usable_cores() == 1
+
+
+def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = _in_a_process(
+        "import resource\n"
+        "from v2v_server.process import open_many_files\n"
+        "hard = min(resource.getrlimit(resource.RLIMIT_NOFILE)[1], 5000)\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (64, hard))\n"
+        "open_many_files()\n"
+        "print(hard, *resource.getrlimit(resource.RLIMIT_NOFILE))\n"
+    )
+    assert len(said) == 3
+    assert len(set(said)) == 1
+    done: list[str] = []
+
+    def load(config: ServeConfig) -> Catalogue:
+        raise CorpusError("seen enough")
+
+    monkeypatch.setattr("v2v_server.serve.keep_freed_memory", lambda: done.append("memory"))
+    monkeypatch.setattr("v2v_server.serve.open_many_files", lambda: done.append("files"))
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", load)
+    with pytest.raises(CorpusError):
+        serve(ServeConfig(videos="videos"))
+    assert done == ["memory", "files"]
 
 
 def test_long_turns_leave_niceness_and_policy_alone() -> None:
