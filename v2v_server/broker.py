@@ -28,6 +28,7 @@ MOST_QUEUED = 512
 _TICK_SECONDS = 0.1
 _LONGEST_TURN_SECONDS = 1.0
 """Of the loop; what goes beyond is time in which nobody was listened to."""
+_KEEPALIVE_SECONDS = 300
 # Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -65,6 +66,10 @@ class Broker:
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        # A host that vanishes (pre-empted, unplugged) says no farewell, and nothing is said to it that would show it:
+        # the system asks, or its connection would stay open as long as this process lives.
+        router.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
         try:
             router.bind(address)
         except zmq.ZMQError as error:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from tests.waiting import until
 from v2v_protocol.messages import Pong, Stop
 from v2v_protocol.wire import encode
 from v2v_server import broker as broker_module
@@ -113,6 +116,26 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool)
     """How a process of ours ended says whether the sample is to blame; that it is not there any more does not."""
     told = carried(Scripted([ToWorker(b"w", encode(Stop()))]), frozenset({b"w"} if watched else ()))
     assert told == ([] if watched else [("unreachable", b"w")])
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="Linux only")
+def test_the_system_looks_after_connections_on_which_nothing_is_said() -> None:
+    """A host that lost power closes none of them."""
+    broker = Broker("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    try:
+        for address in (broker.address, broker.worker_address):
+            with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as peer:
+                peer.recv(1)  # ZeroMQ's greeting: it has taken the connection
+                until(lambda: _keepalive_is_due(peer))
+    finally:
+        broker.close()
+
+
+def _keepalive_is_due(peer: socket.socket) -> bool:
+    """Whether the other end of a connection, which is idle, waits to send a probe: proc_net_tcp(5), timer 2."""
+    ends = [f"0100007F:{port:04X}" for _, port in (peer.getpeername(), peer.getsockname())]
+    rows = (line.split() for line in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines())
+    return any(row[1:3] == ends and row[5].startswith("02:") for row in rows)
 
 
 def test_a_farewell_to_nobody_is_no_error() -> None:
