@@ -32,7 +32,7 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 @dataclass(frozen=True, slots=True)
 class Death:
-    """A worker process that ended without being asked to."""
+    """A worker process that ended without being asked to, or that the system did not start."""
 
     identity: bytes
     loss: Loss
@@ -103,22 +103,36 @@ class Pool:
             if slot.process is not None and slot.process.poll() is not None:
                 at = None if slot.logbook is None else slot.logbook.lease()
                 death = Death(slot.identity, replace(self._post_mortem(slot.process.returncode), lease=at))
-                self._deaths_in_a_row += 1
-                if self._deaths_in_a_row > self.crash_budget:
-                    raise WorkerCrashLoop(
-                        f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
-                        f"{self.crash_budget}); the last one {death.loss.text}. What they printed is above; "
-                        f"`v2v-simulate` on one of the videos shows the same in one process"
-                    )
-                # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
-                doublings = min(self._deaths_in_a_row - 1, 16)
-                delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
-                slot.process, slot.start_at = None, now + delay
+                self._put_off(slot, death, now)
                 if not slot.given_up:
                     deaths.append(death)
             if slot.process is None and now >= slot.start_at:
-                self._start(number, slot)
+                try:
+                    self._start(number, slot)
+                except OSError as error:
+                    # Too many processes, or no memory for one more: that passes, and must not end those that run.
+                    text = f"could not be started: {error.strerror or error}"
+                    deaths.append(Death(slot.identity, Loss(Cause.KILLED, text)))
+                    self._put_off(slot, deaths[-1], now)
         return deaths
+
+    def _put_off(self, slot: _Slot, death: Death, now: float) -> None:
+        """Lets some time pass before the next process of a slot.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        self._deaths_in_a_row += 1
+        if self._deaths_in_a_row > self.crash_budget:
+            raise WorkerCrashLoop(
+                f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
+                f"{self.crash_budget}); the last one {death.loss.text}. What they printed is above; "
+                f"`v2v-simulate` on one of the videos shows the same in one process"
+            )
+        # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
+        doublings = min(self._deaths_in_a_row - 1, 16)
+        delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
+        slot.process, slot.start_at = None, now + delay
 
     def give_up(self, identity: bytes, reason: str) -> Loss | None:
         """Kills a worker that hangs.
@@ -175,6 +189,7 @@ class Pool:
         slot.identity = name.encode()
         if slot.logbook is not None:
             slot.logbook.close()
+            slot.logbook = None
         slot.logbook = Logbook()
         slot.process = subprocess.Popen(
             [*_command(self._address, self._root, name), "--logbook-fd", str(slot.logbook.descriptor)],

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -97,6 +99,49 @@ def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str],
     pool.check(0.0, 0)
     (pid,) = pool.pids()
     assert os.getpgid(pid) == pid != os.getpgid(0)
+
+
+def test_a_process_that_the_system_does_not_start_is_tried_again(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has no memory, process or file left for it; those that run go on."""
+    pool = start(2, SLEEPS)
+    short = [False]
+    popen = subprocess.Popen
+
+    def spawn(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        if short[0]:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        return popen(*arguments, **options)
+
+    monkeypatch.setattr(subprocess, "Popen", spawn)
+    assert pool.check(0.0, 0) == []
+    os.kill(pool.pids()[0], signal.SIGKILL)
+    until(lambda: pool.running == 1)
+    short[0] = True
+    assert [death.identity for death in pool.check(1.0, 0)] == [b"label-0.1"]
+    lost = Death(b"label-0.2", Loss(Cause.KILLED, "could not be started: Resource temporarily unavailable"))
+    assert pool.check(2.0, 0) == [lost]
+    assert not pool.watches(b"label-0.2")
+    short[0] = False
+    assert pool.check(2.3, 0) == []  # two deaths in a row: 0.4 s
+    assert pool.running == 1
+    assert pool.check(2.5, 0) == []
+    assert pool.running == 2
+
+
+def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **options: Any) -> subprocess.Popen[bytes]:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "/gone/python")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    pool = start(1, SLEEPS)
+    for now in range(pool.crash_budget):
+        assert len(pool.check(100.0 * now, 0)) == 1
+    with pytest.raises(WorkerCrashLoop, match="could not be started: No such file or directory"):
+        pool.check(1e6, 0)
 
 
 @pytest.mark.parametrize(
