@@ -26,6 +26,7 @@ from v2v_protocol.errors import (
     ProtocolError,
     RemoteError,
     UsageError,
+    VersionMismatch,
     VideoChanged,
     VideoError,
     VideoUnreadable,
@@ -117,7 +118,8 @@ class Worker:
         """Works until told to stop.
 
         Raises:
-            RemoteError: the server refuses this worker (another version).
+            RemoteError: the server refuses this worker (another numerics version).
+            VersionMismatch: the server speaks another version of the protocol.
         """
         try:
             self._say_hello()
@@ -156,6 +158,8 @@ class Worker:
             first, *_ = self._socket.recv_multipart()
             try:
                 self._handle(decode(first))
+            except VersionMismatch:
+                raise  # a refusal, in words that only its own version understands
             except ProtocolError as error:
                 print(f"{self._name}: ignored a message from the server: {error}", file=sys.stderr)
 
@@ -292,7 +296,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     Raises:
         CorpusError: the folder is missing.
         UsageError: the address cannot be connected to.
-        RemoteError: the server refuses this worker.
+        RemoteError, VersionMismatch: the server refuses this worker.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)

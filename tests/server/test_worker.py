@@ -13,11 +13,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgpack
 import pytest
 import zmq
 
 from tests.protocol.wire_messages import example
-from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.errors import VersionMismatch, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -239,6 +241,19 @@ def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(tmp_p
             said.append(decode(router.recv_multipart()[1]))
         worker._context.destroy(linger=0)
     assert said == [Ping()] * 9 + [Goodbye()]  # after 1, 2, 4, 8, 16, 32, 64, 128 and 192
+
+
+def test_a_server_of_another_version_ends_the_worker(tmp_path: Path) -> None:
+    """It says so in its own version, which is no message to ours; to ask it again every five seconds is no use."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        router.setsockopt(zmq.LINGER, 0)
+        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+        worker._say_hello()
+        name, _ = router.recv_multipart()
+        refusal = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "refused", "code": "version", "text": "", "more": 0})
+        router.send_multipart([name, refusal])
+        with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
+            worker.run()
 
 
 def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
