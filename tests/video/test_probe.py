@@ -140,3 +140,10 @@ def test_one_frame(tmp_path: Path) -> None:
     facts = probe(write_clip(tmp_path / "clip.mp4", panned_luma(1)))
     assert facts.frames == 1
     assert facts.frames_per_second == pytest.approx(25)
+
+
+def test_a_name_that_looks_like_an_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the path of a worker has it that was started with ``--videos .``; the server's paths are absolute."""
+    write_clip(tmp_path / "12:30.mp4", panned_luma(5))
+    monkeypatch.chdir(tmp_path)
+    assert probe(Path("12:30.mp4")).frames == 5

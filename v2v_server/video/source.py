@@ -38,7 +38,8 @@ def opened(
     """
     name = os.fspath(path)
     try:
-        container = av.open(name, "r")
+        # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one.
+        container = av.open(os.path.abspath(name), "r")
     except (av.FFmpegError, OSError) as error:
         raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
     except UnicodeError as error:
