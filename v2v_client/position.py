@@ -47,6 +47,7 @@ class Iteration:
         state: where in it; None at its beginning.
         loader: None where no loader worker iterates.
         done: batches of the loader worker's share that were delivered before.
+        beginnings: how often an epoch had been set or begun until then; of no use with a loader worker.
     """
 
     number: int
@@ -54,6 +55,7 @@ class Iteration:
     state: ResumeState | None
     loader: Loader | None = None
     done: int = _NO_BATCH_YET
+    beginnings: int = 0
 
     @property
     def workers(self) -> int:
@@ -215,7 +217,7 @@ class Position:
             self._progress.main()
             standing = self.standing()
             self._here = standing.state or consumer.beginning(standing.stream, standing.epoch)
-            return Iteration(self._iterations, standing.epoch, standing.state)
+            return Iteration(self._iterations, standing.epoch, standing.state, beginnings=standing.beginnings)
         name = self._name(worker)
         number, epoch, state = self._progress.start(name, worker.id)
         loader = Loader(worker.id, worker.num_workers, name, number)
@@ -262,7 +264,8 @@ class Position:
             return
         loader = begun.loader
         if loader is None:
-            self._progress.set(begun.epoch + 1, None)
+            if self.standing().beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
+                self._progress.set(begun.epoch + 1, None)
             self._here = None
         else:
             self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers)

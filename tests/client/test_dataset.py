@@ -261,6 +261,23 @@ def test_leaving_early_and_iterating_again_repeats_the_epoch(server):
     server.until_all_left()
 
 
+@pytest.mark.parametrize("loaded", [False, True])
+def test_an_epoch_that_is_set_while_another_is_read_to_its_end_is_the_next(server, loaded):
+    """As a trainer does that says at the last batch which epoch follows, or reads ahead in a thread."""
+    stream = dataset(server)
+    batches = iter(stream)
+    state = next(batches).resume_state
+    if loaded:
+        stream.load_state_dict({**state, "epoch": 5})
+    else:
+        stream.set_epoch(5)
+    list(batches)
+    assert stream.epoch == 5
+    assert stream.state_dict()["epoch"] == 5
+    assert places(stream) == epoch_places(5, 4 if loaded else 0)
+    assert stream.epoch == 6
+
+
 def test_an_epoch_without_a_whole_global_batch_is_refused(server):
     with pytest.raises(UsageError, match="23 sequences"):
         list(dataset(server, batch_size=12, rank=0, world_size=2))
