@@ -23,10 +23,9 @@ import fcntl
 import json
 import os
 import tempfile
-import uuid
 import weakref
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from multiprocessing.context import get_spawning_popen
 from multiprocessing.reduction import DupFd
 from typing import Any
@@ -64,7 +63,8 @@ class Standing:
             case "set":
                 if line["token"] in self.tokens:
                     return  # every loader worker loads its own copy of what is one event
-                self.tokens.add(line["token"])
+                if line["token"] is not None:
+                    self.tokens.add(line["token"])
                 self._begin(line["epoch"], line["state"])
                 self.stale = self.stale and line["keeps_stale"]
             case "main":
@@ -85,6 +85,17 @@ class Standing:
                         self._begin(self.epoch + 1, None)
             case "stream":
                 self.stream = self.stream or Stream(**line["stream"])
+
+    def copy(self) -> Standing:
+        """One of its own, to be gone on with."""
+        return replace(
+            self,
+            tokens=set(self.tokens),
+            starts=dict(self.starts),
+            decisions=dict(self.decisions),
+            decided_after=dict(self.decided_after),
+            finished={iteration: set(workers) for iteration, workers in self.finished.items()},
+        )
 
     def _begin(self, epoch: int, state: Mapping[str, Any] | None) -> None:
         self.beginnings += 1
@@ -114,12 +125,13 @@ class Progress:
 
     def _adopt(self, descriptor: int) -> None:
         self._descriptor = descriptor
+        self._known = 0, Standing()  # bytes of the log, and what they say
         weakref.finalize(self, os.close, descriptor)
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:
             return {"descriptor": DupFd(self._descriptor)}
-        return {"lines": list(self._lines())}
+        return {"lines": self._lines(0)[0]}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         if "descriptor" in state:
@@ -130,10 +142,14 @@ class Progress:
             self._append(**line)
 
     def standing(self) -> Standing:
-        """What the log says now."""
-        standing = Standing()
-        for line in self._lines():
-            standing.apply(line)
+        """What the log says now. Only what is new is read: a week may have a hundred thousand epochs."""
+        end, standing = self._known
+        lines, end = self._lines(end)
+        if lines:
+            standing = standing.copy()  # whoever asked before, in another thread perhaps, has the old one
+            for line in lines:
+                standing.apply(line)
+            self._known = end, standing
         return standing
 
     def set(self, epoch: int, state: ResumeState | None, *, iteration: str | None = None) -> None:
@@ -143,8 +159,7 @@ class Progress:
             iteration: given by loader workers that all load the same state: counts once.
         """
         plain = None if state is None else state.to_dict()
-        token = iteration or uuid.uuid4().hex
-        self._append(kind="set", token=token, epoch=epoch, state=plain, keeps_stale=iteration is not None)
+        self._append(kind="set", token=iteration, epoch=epoch, state=plain, keeps_stale=iteration is not None)
 
     def main(self) -> None:
         """The process that owns the dataset iterates by itself."""
@@ -169,10 +184,11 @@ class Progress:
     def _append(self, **line: Any) -> None:
         os.write(self._descriptor, json.dumps(line).encode() + b"\n")
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def _lines(self, start: int) -> tuple[list[dict[str, Any]], int]:
+        """The whole lines from a byte on, and the byte after them."""
         # The offset of the descriptor is everybody's, so it is not used.
         content = b""
-        while piece := os.pread(self._descriptor, _READ_BYTES, len(content)):
+        while piece := os.pread(self._descriptor, _READ_BYTES, start + len(content)):
             content += piece
-        for line in content.split(b"\n")[:-1]:  # what has no end yet is still being written
-            yield json.loads(line)
+        whole = content[: content.rfind(b"\n") + 1]  # what has no end yet is still being written
+        return [json.loads(line) for line in whole.splitlines()], start + len(whole)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import pickle
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
+from v2v_client import progress as progress_module
 from v2v_client.progress import Progress
 from v2v_client.state import ResumeState
 
@@ -43,3 +50,28 @@ def test_workers_that_finish_what_was_left_early_do_not_end_the_epoch_that_was_s
         progress.finish("again", 1, worker, len(WORKERS))
     standing = progress.standing()
     assert (standing.epoch, standing.state) == (4, None)
+
+
+def test_an_epoch_takes_no_longer_for_all_that_went_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small corpus has a hundred thousand of them in a week."""
+    read: list[bytes] = []
+    monkeypatch.setattr(progress_module, "json", SimpleNamespace(dumps=json.dumps, loads=_counted(read)))
+    progress = Progress(0)
+    before = progress.standing()
+    for epoch in range(1, 51):
+        progress.main()
+        progress.start(f"iteration {epoch}", 0)
+        progress.set(epoch, None)
+        assert progress.standing().epoch == epoch
+    assert len(read) == 1 + 3 * 50
+    assert (before.epoch, before.starts) == (0, {})
+    assert not progress.standing().tokens
+    assert pickle.loads(pickle.dumps(progress)).standing() == progress.standing()
+
+
+def _counted(read: list[bytes]) -> Callable[[bytes], Any]:
+    def loads(text: bytes) -> Any:
+        read.append(text)
+        return json.loads(text)
+
+    return loads
