@@ -42,6 +42,7 @@ class Link:
         self._routing_id = b""
         self._sockets = 0
         self._handshakes = 0
+        self._ipv6 = "[" in address
         self._torn = False
 
     def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
@@ -49,11 +50,15 @@ class Link:
 
         Args:
             largest_frame_bytes: a peer that sends a larger frame is cut off before it is received.
-            keep_name: take the routing id of the socket before, so that the server goes on with its session.
+            keep_name: take the routing id of the socket before, so that the server goes on with its session. If that
+                socket never connected, another kind of address is tried.
 
         Raises:
             UsageError: the address is not understood.
         """
+        if keep_name and self._monitor is not None and not self._shaken_hands():
+            # Of a name that stands for addresses of both kinds ("localhost", as a rule) ZeroMQ tries the first only.
+            self._ipv6 = "[" in self._address or not self._ipv6
         self.disconnect(linger_ms=0)
         if not keep_name:
             self._routing_id = b"\x01" + os.urandom(15)  # a first byte of 0 is ZeroMQ's own
@@ -63,7 +68,7 @@ class Link:
             socket.setsockopt(zmq.LINGER, 0)
             socket.setsockopt(zmq.RCVHWM, 0)
             socket.setsockopt(zmq.SNDHWM, 0)
-            socket.setsockopt(zmq.IPV6, 1)
+            socket.setsockopt(zmq.IPV6, int(self._ipv6))
             socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
             socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
@@ -138,12 +143,16 @@ class Link:
     def remade(self) -> bool:
         """Whether ZeroMQ has connected again since the last call. To be asked when nothing is left to receive, or what
         came before the cut would be taken for lost."""
-        monitor = self._open(self._monitor)
         before = self._handshakes
+        return self._shaken_hands() > max(1, before)
+
+    def _shaken_hands(self) -> int:
+        """How often the socket has connected."""
+        monitor = self._open(self._monitor)
         while monitor.poll(0):
             monitor.recv_multipart(flags=zmq.NOBLOCK)
             self._handshakes += 1
-        return self._handshakes > max(1, before)
+        return self._handshakes
 
     def _open(self, socket: zmq.Socket[bytes] | None) -> zmq.Socket[bytes]:
         if socket is None:

@@ -89,6 +89,30 @@ def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypa
         assert _next(connection) == 0
 
 
+@pytest.mark.parametrize(
+    ("address", "kinds"),
+    [("tcp://localhost:1", [0, 1, 0]), ("tcp://127.0.0.1:1", [0, 1, 0]), ("tcp://[::1]:1", [1] * 3)],
+)
+def test_a_name_is_tried_as_an_ipv4_address_and_then_in_turn(address: str, kinds: list[int]) -> None:
+    """Most hosts have "localhost" in both kinds, and a server listens on 127.0.0.1."""
+    found = []
+    with closing(link.Link(address)) as tried:
+        for _ in kinds:
+            tried.connect(1 << 20, keep_name=bool(found))
+            assert tried._socket is not None
+            found.append(tried._socket.getsockopt(zmq.IPV6))
+    assert found == kinds
+
+
+def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeServer) -> None:
+    with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
+        connection.open()
+        made_anew = connection._open_link()
+        made_anew.connect(1 << 20, keep_name=True)
+        assert made_anew._socket is not None
+        assert made_anew._socket.getsockopt(zmq.IPV6) == 0
+
+
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("which", [1, 2])
 def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
