@@ -59,6 +59,8 @@ _PING_SECONDS = 5.0
 _MOST_SILENCES = 64
 """Of so many seconds each, until a silent server is asked again; before that, after 1, 2, 4, 8 ... of them. ZeroMQ
 keeps what is said to a server that is away, which hears all of it when it is back."""
+_TOLD_SILENCES = 4
+"""Until whoever started a worker is told that its server does not answer."""
 _TOGETHER_SECONDS = 0.1
 """What is done waits for a sibling if less time than this has gone by since the first of them was begun. Not since it
 was done: where samples take long the server's clocks, which run from result to result, must see each of them."""
@@ -82,6 +84,7 @@ class Worker:
 
     def __init__(self, name: str, root: Path, address: str, logbook: int | None = None) -> None:
         self._name = name
+        self._address = address
         self._logbook = logbook
         self._clips = Clips(root)
         self._leases: deque[Lease] = deque()
@@ -152,6 +155,9 @@ class Worker:
             self._silences += 1
             if self._silences.bit_count() == 1 or self._silences % _MOST_SILENCES == 0:
                 self._send(encode(Ping()))
+            if self._silences == _TOLD_SILENCES and self._logbook is None:  # of its own workers a server knows
+                seconds = _TOLD_SILENCES * _PING_SECONDS
+                print(f"{self._name}: {self._address} has not answered for {seconds:g} s; waiting", file=sys.stderr)
             return
         while self._poller.poll(0):
             self._silences = 0

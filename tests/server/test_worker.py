@@ -228,10 +228,13 @@ def test_a_server_that_knows_us_no_more_is_greeted_once_whatever_it_refuses(serv
     assert isinstance(server.heard(), WorkerHello)
 
 
-def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(tmp_path: Path) -> None:
+def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
         router.setsockopt(zmq.LINGER, 0)
-        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+        address = f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}"
+        worker = Worker("w", tmp_path, address)
         for _ in range(200):
             worker._receive(0.001)
         worker._send(encode(Goodbye()))
@@ -241,6 +244,7 @@ def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(tmp_p
             said.append(decode(router.recv_multipart()[1]))
         worker._context.destroy(linger=0)
     assert said == [Ping()] * 9 + [Goodbye()]  # after 1, 2, 4, 8, 16, 32, 64, 128 and 192
+    assert capsys.readouterr().err == f"w: {address} has not answered for 20 s; waiting\n"
 
 
 def test_a_server_of_another_version_ends_the_worker(tmp_path: Path) -> None:
