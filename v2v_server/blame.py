@@ -1,8 +1,9 @@
 """Blame: what the death of a worker says about the sample it was at. Pure.
 
     crashed, hung                the sample did it: its candidate is refused at once, and the verdict is written down
-    unexplained                  an exception, no memory, a lost connection: the sample is tried again; after two such
-                                 deaths it runs alone on its worker, and a third death counts like a crash
+    unexplained                  an exception, no memory, a lost connection, storage that does not answer: the sample is
+                                 tried again; after two such deaths it runs alone on its worker, and a third death
+                                 counts like a crash
     killed                       from outside (pre-emption, an impatient operator): says nothing about any sample
 
 Only the lease that the worker had begun is judged; those queued behind it go back as they were.

@@ -143,11 +143,15 @@ class Pool:
         for slot in self._slots:
             if slot.identity == identity and slot.process is not None:
                 slot.given_up = True
-                stopped = _is_stopped(slot.process.pid)
+                status = _status(slot.process.pid)
                 slot.process.kill()
-                if stopped:
+                if status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
                     return Loss(Cause.KILLED, "was stopped from outside and killed")
-                return Loss(Cause.HUNG, reason, None if slot.logbook is None else slot.logbook.lease())
+                at = None if slot.logbook is None else slot.logbook.lease()
+                if status == psutil.STATUS_DISK_SLEEP:
+                    # A network file system whose server is away holds every worker at whatever clip it has.
+                    return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at)
+                return Loss(Cause.HUNG, reason, at)
         return None
 
     def _post_mortem(self, returncode: int) -> Loss:
@@ -209,12 +213,12 @@ def _command(address: str, root: Path, name: str) -> list[str]:
     ]
 
 
-def _is_stopped(pid: int) -> bool:
-    """Whether somebody sent it SIGSTOP, or a debugger holds it."""
+def _status(pid: int) -> str:
+    """What a process is at, in psutil's words: stopped, also by a debugger, or in the kernel, waiting for a disk ..."""
     try:
-        return psutil.Process(pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+        return str(psutil.Process(pid).status())
     except psutil.NoSuchProcess:
-        return False
+        return psutil.STATUS_DEAD
 
 
 def _out_of_memory_kills() -> int:

@@ -242,6 +242,18 @@ def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int,
     all_dead(pool)
 
 
+def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All workers of a host wait then, each at a sound clip."""
+    pool = start(1, SLEEPS)
+    pool.check(0.0, 0)
+    monkeypatch.setattr(psutil.Process, "status", lambda self: psutil.STATUS_DISK_SLEEP)
+    expected = Loss(Cause.UNEXPLAINED, "waited for its storage and gave no answer for 60 s")
+    assert pool.give_up(b"label-0.1", "gave no answer for 60 s") == expected
+    all_dead(pool)
+
+
 # --- restarting -------------------------------------------------------------------------------------------------------
 
 
