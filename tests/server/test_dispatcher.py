@@ -236,6 +236,18 @@ def test_credit_follows_batch_size_workers_and_bytes() -> None:
     assert peers(max_credit_bytes=sample_bytes).hello(batch_size=12).credit == 1
 
 
+def test_credit_counts_workers_that_are_still_starting() -> None:
+    """A server is ready with its first worker, and the credit of whoever connects then holds for an epoch."""
+    at = peers(local_workers=20)
+    assert at.hello(batch_size=12).credit == 40
+    for number in range(3):
+        at.join(b"w%d" % number)
+    assert at.hello(batch_size=12).credit == 40
+    for number in range(25):
+        at.join(b"elsewhere %d" % number)
+    assert at.hello(batch_size=12).credit == 56
+
+
 def test_a_sample_that_the_credit_cannot_hold_is_refused_with_both_numbers() -> None:
     at = peers(max_credit_bytes=255)
     text = refused(at.consumer_says(b"c", Hello({}, ("voxels",), 1, 0)), ErrorCode.SPEC)
