@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.convert.archive import Archive
-from trainer.convert.items import Item, Options, Picture, Progress, seconds_to_ns
+from trainer.convert.items import Item, Options, Picture, Progress, to_ns
 from trainer.convert.text_events import read_text_events
 from v2v_protocol.errors import UsageError
 
@@ -92,5 +92,5 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
         member = folder + parts[1].strip()
         if member not in archive.bytes_of:
             raise UsageError(f"{archive.path}: {listing}, line {number} names {parts[1].strip()}, which is not there")
-        pictures.append((int(seconds_to_ns(np.float64(seconds))), member))  # type: ignore[arg-type]
+        pictures.append((int(to_ns(np.array([seconds]), f"{archive.path}: {listing}, line {number}")[0]), member))
     return pictures

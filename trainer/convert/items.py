@@ -99,6 +99,21 @@ class Options:
     images_topic: str | None = None
 
 
-def seconds_to_ns(seconds: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """float64 seconds -> int64 nanoseconds, to the nearest."""
-    return np.rint(seconds * 1e9).astype(np.int64)
+LARGEST_NS = 2.0**63
+
+
+def to_ns(times: npt.NDArray[np.float64], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
+    """float64 times, in seconds unless ``ns_per_unit`` says otherwise -> int64 nanoseconds, to the nearest.
+
+    Raises:
+        UsageError: a time that int64 cannot hold, so one of another unit, or no number; ``where`` begins the message.
+    """
+    ns = np.rint(times * ns_per_unit)
+    held = np.abs(ns) < LARGEST_NS
+    if not held.all():
+        # A cast would make the same number of all of them.
+        raise UsageError(
+            f"{where}: a time of {ns[~held][0] * 1e-9:.10g} s, which no recording has; --time-unit gives the unit of "
+            "text files"
+        )
+    return ns.astype(np.int64)

@@ -16,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize, seconds_to_ns
+from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
 
 READ_EVENTS = 1 << 18
@@ -59,7 +59,7 @@ def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Itera
     for start in range(0, len(events), READ_EVENTS):
         rows = events[start : start + READ_EVENTS]
         yield EventChunk(
-            seconds_to_ns(rows[:, 2]), rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 3] > 0
+            to_ns(rows[:, 2], str(path)), rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 3] > 0
         )
         done += rows.nbytes
         progress(done, total)
@@ -68,7 +68,7 @@ def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Itera
     times, nearest = group["image_raw_ts"][:], group.get("image_raw_event_inds")
     if len(times) != len(pictures) or (nearest is not None and len(nearest) != len(pictures)):
         raise UsageError(f"{path}: {len(pictures)} pictures, but {len(times)} times in image_raw_ts")
-    for index, t_ns in enumerate(seconds_to_ns(times)):
+    for index, t_ns in enumerate(to_ns(times, str(path))):
         pixels = pictures[index]
         yield Picture(int(t_ns), pixels, None if nearest is None else max(0, int(nearest[index])))
         done += pixels.nbytes

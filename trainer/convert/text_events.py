@@ -9,7 +9,7 @@ from typing import IO
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import EventChunk, SensorSize
+from trainer.convert.items import EventChunk, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
 
 BLOCK_BYTES = 1 << 22
@@ -31,7 +31,8 @@ def read_text_events(
         advance: called with the bytes of each block.
 
     Raises:
-        UsageError: a line that is not four numbers; the message gives its number and text.
+        UsageError: a line that is not four numbers (the message gives its number and text), or times that are in
+            another unit.
     """
     if time_unit is not None and time_unit not in NS_PER_UNIT:
         raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
@@ -76,9 +77,7 @@ def _chunk(block: bytes, name: str, lines_before: int, time_unit: str | None) ->
     if values is None:
         raise UsageError(_first_bad_line(block, name, lines_before))
     t, x, y, p = values.T
-    yield EventChunk(
-        np.rint(t * NS_PER_UNIT[time_unit or "us"]).astype(np.int64), x.astype(np.int32), y.astype(np.int32), p > 0
-    )
+    yield EventChunk(to_ns(t, name, NS_PER_UNIT[time_unit or "us"]), x.astype(np.int32), y.astype(np.int32), p > 0)
 
 
 def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:

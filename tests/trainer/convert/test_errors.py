@@ -86,6 +86,15 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: ijrr(path, events=b"0.1 1 2 1\nnan 1 2 0\n"), r"line 2: 'nan 1 2 0' is not"),
         (lambda path: ijrr(path, events=b"a b\n0.2 1 2 1\n"), r"the first line is b'a b'"),
         (lambda path: ijrr(path, events=b""), "holds no events"),
+        (
+            lambda path: ijrr(path, events=b"1468939993067416.0 1 2 1\n"),
+            r"events.txt: a time of 1.468939993e\+15 s.*--time-unit",
+        ),
+        (lambda path: ijrr(path, events=b"1468939993067416019 1 2 1\n"), r"a time of 1.468939993e\+12 s"),
+        (
+            lambda path: ijrr(path, images=b"1e15 images/frame_00000000.png\n"),
+            r"images.txt, line 1: a time of 1e\+15 s",
+        ),
         (lambda path: ijrr(path, frame=None), r"line 3 names images/frame_00000002.png, which is not there"),
         (lambda path: ijrr(path, frame=b"no picture"), r"frame_00000002.png is no picture"),
         (lambda path: ijrr(path, images=b"one two three\n"), r"line 1: 'one two three' is not `seconds path`"),
@@ -95,6 +104,7 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: evaid(path, shape=b"20 18"), r"the sensor is SensorSize\(width=20"),
         (lambda path: mvsec(path, events=np.zeros((4, 3))), r"is \[4, 3\], not \[N, 4\]"),
         (lambda path: mvsec(path, image_raw_ts=np.zeros(2)), "5 pictures, but 2 times"),
+        (lambda path: mvsec(path, image_raw_ts=np.full(5, np.nan)), "a time of nan s"),
         (lambda path: mvsec(path, image_raw=np.zeros((5, 18, 24))), "not uint8"),
         (short_bag, "the bag cannot be read"),
         (short_aedat4, "cannot be decoded"),
