@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from typing import IO
@@ -14,6 +15,8 @@ from v2v_protocol.errors import UsageError
 
 BLOCK_BYTES = 1 << 22
 NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
+TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
+"""A line whose first number has a point or, without one, a negative exponent (1e-06)."""
 
 
 def read_text_events(
@@ -27,7 +30,8 @@ def read_text_events(
     Args:
         stream: of the file's bytes; read in blocks of 4 MiB.
         name: of the file, for messages.
-        time_unit: "s", "us" or "ns"; None takes seconds where the first time has a point or an exponent, else us.
+        time_unit: "s", "us" or "ns"; None takes seconds where a time of the first block has a point, else us. Not the
+            first time alone: ``%g`` writes 0 and 1e-06.
         advance: called with the bytes of each block.
 
     Raises:
@@ -63,11 +67,10 @@ def _sensor_size(line: bytes, name: str) -> SensorSize:
 
 
 def _time_unit(block: bytes) -> str | None:
-    """Of the first event in a block; None where there is none."""
-    first = block.split(None, 1)[:1]
-    if not first:
+    """Of the events in a block; None where there is none."""
+    if not block.strip():
         return None
-    return "s" if set(first[0].lower()) & set(b".e") else "us"
+    return "s" if TIME_WITH_A_FRACTION.search(block) else "us"
 
 
 def _chunk(block: bytes, name: str, lines_before: int, time_unit: str | None) -> Iterator[EventChunk]:

@@ -134,6 +134,8 @@ def test_text_units_and_header(tmp_path: Path) -> None:
     for text, unit, seconds in (
         ("5000000 1 2 1\n5000300 1 2 0\n", None, 300e-6),
         ("5.0 1 2 1\n5.0003 1 2 -1", None, 300e-6),
+        ("0 1 2 1\n0.0003 1 2 0\n", None, 300e-6),
+        ("0 1 2 1\n3e-04 1 2 0\n", None, 300e-6),
         ("5000000 1 2 1\n5000300 1 2 0\n", "ns", 300e-9),
         ("24 18\n\n5000000 1 2 1\n5000300 1 2 0\n\n", None, 300e-6),
     ):
