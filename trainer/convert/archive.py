@@ -47,9 +47,18 @@ class Archive:
             self._zip.close()
 
     def find(self, name: str) -> str | None:
-        """The member of this name in the outermost folder that has one."""
+        """The member of this name in the outermost folder that has one; None without any.
+
+        Raises:
+            UsageError: several folders of that depth have one, so these are several recordings.
+        """
         found = [member for member in self.bytes_of if member == name or member.endswith(f"/{name}")]
-        return min(found, key=lambda member: (member.count("/"), member), default=None)
+        depth = min((member.count("/") for member in found), default=0)
+        outermost = sorted(member for member in found if member.count("/") == depth)
+        if len(outermost) > 1:
+            folders = ", ".join(member.removesuffix(f"/{name}") for member in outermost[:3])
+            raise UsageError(f"{self.path} holds {len(outermost)} recordings ({folders}): give each by itself")
+        return outermost[0] if outermost else None
 
     @contextlib.contextmanager
     def open(self, member: str) -> Iterator[IO[bytes]]:

@@ -40,6 +40,12 @@ def evaid(path: Path, **changes: bytes) -> Path:
     return path / "ball.zip"
 
 
+def several(path: Path, members: dict[str, bytes]) -> Path:
+    for name in ("one", "two"):
+        raw_forms.write_folder(path / "all" / name, members)
+    return path / "all"
+
+
 def mvsec(path: Path, **datasets: np.ndarray) -> Path:
     raw_forms.write_mvsec(path / "fly_data.hdf5", scene())
     with h5py.File(path / "fly_data.hdf5", "a") as file:
@@ -98,6 +104,8 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: ijrr(path, frame=None), r"line 3 names images/frame_00000002.png, which is not there"),
         (lambda path: ijrr(path, frame=b"no picture"), r"frame_00000002.png is no picture"),
         (lambda path: ijrr(path, images=b"one two three\n"), r"line 1: 'one two three' is not `seconds path`"),
+        (lambda path: several(path, raw_forms.ijrr_members(scene())), r"holds 2 recordings \(one/slow, two/slow"),
+        (lambda path: several(path, raw_forms.evaid_members(scene())), r"holds 2 recordings \(one, two"),
         (lambda path: evaid(path, timestamps=b"1 2 3"), r"5 pictures in gt/, but 3 times"),
         (lambda path: evaid(path, timestamps=b"1 2 x"), r"something else than numbers"),
         (lambda path: evaid(path, shape=b"24"), r"shape.txt holds \[24\]"),
