@@ -65,15 +65,26 @@ class Archive:
         """A stream of its bytes.
 
         Raises:
-            UsageError: no such member, or it is damaged (on opening or while it is read).
+            UsageError: no such member, or it is damaged (on opening or while it is read), encrypted, or packed by a
+                method that Python has not.
         """
         if member not in self.bytes_of:
             raise UsageError(f"{self.path} has no {member}")
         try:
-            with (self.path / member).open("rb") if self._zip is None else self._zip.open(member) as stream:
+            with self._opened(member) as stream:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise UsageError(f"{self.path}: {member} cannot be read: {error}") from error
+
+    def _opened(self, member: str) -> IO[bytes]:
+        if self._zip is None:
+            return (self.path / member).open("rb")
+        try:
+            return self._zip.open(member)
+        except RuntimeError as error:  # encrypted, or packed by a method that Python has not: Deflate64 of Windows
+            raise UsageError(
+                f"{self.path}: {member} cannot be read: {error}; unpack it, and give the folder"
+            ) from error
 
     def picture(self, member: str) -> npt.NDArray[np.uint8]:
         """A PNG or JPEG as grey values, uint8 [H, W].

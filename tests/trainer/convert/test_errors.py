@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 import sys
 from pathlib import Path
 
@@ -38,6 +39,18 @@ def evaid(path: Path, **changes: bytes) -> Path:
     members = raw_forms.evaid_members(scene())
     raw_forms.write_zip(path / "ball.zip", members | {f"{name}.txt": text for name, text in changes.items()})
     return path / "ball.zip"
+
+
+def patched_zip(path: Path, *, flags: int = 0, method: int = 8) -> Path:
+    """The same bytes under other flags or another method, in both headers of every member."""
+    source = ijrr(path)
+    content = bytearray(source.read_bytes())
+    for signature, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        found = content.find(signature)
+        while found >= 0:
+            struct.pack_into("<HH", content, found + at, flags, method)
+            found = content.find(signature, found + 1)
+    return written(source, bytes(content))
 
 
 def several(path: Path, members: dict[str, bytes]) -> Path:
@@ -86,6 +99,8 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: written(path / "a.bin", b"nothing"), "is no recording that can be read.*--form"),
         (lambda path: written(path / "a.zip", b"nothing"), "neither a folder nor a whole zip"),
         (lambda path: cut_short(ijrr(path), 0.6), "neither a folder nor a whole zip"),
+        (lambda path: patched_zip(path, method=9), "images.txt cannot be read: That compression method.*unpack it"),
+        (lambda path: patched_zip(path, flags=1), "images.txt cannot be read: .*encrypted.*unpack it"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2\n"), r"line 2: '0.2 1 2' is not `t x y p`"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2 2\n"), r"line 2: '0.2 1 2 2' is not `t x y p`"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 x 0\n"), r"line 2: '0.2 1 x 0' is not"),
