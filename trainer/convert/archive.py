@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import posixpath
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -31,13 +32,15 @@ class Archive:
         self._zip: zipfile.ZipFile | None = None
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
-            self.bytes_of = {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
+            self.bytes_of = _recorded({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
             return
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
             raise UsageError(f"{path} is neither a folder nor a whole zip file: {error}") from error
-        self.bytes_of = {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
+        self.bytes_of = _recorded(
+            {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
+        )
 
     def __enter__(self) -> Archive:
         return self
@@ -98,3 +101,8 @@ class Archive:
         if pixels is None:
             raise UsageError(f"{self.path}: {member} is no picture that can be read")
         return np.asarray(pixels, np.uint8)
+
+
+def _recorded(bytes_of: dict[str, int]) -> dict[str, int]:
+    """Without the ``._name`` that macOS puts beside each file, in zips (under ``__MACOSX``) and on foreign disks."""
+    return {member: size for member, size in bytes_of.items() if not posixpath.basename(member).startswith("._")}

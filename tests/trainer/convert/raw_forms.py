@@ -42,6 +42,12 @@ def evaid_members(scene: Scene) -> dict[str, bytes]:
     return members | {f"gt/{i}.png": png(pixels) for i, pixels in enumerate(scene.pictures)}
 
 
+def with_macos_notes(members: dict[str, bytes]) -> dict[str, bytes]:
+    """As the Finder packs: what its file system knows of each file lies beside, in files of the same ending."""
+    notes = {f"__MACOSX/{Path(name).parent / f'._{Path(name).name}'}": b"\0\5\x16\7" for name in members}
+    return members | notes
+
+
 def write_zip(path: Path, members: dict[str, bytes]) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():

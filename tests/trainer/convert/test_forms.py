@@ -25,6 +25,11 @@ WITH_PICTURES: dict[str, tuple[str, str, Write]] = {
     "ijrr zip": ("ijrr", "slow.zip", lambda path, s: raw_forms.write_zip(path, raw_forms.ijrr_members(s))),
     "ijrr folder": ("ijrr", "slow", lambda path, s: raw_forms.write_folder(path, raw_forms.ijrr_members(s))),
     "evaid zip": ("evaid", "ball.zip", lambda path, s: raw_forms.write_zip(path, raw_forms.evaid_members(s))),
+    "evaid zip of macOS": (
+        "evaid",
+        "ball.zip",
+        lambda path, s: raw_forms.write_zip(path, raw_forms.with_macos_notes(raw_forms.evaid_members(s))),
+    ),
     "evaid folder": ("evaid", "ball", lambda path, s: raw_forms.write_folder(path, raw_forms.evaid_members(s))),
     "mvsec": ("mvsec", "indoor_flying1_data.hdf5", raw_forms.write_mvsec),
     "bag": ("bag", "desk.bag", raw_forms.write_bag),
