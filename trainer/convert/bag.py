@@ -25,6 +25,8 @@ EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"
 IMAGE = "sensor_msgs/msg/Image"
 RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("secs", "<u4"), ("nsecs", "<u4"), ("polarity", "u1")])
 EVT_HEADERS = {"evt2": "% evt 2.0", "evt21": "% evt 2.1", "evt3": "% evt 3.0"}
+DAMAGE = (EOFError, RuntimeError, ValueError, LookupError, AssertionError)
+"""What rosbags, and the decompressors that it calls, raise on bytes that are not theirs, beside errors of their own."""
 COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 
@@ -59,6 +61,8 @@ def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
                 yield from _read_arrays(bag, events, images, path, progress)
     except (ReaderError, struct.error, OSError) as error:
         raise UsageError(f"{path}: the bag cannot be read: {error}") from error
+    except DAMAGE as error:
+        raise UsageError(f"{path}: the bag cannot be read, it is damaged: {error!r}") from error
 
 
 def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:

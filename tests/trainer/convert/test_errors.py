@@ -82,6 +82,16 @@ def short_bag(path: Path) -> Path:
     return cut_short(path / "a.bag", 0.7)
 
 
+def bag_with(path: Path, **changes: bytes) -> Path:
+    """A bag in which fields in the header of the first message begin with other values."""
+    raw_forms.write_bag(path / "a.bag", scene())
+    content = bytearray((path / "a.bag").read_bytes())
+    for name, value in changes.items():
+        at = content.index(b"%s=" % name.encode(), content.index(b"op=\2")) + len(name) + 1
+        content[at : at + len(value)] = value
+    return written(path / "a.bag", bytes(content))
+
+
 def short_aedat4(path: Path) -> Path:
     write_aedat4(path / "a.aedat4", scene())
     return cut_short(path / "a.aedat4", 0.03)
@@ -130,6 +140,8 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: mvsec(path, image_raw_ts=np.full(5, np.nan)), "a time of nan s"),
         (lambda path: mvsec(path, image_raw=np.zeros((5, 18, 24))), "not uint8"),
         (short_bag, "the bag cannot be read"),
+        (lambda path: bag_with(path, time=b"\1\1"), r"the bag cannot be read, it is damaged: AssertionError\(\)"),
+        (lambda path: bag_with(path, conn=b"\x77"), r"the bag cannot be read, it is damaged: KeyError\(119\)"),
         (short_aedat4, "cannot be decoded"),
         (evt2_without_size, "give --size WIDTHxHEIGHT"),
     ],
