@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,10 +24,14 @@ READ_EVENTS = 1 << 18
 
 
 def recognises(path: Path) -> bool:
-    """An HDF5 file with a group ``davis``."""
+    """An HDF5 file with a group ``davis``.
+
+    Raises:
+        UsageError: an HDF5 file, and damaged.
+    """
     if path.suffix not in (".hdf5", ".h5") or not h5py.is_hdf5(path):
         return False
-    with h5py.File(path, "r") as file:
+    with _opened(path) as file:
         return "davis" in file
 
 
@@ -36,10 +41,16 @@ def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
     Raises:
         UsageError: a part is missing, damaged or of another shape.
     """
+    with _opened(path) as file:
+        yield from _read(file, path, options.camera, progress)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
-            yield from _read(file, path, options.camera, progress)
-    except OSError as error:
+            yield file
+    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's, on files that are cut off or damaged
         raise UsageError(f"{path} cannot be read as HDF5: {error}") from error
 
 

@@ -59,12 +59,13 @@ def several(path: Path, members: dict[str, bytes]) -> Path:
     return path / "all"
 
 
-def mvsec(path: Path, **datasets: np.ndarray) -> Path:
+def mvsec(path: Path, **datasets: np.ndarray | None) -> Path:
     raw_forms.write_mvsec(path / "fly_data.hdf5", scene())
     with h5py.File(path / "fly_data.hdf5", "a") as file:
         for name, values in datasets.items():
             del file[f"davis/left/{name}"]
-            file[f"davis/left/{name}"] = values
+            if values is not None:
+                file[f"davis/left/{name}"] = values
     return path / "fly_data.hdf5"
 
 
@@ -139,6 +140,8 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: mvsec(path, image_raw_ts=np.zeros(2)), "5 pictures, but 2 times"),
         (lambda path: mvsec(path, image_raw_ts=np.full(5, np.nan)), "a time of nan s"),
         (lambda path: mvsec(path, image_raw=np.zeros((5, 18, 24))), "not uint8"),
+        (lambda path: cut_short(mvsec(path), 0.6), "fly_data.hdf5 cannot be read as HDF5: .*truncated"),
+        (lambda path: mvsec(path, image_raw_ts=None), "fly_data.hdf5 cannot be read as HDF5: .*image_raw_ts"),
         (short_bag, "the bag cannot be read"),
         (lambda path: bag_with(path, time=b"\1\1"), r"the bag cannot be read, it is damaged: AssertionError\(\)"),
         (lambda path: bag_with(path, conn=b"\x77"), r"the bag cannot be read, it is damaged: KeyError\(119\)"),
