@@ -10,9 +10,10 @@ ends before it begins is empty then.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,15 +50,28 @@ class Window:
     target: Image | None
 
 
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Errors of h5py while it looks into a file or reads from it, as ours."""
+    try:
+        yield
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise UsageError(
+            f"{path} cannot be read as HDF5: {error} (it is damaged, or compressed by a filter whose plugin is not "
+            "found in HDF5_PLUGIN_PATH)"
+        ) from error
+
+
 class _Times(Sequence[float]):
     """``events/ts`` as a sequence that bisection can search: reads blocks, keeps the last ones."""
 
-    def __init__(self, dataset: h5py.Dataset) -> None:
-        self._dataset = dataset
+    def __init__(self, dataset: h5py.Dataset, path: Path) -> None:
+        self._dataset, self._path = dataset, path
         self._block = functools.lru_cache(CACHED_BLOCKS)(self._read)
 
     def _read(self, block: int) -> npt.NDArray[np.float64]:
-        values: npt.NDArray[np.float64] = self._dataset[block * BLOCK_EVENTS : (block + 1) * BLOCK_EVENTS]
+        with _reading(self._path):
+            values: npt.NDArray[np.float64] = self._dataset[block * BLOCK_EVENTS : (block + 1) * BLOCK_EVENTS]
         return values.astype(np.float64)
 
     def __len__(self) -> int:
@@ -94,11 +108,12 @@ class Recording:
         except OSError as error:
             raise UsageError(f"{self.path} cannot be read as HDF5: {error}") from error
         try:
-            self._columns = self._checked_columns()
-            self._times = _Times(self._columns["ts"])
-            self.repaired_images = 0
-            self.images = self._listed_images(as_published)
-            self.size = self._sensor_size()
+            with _reading(self.path):
+                self._columns = self._checked_columns()
+                self._times = _Times(self._columns["ts"], self.path)
+                self.repaired_images = 0
+                self.images = self._listed_images(as_published)
+                self.size = self._sensor_size()
         except BaseException:
             self._file.close()
             raise
@@ -233,22 +248,28 @@ class Recording:
         return [Window(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
 
     def events(self, window: Window) -> Events:
-        """The events of a window."""
+        """The events of a window.
+
+        Raises:
+            UsageError: they cannot be read.
+        """
         part = slice(window.start, window.stop)
-        return Events(
-            self._columns["ts"][part].astype(np.float64),
-            self._columns["xs"][part],
-            self._columns["ys"][part],
-            np.where(self._columns["ps"][part] > 0, np.float32(1), np.float32(-1)),
-        )
+        with _reading(self.path):
+            return Events(
+                self._columns["ts"][part].astype(np.float64),
+                self._columns["xs"][part],
+                self._columns["ys"][part],
+                np.where(self._columns["ps"][part] > 0, np.float32(1), np.float32(-1)),
+            )
 
     def image(self, image: Image) -> npt.NDArray[np.uint8]:
         """Its pixels, uint8 [H, W].
 
         Raises:
-            UsageError: another dtype or size than the first picture's.
+            UsageError: it cannot be read, or is of another dtype or size than the first picture.
         """
-        pixels = self._file[image.key][:]
+        with _reading(self.path):
+            pixels = self._file[image.key][:]
         if pixels.dtype != np.uint8 or pixels.shape != self.size:
             raise UsageError(
                 f"{self.path}: {image.key} is {pixels.dtype} {list(pixels.shape)}, not uint8 {list(self.size)}"

@@ -184,6 +184,49 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, kind: str, message: str)
         Recording(broken(tmp_path, kind))
 
 
+def damaged(path: Path, name: str) -> Path:
+    """A recording in which the compressed bytes of one dataset are none."""
+    import h5py
+
+    file = recording(path, stamped(1.05, 1.25, 1.45))
+    with h5py.File(file, "r+") as opened:
+        values, attributes = opened[name][:], dict(opened[name].attrs)
+        del opened[name]
+        made = opened.create_dataset(name, data=values, compression="gzip")
+        made.attrs.update(attributes)
+        made.id.write_direct_chunk((0,) * values.ndim, b"none")
+    return file
+
+
+@pytest.mark.parametrize("name", ["events/ts", "events/xs", "images/image000000002"])
+def test_damage_is_told(tmp_path: Path, name: str) -> None:
+    file = damaged(tmp_path, name)
+
+    def read() -> None:
+        with Recording(file) as opened:
+            opened.events(opened.windows()[0])
+            opened.image(opened.images[2])
+
+    with pytest.raises(UsageError, match=r"a.h5 cannot be read as HDF5: .*HDF5_PLUGIN_PATH"):
+        read()
+
+
+def test_a_compression_that_is_not_installed_is_told(tmp_path: Path) -> None:
+    import h5py
+
+    file = recording(tmp_path, stamped(1.05, 1.25))
+    with h5py.File(file, "r+") as opened:
+        del opened["events/ts"]
+        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        properties.set_chunk((len(T),))
+        properties.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # Blosc
+        space = h5py.h5s.create_simple((len(T),))
+        made = h5py.h5d.create(opened["events"].id, b"ts", h5py.h5t.NATIVE_DOUBLE, space, properties)
+        made.write_direct_chunk((0,), b"whatever")
+    with pytest.raises(UsageError, match="plugin"):
+        Recording(file)
+
+
 def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     first, second = stamped(1.05, 1.25)
