@@ -248,19 +248,20 @@ class Recording:
         return [Window(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
 
     def events(self, window: Window) -> Events:
-        """The events of a window.
+        """The events of a window, in order of time.
 
         Raises:
-            UsageError: they cannot be read.
+            UsageError: they cannot be read, or come too late or too early to be of this window.
         """
         part = slice(window.start, window.stop)
         with _reading(self.path):
-            return Events(
+            events = Events(
                 self._columns["ts"][part].astype(np.float64),
                 self._columns["xs"][part],
                 self._columns["ys"][part],
                 np.where(self._columns["ps"][part] > 0, np.float32(1), np.float32(-1)),
             )
+        return _in_order(events, window, self.path)
 
     def image(self, image: Image) -> npt.NDArray[np.uint8]:
         """Its pixels, uint8 [H, W].
@@ -275,3 +276,22 @@ class Recording:
                 f"{self.path}: {image.key} is {pixels.dtype} {list(pixels.shape)}, not uint8 {list(self.size)}"
             )
         return np.asarray(pixels)
+
+
+def _in_order(events: Events, window: Window, path: Path) -> Events:
+    """Those that come a little late sorted in, as sensors and files have some; where one lies further outside of its
+    window than this is long, the file has no order in which windows could be searched.
+    """
+    t = events.t
+    if (t[1:] >= t[:-1]).all():
+        return events
+    reach = window.end - window.begin
+    within = (t >= window.begin - reach) & (t <= window.end + reach)
+    if not within.all():
+        at = int(np.flatnonzero(~within)[0])
+        raise UsageError(
+            f"{path}: events are not in order of time: event {window.start + at}, at {t[at]:.6f} s, lies among those "
+            f"from {window.begin:.6f} to {window.end:.6f} s. Sort the file"
+        )
+    order = np.argsort(t, kind="stable")
+    return Events(t[order], events.x[order], events.y[order], events.p[order])

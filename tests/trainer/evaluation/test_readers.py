@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.trainer.evaluation.h5_file import random_recording, write_h5
 from trainer.evaluation import readers
-from trainer.evaluation.readers import Recording
+from trainer.evaluation.readers import Recording, Window
 from v2v_protocol.errors import UsageError
 
 PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
@@ -182,6 +182,37 @@ def broken(path: Path, kind: str) -> Path:
 def test_what_cannot_be_read_is_refused(tmp_path: Path, kind: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Recording(broken(tmp_path, kind))
+
+
+def disordered(path: Path, order: list[int]) -> Path:
+    """Six events at 1.0 ... 1.5 s, x = their number in time modulo 4, one after the other in this order."""
+    numbers = np.array(order)
+    pictures = [(PIXELS, given) for given in stamped(1.05, 1.25, 1.45)]
+    return write_h5(path / "a.h5", T[numbers], numbers % 4, numbers % 3, numbers % 2, pictures)
+
+
+def test_late_events_are_sorted_in(tmp_path: Path) -> None:
+    with Recording(disordered(tmp_path, [0, 2, 1, 4, 3, 5])) as opened:
+        for window, times, columns in zip(opened.windows(), ([1.1, 1.2], [1.3, 1.4]), ([1, 2], [3, 0]), strict=True):
+            events = opened.events(window)
+            assert events.t.tolist() == times
+            assert events.x.tolist() == columns
+
+
+@pytest.mark.parametrize("order", [[0, 1, 5, 3, 4, 2], [5, 4, 3, 2, 1, 0]])
+def test_events_without_an_order_are_refused(tmp_path: Path, order: list[int]) -> None:
+    with (
+        Recording(disordered(tmp_path, order)) as opened,
+        pytest.raises(UsageError, match=r"event \d, at .*Sort the file"),
+    ):
+        opened.events(Window(0, len(T), 1.05, 1.25, None))
+
+
+def test_times_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    pictures = [(PIXELS, given) for given in stamped(1.05, 1.45)]
+    path = write_h5(tmp_path / "a.h5", np.where(T == 1.2, np.nan, T), T, T, T, pictures)
+    with Recording(path) as opened, pytest.raises(UsageError, match="event 2, at nan s"):
+        opened.events(Window(0, len(T), 1.0, 1.5, None))
 
 
 def damaged(path: Path, name: str) -> Path:
