@@ -141,6 +141,12 @@ class Recording:
                 f"{self.path} has no events/{missing[0]}: it is not in the layout of v2v-eval. v2v-convert makes that "
                 "from raw recordings"
             )
+        for name, column in columns.items():
+            if column.ndim != 1 or (name in ("xs", "ys") and column.dtype.kind not in "iu"):
+                raise UsageError(
+                    f"{self.path}: events/{name} is {column.dtype} {list(column.shape)}, not a column [N], of whole "
+                    "numbers for coordinates"
+                )
         lengths = {len(column) for column in columns.values()}
         if lengths == {0} or len(lengths) > 1:
             raise UsageError(f"{self.path}: columns of events have {sorted(lengths)} entries")

@@ -150,6 +150,13 @@ def broken(path: Path, kind: str) -> Path:
         file.write_text("no HDF5")
     elif kind == "columns":
         write_h5(file, T, T[:2], T, T, [])
+    elif kind in ("rows", "scalar", "fractions"):
+        import h5py
+
+        write_h5(file, T, T, T, T, [(PIXELS, {"timestamp": 1.0, "event_idx": 0})])
+        with h5py.File(file, "r+") as opened:
+            del opened["events/xs"]
+            opened["events/xs"] = {"rows": T.astype(int)[:, None], "scalar": 1, "fractions": T}[kind]
     elif kind == "no images or size":
         write_h5(file, T, T, T, T, [])
     elif kind == "no index":
@@ -172,6 +179,9 @@ def broken(path: Path, kind: str) -> Path:
         ("absent", "no file"),
         ("text", "cannot be read as HDF5"),
         ("columns", r"columns of events have \[2, 6\]"),
+        ("rows", r"events/xs is int64 \[6, 1\], not a column"),
+        ("scalar", r"events/xs is int64 \[\], not a column"),
+        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], of whole numbers"),
         ("raw", r"no events/ts.*v2v-convert"),
         ("no images or size", "size is unknown"),
         ("no index", "without the attribute event_idx"),
