@@ -124,7 +124,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
     changed = {"kind": arguments.voxels, "span": arguments.span, "truncate": arguments.as_published or None}
     voxels = dataclasses.replace(voxels, **{name: value for name, value in changed.items() if value is not None})
     lpips_files = {net: (backbone, heads) for net, backbone, heads in arguments.lpips}
-    device = arguments.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    device = _device(arguments.device)
     names: Sequence[str] = config.metrics
     if arguments.metrics is not None:
         names = [name.strip() for name in arguments.metrics.split(",")]
@@ -146,6 +146,16 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         drawing=Drawing(None if arguments.out is None else Path(arguments.out), arguments.rows, arguments.video),
     )
     return run, model
+
+
+def _device(wanted: str | None) -> str:
+    device = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError) as error:  # no such name, none of them here, or not as many
+        reason = str(error).partition("\n")[0]
+        raise UsageError(f"--device {device}: PyTorch cannot compute there: {reason}") from error
+    return device
 
 
 def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> None:

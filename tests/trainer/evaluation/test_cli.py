@@ -148,6 +148,9 @@ def test_without_pictures_only_at_a_given_rate(tmp_path: Path, weights: Path) ->
         (["--data", "{data}", "--fps", "10", "--metrics", "mse"], "--fps scores nothing"),
         (["--data", "{data}", "--rows", "0", "--out", "x"], "0 rows"),
         (["--data", "{data}", "--video"], "a video needs --out"),
+        (["--data", "{data}", "--device", "gpu"], "--device gpu: PyTorch cannot compute there"),
+        (["--data", "{data}", "--device", "cuda:99"], "--device cuda:99: PyTorch cannot compute there"),
+        (["--data", "{data}", "--device", "meta"], "--device meta: PyTorch cannot compute there"),
         (["--data", "{data}/a.h5", "--json", "{data}/none/a.json"], "cannot be written"),
     ],
 )
