@@ -26,6 +26,8 @@ POSITIVE = (40, 40, 214)  # BGR
 NEGATIVE = (200, 96, 30)
 FULL_COLOUR_QUANTILE = 0.98
 FONT_SCALE = 0.4
+LARGEST_TIMEBASE = 65_535
+"""Denominator of the time of a frame that MPEG-4 can hold."""
 
 
 def draw_events(voxels: npt.NDArray[np.float32]) -> Image:
@@ -96,15 +98,25 @@ def write_png(path: Path, rows: Sequence[Image]) -> None:
         raise UsageError(f"{path}: {error.strerror or error}") from error
 
 
+def _rate(fps: float) -> float:
+    """The rate with as many of OpenCV's three decimals as MPEG-4 can hold: 149.993 would be 149993 / 1000."""
+    decimals = next((number for number in (3, 2, 1) if fps * 10**number <= LARGEST_TIMEBASE), 0)
+    return min(round(fps, decimals), float(LARGEST_TIMEBASE))
+
+
 class Video:
     """An MPEG-4 video, a frame at a time; a context manager.
+
+    Args:
+        path: to write to.
+        fps: frames a second; rounded to what the format can hold (three decimals below 65.5, two below 655).
 
     Raises:
         UsageError: the folder cannot be written to, or the encoder does not open.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        self._path, self._fps = path, fps
+        self._path, self._fps = path, _rate(fps)
         self._writer: cv2.VideoWriter | None = None
 
     def add(self, image: Image) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.evaluation.pictures import chosen_steps, draw_events, grey_levels
+from trainer.evaluation.pictures import Video, chosen_steps, draw_events, grey_levels
 
 
 def test_colours_of_events() -> None:
@@ -35,3 +38,11 @@ def test_steps_are_evenly_spaced_and_end_with_the_last(count: int, rows: int) ->
 @pytest.mark.parametrize(("count", "rows", "steps"), [(12, 2, {5, 11}), (2, 6, {0, 1}), (10, 1, {9})])
 def test_some_of_them(count: int, rows: int, steps: set[int]) -> None:
     assert chosen_steps(count, rows) == steps
+
+
+@pytest.mark.parametrize("fps", [1.0, 65.5354, 149.993, 655.357, 1000.123, 65_534.7, 200_000.5])
+def test_a_video_of_any_rate_is_written(tmp_path: Path, fps: float) -> None:
+    """EVAID has 150 pictures a second, and time stamps of microseconds make an odd number of them."""
+    with Video(tmp_path / "a.mp4", fps) as video:
+        video.add(np.zeros((18, 24, 3), np.uint8))
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(min(fps, 65_535), rel=1e-3)
