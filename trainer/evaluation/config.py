@@ -87,7 +87,7 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
     return EvaluationConfig(
         data_sets=tuple(_data_set(entry, f"{where}: data") for entry in _list(top.get("data"), f"{where}: data")),
         model=model.get("name"),
-        model_options=dict(model.get("options") or {}),
+        model_options=_options(model.get("options"), f"{where}: model: options"),
         voxels=VoxelSettings(**voxels) if voxels else None,
         metrics=_known(top.get("metrics", ["mse", "ssim_range2", "ssim"]), METRICS, f"{where}: metrics"),
         paper=_known(top.get("paper", []), tuple(paper.RESULTS), f"{where}: paper"),
@@ -129,6 +129,13 @@ def _cut(value: Any, where: str) -> Cut | None:
     if not 0 <= start < end:
         raise UsageError(f"{where}: a cut from {start:g} to {end:g} s")
     return start, end
+
+
+def _options(value: Any, where: str) -> dict[str, Any]:
+    """Which there are, the network says."""
+    if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+        raise UsageError(f"{where}: {value!r} should be names and values")
+    return dict(value or {})
 
 
 def _mapping(value: Any, where: str, keys: tuple[str, ...]) -> dict[str, Any]:

@@ -93,6 +93,8 @@ def test_folders_and_files(tmp_path: Path) -> None:
         ({"data": [{"name": "a", "sequences": {"b": [3, 2]}}]}, "b: a cut from 3 to 2 s"),
         ({"data": ["HQF"], "voxels": {"kind": "square"}}, "kind 'square'"),
         ({"data": ["HQF"], "voxels": {"size": 3}}, "voxels: unknown key 'size'"),
+        ({"data": ["HQF"], "model": {"options": "normalize"}}, "x: model: options: 'normalize' should be names and"),
+        ({"data": ["HQF"], "model": {"options": {1: 2}}}, r"x: model: options: \{1: 2\} should be names and"),
         ({"data": ["HQF"], "metrics": ["psnr"]}, "'psnr' is none of mse"),
         ({"data": ["HQF"], "paper": ["V2E"]}, "'V2E' is none of E2VID"),
     ],
