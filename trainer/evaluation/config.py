@@ -84,8 +84,13 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
     top = _mapping(content, where, KEYS)
     model = _mapping(top.get("model", {}), f"{where}: model", ("name", "options"))
     voxels = _mapping(top.get("voxels", {}), f"{where}: voxels", ("kind", "bins", "span"))
+    data_sets = tuple(_data_set(entry, f"{where}: data") for entry in _list(top.get("data"), f"{where}: data"))
+    names = [data_set.name for data_set in data_sets]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"{where}: data: two sets of the name {twice}: give each a name of its own")
     return EvaluationConfig(
-        data_sets=tuple(_data_set(entry, f"{where}: data") for entry in _list(top.get("data"), f"{where}: data")),
+        data_sets=data_sets,
         model=model.get("name"),
         model_options=_options(model.get("options"), f"{where}: model: options"),
         voxels=VoxelSettings(**voxels) if voxels else None,

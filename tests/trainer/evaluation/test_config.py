@@ -87,6 +87,7 @@ def test_folders_and_files(tmp_path: Path) -> None:
         ({"data": ["HQF"], "colour": 1}, "unknown key 'colour'"),
         ({}, "x: data: None should be a list"),
         ({"data": ["KITTI"]}, "'KITTI' is none of the paper's: HQF, EVAID, IJRR, MVSEC"),
+        ({"data": ["HQF", {"name": "HQF", "sequences": ["b"]}]}, "two sets of the name HQF"),
         ({"data": [{"name": "a"}]}, "has a name and sequences"),
         ({"data": [{"name": "a", "sequences": "b"}]}, "sequences are a list"),
         ({"data": [{"name": "a", "sequences": {"b": [1]}}]}, r"b: \[1\] is not \[first second"),
