@@ -73,6 +73,8 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     found = {}
     for sequence in data_set.cuts:
         candidates = [folder / data_set.folder / f"{sequence}{suffix}" for suffix in layout.SUFFIXES]
+        if data.is_file() and (data_set.folder, sequence) == (".", data.stem):
+            candidates = [data]  # whatever its ending, and whatever lies beside it
         existing = next((path for path in candidates if path.is_file()), None)
         if existing is not None:
             found[sequence] = existing

@@ -69,6 +69,14 @@ def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path
     assert published[0]["as_published"] is True
 
 
+@pytest.mark.parametrize("name", ["a.hdf5", "a.hdf", "a"])
+def test_a_single_file_is_that_file(tmp_path: Path, weights: Path, name: str) -> None:
+    random_recording(tmp_path / "own" / "a.h5", images=3)
+    random_recording(tmp_path / "own" / name, images=5)
+    (record, _) = evaluate("--weights", weights, "--data", tmp_path / "own" / name, "--metrics", "mse")
+    assert (record["sequence"], record["frames"]) == ("a", 4)
+
+
 def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two sequences of IJRR, cut; one of HQF, whole; the mean over sequences; the paper's rows beside."""
     data = tmp_path / "data"
