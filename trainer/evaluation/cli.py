@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
-from trainer.evaluation.evaluate import Advance, Drawing, Run, evaluate_data_set
+from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set
 from trainer.evaluation.metrics import METRICS, make_metrics
 from trainer.evaluation.network import load_network
 from trainer.evaluation.score import SequenceScore
@@ -89,6 +89,8 @@ def _run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--data {data}: no such folder or file")
     config = folder_config(data) if arguments.config is None else read_config(arguments.config)
     run, model = _prepare(arguments, config)
+    for data_set in config.data_sets:
+        check_data_set(run, data, data_set)
     scores: dict[str, list[SequenceScore]] = {}
     with _progress() as advance:
         for data_set in config.data_sets:

@@ -81,6 +81,23 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     return found
 
 
+def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
+    """Look into the recordings that are there, so that the last one is not refused when all others have been evaluated.
+
+    Raises:
+        UsageError: see :class:`Recording`.
+    """
+    for sequence, path in find_recordings(data, data_set).items():
+        with Recording(path, as_published=run.as_published) as recording:
+            _windows(run, recording, data_set.cuts[sequence])
+
+
+def _windows(run: Run, recording: Recording, cut: Cut | None) -> list[Window]:
+    if run.fps is not None:
+        return recording.regular_windows(run.fps)
+    return recording.windows(cut if run.use_cuts else None)
+
+
 def evaluate_data_set(
     run: Run, data: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> list[SequenceScore]:
@@ -100,10 +117,7 @@ def evaluate_sequence(
 ) -> SequenceScore:
     """Score, and draw, one recording."""
     with Recording(path, as_published=run.as_published) as recording:
-        if run.fps is None:
-            windows = recording.windows(cut if run.use_cuts else None)
-        else:
-            windows = recording.regular_windows(run.fps)
+        windows = _windows(run, recording, cut)
         scorer = SequenceScorer(run.metrics)
         rows = []
         shown = pictures.chosen_steps(len(windows), run.drawing.rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.evaluation.test_metrics import slow_ssim
 from trainer.convert import cli as convert_cli
 from trainer.evaluation import cli
+from trainer.evaluation import evaluate as evaluate_module
+from trainer.evaluation.readers import Recording
+from trainer.evaluation.reconstruct import Step
 from trainer.models import FireNet
 
 DAVIS = WEIGHTS.parent / "events" / "davis346_aestream.aedat4"
@@ -170,6 +174,25 @@ def test_mistakes_end_with_status_2(
         cli.main(["--weights", str(weights), *(a.replace("{data}", str(tmp_path / "own")) for a in arguments)])
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_recording_that_is_refused_is_so_before_others_are_evaluated(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random_recording(tmp_path / "hqf" / "desk.h5")
+    random_recording(tmp_path / "ijrr" / "slider_depth.h5")  # shorter than its cut
+    evaluated = []
+
+    def reconstruct(recording: Recording, *_rest: object, **_named: object) -> Iterator[Step]:
+        evaluated.append(recording.name)
+        return iter(())
+
+    monkeypatch.setattr(evaluate_module, "reconstruct", reconstruct)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["paper-discrete", "--weights", str(weights), "--data", str(tmp_path), "--metrics", "mse"])
+    assert stop.value.code == 2
+    assert "if it is already cut, give --cuts none" in capsys.readouterr().err
+    assert not evaluated
 
 
 def test_published_firenet_shows_the_scene_of_a_real_recording(tmp_path: Path, published: Path) -> None:
