@@ -63,9 +63,16 @@ def _run(arguments: argparse.Namespace) -> int:
     to_file = out.suffix in layout.SUFFIXES
     if to_file and len(arguments.sources) > 1:
         raise UsageError(f"--out {out} is one file, and there are {len(arguments.sources)} recordings: give a folder")
+    sources = [Path(source) for source in arguments.sources]
+    destinations = [out if to_file else out / default_name(source) for source in sources]
+    for number, destination in enumerate(destinations):
+        if (first := destinations.index(destination)) < number:
+            raise UsageError(
+                f"{sources[first]} and {sources[number]} would both become {destination}: convert one at a time, each "
+                "with its own --out"
+            )
     records = []
-    for source in map(Path, arguments.sources):
-        destination = out if to_file else out / default_name(source)
+    for source, destination in zip(sources, destinations, strict=True):
         with _progress(source.name) as progress:
             done = convert(
                 source,

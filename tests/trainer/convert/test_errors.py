@@ -237,6 +237,10 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["absent", "--out", "x"], "no file or folder absent"),
         (["a", "b", "--out", "x.h5"], "--out x.h5 is one file, and there are 2"),
         (["a", "--out", "x", "--size", "24"], "give WIDTHxHEIGHT"),
+        (
+            ["a/rec.bag", "b/rec.aedat4", "--out", "x", "--overwrite"],
+            "a/rec.bag and b/rec.aedat4 would both become x/rec.h5",
+        ),
     ],
 )
 def test_command_line_refuses(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
