@@ -170,13 +170,23 @@ class Recording:
             return self._paired(keys, times, stored)
         first, last = self.span
         if times[-1] < first - CLOCK_SLACK_SECONDS or times[0] > last + CLOCK_SLACK_SECONDS:
-            raise UsageError(
-                f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
-                f"{last:.3f} s: not one clock. Convert the recording again with v2v-convert, or trust its event_idx "
-                "with --as-published"
-            )
+            raise self._two_clocks(times)
         times = self._increasing(times)
+        for time, index in zip(times, stored, strict=True):
+            # Beyond the events, and yet with events on either side, as where one clock counts microseconds.
+            if (time < first - CLOCK_SLACK_SECONDS and index > 1) or (
+                time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
+            ):
+                raise self._two_clocks(times)
         return self._paired(keys, times, [bisect.bisect_left(self._times, time) for time in times])
+
+    def _two_clocks(self, times: Sequence[float]) -> UsageError:
+        first, last = self.span
+        return UsageError(
+            f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
+            f"{last:.3f} s: not one clock. Convert the recording again with v2v-convert, or trust its event_idx with "
+            "--as-published"
+        )
 
     def _paired(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
         return tuple(Image(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True))

@@ -95,6 +95,24 @@ def test_clocks_that_do_not_fit_are_refused_or_taken_as_published(tmp_path: Path
         assert [len(opened.events(window)) for window in opened.windows()] == [0]
 
 
+@pytest.mark.parametrize("shift", [0, -1])
+def test_clocks_of_another_unit_are_refused_although_they_overlap(tmp_path: Path, shift: int) -> None:
+    """Both count from the first picture, one in microseconds."""
+    attributes = stamped(1.05, 1.25, 1.45, shift=shift)
+    for attribute in attributes:
+        attribute["timestamp"] = 1.05 + (attribute["timestamp"] - 1.05) * 1e6
+    with pytest.raises(UsageError, match="not one clock"):
+        Recording(recording(tmp_path, attributes))
+
+
+@pytest.mark.parametrize("index", [5, 6])
+def test_pictures_before_and_after_all_events_are_taken(tmp_path: Path, index: int) -> None:
+    """The released conversion of HQF writes one event less."""
+    attributes = [{"timestamp": time, "event_idx": index if time > 2 else 0} for time in (-2.0, 1.25, 3.0, 4.0)]
+    with Recording(recording(tmp_path, attributes)) as opened:
+        assert [len(opened.events(window)) for window in opened.windows()] == [3, 3, 0]
+
+
 def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, [{"event_idx": 1}, {"event_idx": 4}])) as opened:
         assert [window.start for window in opened.windows()] == [1]
