@@ -157,15 +157,21 @@ class Recording:
         keys = sorted(group)
         if not keys:
             return ()
-        attributes = [group[key].attrs for key in keys]
-        if any("event_idx" not in attribute for attribute in attributes):
-            raise UsageError(f"{self.path}: pictures without the attribute event_idx")
         name = "event_idx_published" if as_published else "event_idx"
-        stored = [int(attribute.get(name, attribute["event_idx"])) for attribute in attributes]
-        if not all("timestamp" in attribute for attribute in attributes):
+        indices, stamps = [], []
+        for key in keys:
+            # Of one picture after the other: attributes keep their picture open, which takes 16 kB.
+            attributes = group[key].attrs
+            published = attributes.get(name)
+            indices.append(attributes.get("event_idx") if published is None else published)
+            stamps.append(attributes.get("timestamp"))
+        if any(index is None for index in indices):
+            raise UsageError(f"{self.path}: pictures without the attribute event_idx")
+        stored = [int(index) for index in indices]
+        if any(stamp is None for stamp in stamps):
             times = [self._times[min(index, len(self) - 1)] for index in stored]
             return self._paired(keys, times, stored)
-        times = [float(attribute["timestamp"]) for attribute in attributes]
+        times = [float(stamp) for stamp in stamps]
         if as_published:
             return self._paired(keys, times, stored)
         first, last = self.span

@@ -134,6 +134,22 @@ def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
             opened.windows((4.96, 5.5))
 
 
+def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import h5py
+
+    open_datasets = []
+    increasing = Recording._increasing
+
+    def look(self: Recording, times: list[float]) -> list[float]:
+        open_datasets.append(h5py.h5f.get_obj_count(self._file.id, h5py.h5f.OBJ_DATASET))
+        return increasing(self, times)
+
+    monkeypatch.setattr(Recording, "_increasing", look)
+    with Recording(random_recording(tmp_path / "a.h5", images=50, events=50)) as opened:
+        assert len(opened.images) == 50
+    assert open_datasets[0] <= 6, "four columns, and at most the picture that was looked at last"
+
+
 @settings(max_examples=30)
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=40), st.integers(1, 9))
 def test_search_in_blocks_equals_search_in_memory(
