@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +17,15 @@ from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, 
 from v2v_protocol.errors import UsageError
 
 AEDAT4_MAGIC = b"#!AER-DAT4"
+EVT_WORDS: dict[str, np.dtype[Any]] = {
+    **dict.fromkeys(("2.0", "EVT2"), np.dtype("<u4")),
+    **dict.fromkeys(("3.0", "EVT3"), np.dtype("<u2")),
+}
+"""Words by what a header says of their version."""
+TIME_HIGH = 0x8
+"""What the four upper bits of a word are where the others are the upper bits of a time."""
+LOOKED_THROUGH_WORDS = 1 << 20
+LONGEST_LINE_BYTES = 1 << 12
 GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
 
@@ -57,6 +67,10 @@ def read_aedat4(path: Path, options: Options, progress: Progress) -> Iterator[It
 def read_prophesee(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
     """Events of a file; the sensor's size is in its header or in ``options``.
 
+    Words of EVT carry the lower bits of a time only; the upper bits come by themselves, many times a millisecond.
+    Where a recording begins in the middle of the sensor's stream, events in front of the first of these have no time:
+    they are left out.
+
     Raises:
         UsageError: damaged, or of no stated size.
     """
@@ -67,13 +81,52 @@ def read_prophesee(path: Path, options: Options, progress: Progress) -> Iterator
         if decoder.dimensions is None:
             raise UsageError(f"{path}: its header states no size of the sensor; give --size")
         yield SensorSize(*decoder.dimensions)
-        for packet in decoder:
+        timeless = 0 if module is faery.dat else _events_without_time(path, module, fallback)
+        for events in _event_packets(decoder):
             progress(0, None)
-            if isinstance(packet, dict):
-                if "events" in packet:
-                    yield _events(packet["events"])
-            else:
-                yield _events(packet)
+            left_out = min(timeless, len(events))
+            timeless -= left_out
+            yield _events(events[left_out:])
+
+
+def _event_packets(decoder: Any) -> Iterator[npt.NDArray[Any]]:
+    for packet in decoder:
+        if not isinstance(packet, dict):
+            yield packet
+        elif "events" in packet:
+            yield packet["events"]
+
+
+def _events_without_time(path: Path, module: Any, fallback: tuple[int, int] | None) -> int:
+    """How many events of an EVT file lie in front of the first upper bits of a time: as many as that part of it has."""
+    word, head = _evt_words(path)
+    if word is None:
+        return 0
+    kinds = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=head) >> (8 * word.itemsize - 4)
+    times = np.flatnonzero(kinds == TIME_HIGH)
+    if not len(times) or not times[0]:
+        return 0
+    with tempfile.TemporaryDirectory() as folder, path.open("rb") as file:
+        front = Path(folder) / "front.raw"
+        front.write_bytes(file.read(head + int(times[0]) * word.itemsize))
+        with module.Decoder(front, fallback, None) as decoder:
+            return sum(len(events) for events in _event_packets(decoder))
+
+
+def _evt_words(path: Path) -> tuple[np.dtype[Any] | None, int]:
+    """The words of an EVT file, None where its header names no known ones, and at which byte they begin."""
+    word: np.dtype[Any] | None = None
+    with path.open("rb") as file:
+        while True:
+            begin = file.tell()
+            line = file.readline(LONGEST_LINE_BYTES)
+            if not line.startswith(b"%"):
+                return word, begin
+            key, _, value = line[1:].decode("ascii", "replace").strip().partition(" ")
+            if key in ("evt", "format"):
+                word = EVT_WORDS.get(value.partition(";")[0], word)
+            elif key == "end":
+                return word, file.tell()
 
 
 def _events(packet: npt.NDArray[Any]) -> EventChunk:

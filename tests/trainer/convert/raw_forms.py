@@ -72,8 +72,12 @@ def write_mvsec(path: Path, scene: Scene) -> None:
             group["image_raw_event_inds"] = np.searchsorted(scene.t_us, scene.picture_us) - 1
 
 
-def write_bag(path: Path, scene: Scene, *, packets: bool = False, image_encoding: str = "mono8") -> None:
-    """Two messages of events, one of each picture; ``packets``: EventPackets of EVT 3 instead of EventArrays."""
+def write_bag(
+    path: Path, scene: Scene, *, packets: bool = False, front: bytes = b"", image_encoding: str = "mono8"
+) -> None:
+    """Two messages of events, one of each picture; ``packets``: EventPackets of EVT 3 instead of EventArrays, the first
+    of them with the words ``front`` in front.
+    """
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -103,7 +107,9 @@ def write_bag(path: Path, scene: Scene, *, packets: bool = False, image_encoding
         t_us, x, y, p = scene.t_us[part], scene.x[part], scene.y[part], scene.p[part]
         if packets:
             # The sensor's clock has another origin than ROS.
-            words = np.frombuffer(evt3_words(t_us - scene.t_us[0] + 77, x, y, p), np.uint8)
+            words = np.frombuffer(
+                (b"" if part.start else front) + evt3_words(t_us - scene.t_us[0] + 77_000, x, y, p), np.uint8
+            )
             return types[EVENT_PACKET](
                 header=header(t_us[0]), height=HEIGHT, width=WIDTH, seq=0, time_base=0, encoding="evt3",
                 is_bigendian=False, events=words,
@@ -135,8 +141,11 @@ def write_bag(path: Path, scene: Scene, *, packets: bool = False, image_encoding
             bag.write(images, t_us * 1000, bytes(store.serialize_ros1(image_message(pixels, t_us), IMAGE)))
 
 
-def write_evt2(path: Path, scene: Scene, *, geometry: bool = True) -> None:
-    """Words of 32 bits: 0x8 upper time, 0x0 and 0x1 an event of either polarity with the lower 6 bits of its time."""
+def write_evt2(path: Path, scene: Scene, *, geometry: bool = True, front: bytes = b"") -> None:
+    """Words of 32 bits: 0x8 upper time, 0x0 and 0x1 an event of either polarity with the lower 6 bits of its time.
+
+    The words ``front`` come in front of them.
+    """
     words, upper = [], -1
     for t, x, y, p in zip(scene.t_us.tolist(), scene.x.tolist(), scene.y.tolist(), scene.p.tolist(), strict=True):
         if t >> 6 != upper:
@@ -144,7 +153,7 @@ def write_evt2(path: Path, scene: Scene, *, geometry: bool = True) -> None:
             words.append(0x8 << 28 | upper)
         words.append(int(p) << 28 | (t & 0x3F) << 22 | x << 11 | y)
     size = f"% geometry {WIDTH}x{HEIGHT}\n" if geometry else ""
-    path.write_bytes(f"% evt 2.0\n{size}% end\n".encode() + struct.pack(f"<{len(words)}I", *words))
+    path.write_bytes(f"% evt 2.0\n{size}% end\n".encode() + front + struct.pack(f"<{len(words)}I", *words))
 
 
 def evt3_words(t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
@@ -155,6 +164,10 @@ def evt3_words(t_us: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) ->
     return struct.pack(f"<{len(words)}H", *words)
 
 
-def write_evt3(path: Path, scene: Scene) -> None:
+EVT3_MIDDLE = struct.pack("<8H", 0x2807, 0x6005, 0x0003, 0x2004, 0x3001, 0x4003, 0x6E4B, 0x2809)
+"""Words as they come in the middle of a stream, with five events, before the upper bits of a time."""
+
+
+def write_evt3(path: Path, scene: Scene, *, front: bytes = b"") -> None:
     header = f"% evt 3.0\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode()
-    path.write_bytes(header + evt3_words(scene.t_us, scene.x, scene.y, scene.p))
+    path.write_bytes(header + front + evt3_words(scene.t_us, scene.x, scene.y, scene.p))

@@ -35,11 +35,26 @@ WITH_PICTURES: dict[str, tuple[str, str, Write]] = {
     "bag": ("bag", "desk.bag", raw_forms.write_bag),
     "bag of colour": ("bag", "desk.bag", lambda path, s: raw_forms.write_bag(path, s, image_encoding="bgr8")),
     "bag of packets": ("bag", "desk.bag", lambda path, s: raw_forms.write_bag(path, s, packets=True)),
+    "bag of packets from the middle": (
+        "bag",
+        "desk.bag",
+        lambda path, s: raw_forms.write_bag(path, s, packets=True, front=raw_forms.EVT3_MIDDLE),
+    ),
     "aedat4": ("aedat4", "own.aedat4", write_aedat4),
 }
 WITHOUT: dict[str, tuple[str, str, Write]] = {
     "evt2": ("prophesee", "own.raw", raw_forms.write_evt2),
     "evt3": ("prophesee", "own.raw", raw_forms.write_evt3),
+    "evt2 from the middle": (
+        "prophesee",
+        "own.raw",
+        lambda path, s: raw_forms.write_evt2(path, s, front=b"\4\x18\0\x14" * 3),
+    ),
+    "evt3 from the middle": (
+        "prophesee",
+        "own.raw",
+        lambda path, s: raw_forms.write_evt3(path, s, front=raw_forms.EVT3_MIDDLE),
+    ),
     "text": ("ijrr", "own.txt", lambda path, s: path.write_bytes(raw_forms.ijrr_members(s)["slow/events.txt"])),
 }
 
