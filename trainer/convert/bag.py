@@ -24,7 +24,7 @@ EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray"
 EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"
 IMAGE = "sensor_msgs/msg/Image"
 RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("secs", "<u4"), ("nsecs", "<u4"), ("polarity", "u1")])
-EVT_HEADERS = {"evt2": "% evt 2.0", "evt21": "% evt 2.1", "evt3": "% evt 3.0"}
+EVT_HEADERS = {"evt2": "% evt 2.0", "evt3": "% evt 3.0"}
 DAMAGE = (EOFError, RuntimeError, ValueError, LookupError, AssertionError)
 """What rosbags, and the decompressors that it calls, raise on bytes that are not theirs, beside errors of their own."""
 COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}

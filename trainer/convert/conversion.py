@@ -36,7 +36,7 @@ FORMS = {
     "mvsec": Form("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
     "bag": Form("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
     "aedat4": Form("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
-    "prophesee": Form("EVT 2, 2.1, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
+    "prophesee": Form("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
 }
 
 

@@ -1,4 +1,4 @@
-"""Files that the faery package decodes: aedat4 of DAVIS cameras; Prophesee's EVT 2, 2.1 and 3 (.raw) and DAT."""
+"""Files that the faery package decodes: aedat4 of DAVIS cameras; Prophesee's EVT 2 and 3 (.raw) and DAT."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ EVT_WORDS: dict[str, np.dtype[Any]] = {
     **dict.fromkeys(("3.0", "EVT3"), np.dtype("<u2")),
 }
 """Words by what a header says of their version."""
+NOT_DECODED = "2.1"
+"""A version that faery knows and, up to 0.7.1, has not implemented: it panics. As EVT21 it does not know it."""
 TIME_HIGH = 0x8
 """What the four upper bits of a word are where the others are the upper bits of a time."""
 LOOKED_THROUGH_WORDS = 1 << 20
@@ -72,7 +74,7 @@ def read_prophesee(path: Path, options: Options, progress: Progress) -> Iterator
     they are left out.
 
     Raises:
-        UsageError: damaged, or of no stated size.
+        UsageError: damaged, of no stated size, or of a version that faery does not decode.
     """
     faery = _faery()
     fallback = None if options.size is None else (options.size.width, options.size.height)
@@ -114,7 +116,11 @@ def _events_without_time(path: Path, module: Any, fallback: tuple[int, int] | No
 
 
 def _evt_words(path: Path) -> tuple[np.dtype[Any] | None, int]:
-    """The words of an EVT file, None where its header names no known ones, and at which byte they begin."""
+    """The words of an EVT file, None where its header names no known ones, and at which byte they begin.
+
+    Raises:
+        UsageError: a version that faery does not decode.
+    """
     word: np.dtype[Any] | None = None
     with path.open("rb") as file:
         while True:
@@ -124,7 +130,10 @@ def _evt_words(path: Path) -> tuple[np.dtype[Any] | None, int]:
                 return word, begin
             key, _, value = line[1:].decode("ascii", "replace").strip().partition(" ")
             if key in ("evt", "format"):
-                word = EVT_WORDS.get(value.partition(";")[0], word)
+                version = value.partition(";")[0]
+                if version == NOT_DECODED:
+                    raise UsageError(f"{path} is in EVT 2.1, which is not read here; EVT 2, EVT 3 and DAT are")
+                word = EVT_WORDS.get(version, word)
             elif key == "end":
                 return word, file.tell()
 

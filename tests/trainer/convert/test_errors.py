@@ -103,6 +103,12 @@ def evt2_without_size(path: Path) -> Path:
     return path / "a.raw"
 
 
+def evt21(path: Path, header: bytes) -> Path:
+    return written(
+        path / "a.raw", header + b"\n% geometry 24x18\n% end\n" + struct.pack("<2Q", 0x8 << 60, 0x1 << 60 | 1)
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -147,6 +153,8 @@ def evt2_without_size(path: Path) -> Path:
         (lambda path: bag_with(path, conn=b"\x77"), r"the bag cannot be read, it is damaged: KeyError\(119\)"),
         (short_aedat4, "cannot be decoded"),
         (evt2_without_size, "give --size WIDTHxHEIGHT"),
+        (lambda path: evt21(path, b"% evt 2.1"), "a.raw is in EVT 2.1, which is not read here"),
+        (lambda path: evt21(path, b"% evt 2.1\n% format EVT21;height=18;width=24"), 'decoded: unknown version "EVT21"'),
     ],
 )
 def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: str) -> None:
