@@ -181,3 +181,8 @@ def _errors_of_faery(path: Path) -> Iterator[None]:
         text = str(error)
         hint = "; give --size WIDTHxHEIGHT" if "size" in text else ""
         raise UsageError(f"{path} cannot be decoded: {text}{hint}") from error
+    except BaseException as error:
+        # A panic of Rust, on bytes that faery did not think of: its class is not to be imported, and no Exception.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise UsageError(f"{path} cannot be decoded: {error}") from error

@@ -16,6 +16,7 @@ from tests.trainer.convert import raw_forms
 from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import scene
 from trainer.convert import cli, convert, text_events
+from trainer.convert.faery_reader import _errors_of_faery
 from trainer.convert.items import EventChunk, Options, SensorSize
 from trainer.convert.text_events import read_text_events
 from v2v_protocol.errors import UsageError
@@ -162,6 +163,22 @@ def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: s
     with pytest.raises(UsageError, match=message):
         convert(source, tmp_path / "out" / "a.h5")
     assert not list(tmp_path.glob("out/*"))
+
+
+class PanicException(BaseException):
+    """As Rust's is seen from here: by its name and base only."""
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"),
+    [
+        (PanicException("index out of bounds"), UsageError),
+        (KeyboardInterrupt("index out of bounds"), KeyboardInterrupt),
+    ],
+)
+def test_a_panic_of_the_decoder_is_told_as_damage(raised: BaseException, expected: type[BaseException]) -> None:
+    with pytest.raises(expected, match="index out of bounds"), _errors_of_faery(Path("a.aedat4")):
+        raise raised
 
 
 def test_size_given_where_the_file_has_none(tmp_path: Path) -> None:
