@@ -166,20 +166,21 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
         console = Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         if data_set.name not in scores:
-            console.print(f"{data_set.name}: none of its {len(data_set.cuts)} sequences is there")
+            console.print(f"{data_set.name}: none of its {len(data_set.cuts)} sequences is there", markup=False)
             continue
         console.print(table(data_set, scores[data_set.name], config.paper))
         for score in scores[data_set.name]:
             if score.repaired_images or score.empty_windows:
                 console.print(
                     f"{score.sequence}: {score.repaired_images} time stamps of pictures mended, "
-                    f"{score.empty_windows} windows without events"
+                    f"{score.empty_windows} windows without events",
+                    markup=False,
                 )
 
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Advance]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("", total=None)

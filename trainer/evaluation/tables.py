@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from trainer.evaluation import paper
@@ -30,13 +31,14 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     """
     means = mean_over_sequences(scores)
     names = list(dict.fromkeys(name for score in scores for name in score.means))
-    made = Table(title=data_set.name, title_justify="left")
+    # Names in brackets would be taken for markup, and left out.
+    made = Table(title=escape(data_set.name), title_justify="left")
     made.add_column("sequence", no_wrap=True)
     made.add_column("frames", justify="right")
     for name in names:
         made.add_column(TITLES[name], justify="right")
     for score in scores:
-        made.add_row(score.sequence, str(score.frames), *(_number(score.means, name) for name in names))
+        made.add_row(escape(score.sequence), str(score.frames), *(_number(score.means, name) for name in names))
     if not names:
         return made
     made.add_section()

@@ -81,6 +81,14 @@ def test_a_single_file_is_that_file(tmp_path: Path, weights: Path, name: str) ->
     assert (record["sequence"], record["frames"]) == ("a", 4)
 
 
+def test_names_in_brackets_are_shown(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random_recording(tmp_path / "own[night]" / "walk[left].h5", images=40, events=3)
+    evaluate("--weights", weights, "--data", tmp_path / "own[night]", "--metrics", "mse")
+    printed = capsys.readouterr().out
+    assert printed.startswith("own[night] ")
+    assert printed.count("walk[left]") == 2, "in the table, and with its windows without events"
+
+
 def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two sequences of IJRR, cut; one of HQF, whole; the mean over sequences; the paper's rows beside."""
     data = tmp_path / "data"
