@@ -87,6 +87,8 @@ def _run(arguments: argparse.Namespace) -> int:
     data = Path(arguments.data)
     if not data.exists():
         raise UsageError(f"--data {data}: no such folder or file")
+    if arguments.json is not None and not Path(arguments.json).parent.is_dir():
+        raise UsageError(f"--json {arguments.json}: cannot be written: no folder {Path(arguments.json).parent}")
     config = folder_config(data) if arguments.config is None else read_config(arguments.config)
     run, model = _prepare(arguments, config)
     for data_set in config.data_sets:

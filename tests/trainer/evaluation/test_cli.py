@@ -184,8 +184,20 @@ def test_mistakes_end_with_status_2(
     assert message in capsys.readouterr().err
 
 
-def test_a_recording_that_is_refused_is_so_before_others_are_evaluated(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "if it is already cut, give --cuts none"),
+        (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: cannot be written: no folder"),
+    ],
+)
+def test_what_is_refused_is_so_before_anything_is_evaluated(
+    tmp_path: Path,
+    weights: Path,
+    arguments: tuple[str, ...],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     random_recording(tmp_path / "hqf" / "desk.h5")
     random_recording(tmp_path / "ijrr" / "slider_depth.h5")  # shorter than its cut
@@ -196,10 +208,11 @@ def test_a_recording_that_is_refused_is_so_before_others_are_evaluated(
         return iter(())
 
     monkeypatch.setattr(evaluate_module, "reconstruct", reconstruct)
+    fixed = ["paper-discrete", "--weights", str(weights), "--data", str(tmp_path), "--metrics", "mse"]
     with pytest.raises(SystemExit) as stop:
-        cli.main(["paper-discrete", "--weights", str(weights), "--data", str(tmp_path), "--metrics", "mse"])
+        cli.main([*fixed, *(argument.replace("{data}", str(tmp_path)) for argument in arguments)])
     assert stop.value.code == 2
-    assert "if it is already cut, give --cuts none" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not evaluated
 
 
