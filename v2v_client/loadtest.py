@@ -239,7 +239,7 @@ def recipe_of(preset: str | None, changes: Sequence[str]) -> str | dict[str, Any
         key, equals, text = change.partition("=")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
             raise UsageError(f"--set {change}: the value is not YAML") from error
         if not equals or not key or value is None:
             raise UsageError(f"--set {change}: give KEY=VALUE, for example --set threshold='[0.1, 0.5]'")

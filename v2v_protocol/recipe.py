@@ -237,7 +237,7 @@ class Recipe:
         """
         rest = dict(values)
         base = preset(rest.pop("preset", DEFAULT_PRESET))
-        return base.replace(**rest)
+        return base.replace(**{str(key): value for key, value in rest.items()})  # from YAML, say: {1: 2}
 
     def replace(self, /, **changes: Any) -> Recipe:
         """This recipe with some fields changed.

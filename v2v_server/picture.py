@@ -5,7 +5,7 @@ One row shows one voxel grid: what the camera was, the frame that closes it, and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,14 +48,23 @@ class Row:
     flow: npt.NDArray[np.float16] | None = None
 
 
+def check_drawable(arrays: Collection[str]) -> None:
+    """Refuses arrays that a picture cannot be made of.
+
+    Raises:
+        UsageError: voxels or frames are not among them.
+    """
+    if not {"voxels", "frames"} <= set(arrays):
+        raise UsageError("a picture needs both arrays: --arrays voxels,frames")
+
+
 def draw_sample(sample: Sample, rows: int = 6) -> Image:
     """The voxel grids of one sample at evenly spaced times.
 
     Raises:
         UsageError: the sample lacks voxels or frames.
     """
-    if not {"voxels", "frames"} <= sample.arrays.keys():
-        raise UsageError("a picture needs both arrays: --arrays voxels,frames")
+    check_drawable(sample.arrays)
     voxels, frames, flow = sample.arrays["voxels"], sample.arrays["frames"], sample.arrays.get("flow")
     # Lead frames and lead voxels stand in front: the last entries of both belong together.
     count = min(len(array) for array in (voxels, frames, flow) if array is not None)

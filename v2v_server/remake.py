@@ -16,7 +16,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.candidates import next_candidate
 from v2v_server.jobs import describe
 from v2v_server.leases import Task
-from v2v_server.picture import draw_sample, write_png
+from v2v_server.picture import check_drawable, draw_sample, write_png
 from v2v_server.produce import decode_for, make_sample
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule
@@ -127,6 +127,8 @@ def simulate_to_file(
             there is no such snapshot.
     """
     stream = StreamSpec.from_dict(spec)
+    if picture is not None:
+        check_drawable(arrays)
     scene = stream.scene != "off"
     catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()

@@ -85,8 +85,9 @@ def test_changes_to_the_recipe_are_yaml():
         "threshold": [0.1, 0.5],
         "bins": 3,
     }
-    with pytest.raises(UsageError):
-        loadtest.recipe_of(None, ["bins={"])
+    for change in ("bins={", "gamma=2001-99-99"):
+        with pytest.raises(UsageError, match="not YAML"):
+            loadtest.recipe_of(None, [change])
 
 
 @pytest.mark.parametrize(("share", "value"), [(0.5, 50), (0.99, 99), (0.0, 1), (1.0, 100), (0.001, 1)])

@@ -178,9 +178,9 @@ def test_unknown_key_is_refused_with_the_nearest_known_one(make: Any) -> None:
         make({"noise_sigm": 0.1})
 
 
-@pytest.mark.parametrize("key", ["self", "cls", "changes", "__class__", "", "\0"])
-def test_no_key_escapes_as_another_error(key: str) -> None:
-    """A key named like a parameter must not become a TypeError: recipes come from the wire."""
+@pytest.mark.parametrize("key", ["self", "cls", "changes", "__class__", "", "\0", 1])
+def test_no_key_escapes_as_another_error(key: Any) -> None:
+    """A key named like a parameter, or that is none, must not become a TypeError: recipes come from the wire."""
     with pytest.raises(RecipeError, match="unknown recipe key"):
         Recipe.from_dict({key: 1})
 

@@ -15,6 +15,7 @@ from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Sample
 from v2v_server.picture import _NEGATIVE, _POSITIVE, Row, draw_rows, draw_sample, write_png
+from v2v_server.remake import simulate_to_file
 
 TILE, GAP, LABEL = 168, 6, 250
 WHITE = (255, 255, 255)
@@ -143,3 +144,11 @@ def test_png_reads_back(tmp_path: Path) -> None:
     assert np.array_equal(np.asarray(cv2.imread(str(tmp_path / "picture.png"))), image)
     with pytest.raises(UsageError, match=r"picture\.png: No such file or directory"):
         write_png(tmp_path / "nowhere" / "picture.png", image)
+
+
+def test_what_cannot_be_drawn_is_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a picture needs both arrays"):
+        simulate_to_file(
+            str(tmp_path / "absent"), out=tmp_path / "a.npz", picture=tmp_path / "a.png", list_file=None, rows="full",
+            spec={}, arrays=("voxels",), seed=0, epoch=0, index=0,
+        )  # fmt: skip
