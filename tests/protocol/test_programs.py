@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 import tomllib
 from pathlib import Path
@@ -40,6 +41,20 @@ def test_a_missing_package_is_named(
     line = capsys.readouterr().err
     assert line.startswith(f"v2v-convert: needs the Python package {said}, ")
     assert "pip install '.[convert]'" in line
+
+
+def test_a_local_server_without_its_packages_says_so_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def load(module: str) -> None:
+        raise ModuleNotFoundError("No module named 'av'", name="av")
+
+    monkeypatch.setattr(programs, "import_module", load)
+    monkeypatch.setattr(sys, "argv", ["v2v_server", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("v2v_server", run_name="__main__")
+    assert ended.value.code == 2  # that of wrong usage, which LocalServer quotes
+    assert "v2v-serve: needs the Python package av, " in capsys.readouterr().err
 
 
 def test_a_module_of_ours_that_is_missing_is_a_defect(monkeypatch: pytest.MonkeyPatch) -> None:
