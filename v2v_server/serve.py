@@ -109,8 +109,9 @@ def serve(config: ServeConfig) -> None:
             pool.stop()
             broker.close()
             catalogue.close()
-            if config.port_file:
-                Path(config.port_file).unlink(missing_ok=True)
+            if running.port_file_written:
+                with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend
+                    Path(config.port_file).unlink(missing_ok=True)
 
 
 @dataclass(slots=True)
@@ -124,8 +125,9 @@ class _Running:
     pool: Pool
     quarantine: Quarantine
     quarantine_file: Path
-    status: StatusLine = field(default_factory=StatusLine)
+    status: StatusLine = field(default_factory=lambda: StatusLine(sys.stderr))  # that of now, not of the import
     announced: bool = False
+    port_file_written: bool = False
     missing_told: float = -math.inf
 
     def every_tick(self, now: float) -> list[Instruction]:
@@ -141,6 +143,7 @@ class _Running:
             self._say(f"ready: consumers connect to {self.broker.address}, workers to {self.broker.worker_address}")
             if self.config.port_file:
                 _write_port_file(self.config.port_file, self.broker.address)
+                self.port_file_written = True
         if self.announced:
             self.status.update(now, self.dispatcher, self.pool.running)
         return instructions
@@ -199,11 +202,13 @@ def _private_address(label: str) -> str:
 def _write_port_file(file: str, address: str) -> None:
     """Writes the address in one step: whoever sees the file sees all of it."""
     path = Path(file)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.parent / f".{path.name}.{os.getpid()}"
     try:
         partial.write_text(address + "\n", encoding="utf-8")
         partial.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
         raise UsageError(f"--port-file {file}: {error.strerror}") from error
 
 

@@ -165,6 +165,19 @@ def test_a_start_that_cannot_be_ends_with_status_2_and_no_trace(
     assert "Traceback" not in done.stderr
 
 
+def test_a_port_file_that_cannot_be_written_is_one_line_and_leaves_nothing(
+    clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "port"
+    folder.mkdir()
+    flags = ["--videos", "{clips}", "--workers", "0", "--bind", "tcp://127.0.0.1:*", "--port-file", "{folder}"]
+    with pytest.raises(SystemExit) as ended:
+        serve(_filled_in(flags, clips=clips, folder=folder))
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"v2v-serve: --port-file {folder}: Is a directory\n")
+    assert list(tmp_path.iterdir()) == [folder]
+
+
 def test_the_start_says_which_videos_give_nothing_and_what_would_admit_them(clips: Path, tmp_path: Path) -> None:
     folder = tmp_path / "short"
     folder.mkdir()
