@@ -194,4 +194,6 @@ def _whole(name: str, value: object, low: int, high: int) -> None:
 
 def _choose(name: str, value: object, words: tuple[str, ...]) -> None:
     if value not in words:
-        raise UsageError(f"spec {name} = {value!r}: choose one of {', '.join(words)}")
+        # scene: off in a YAML file, of which the message would show nothing that was written.
+        hint = " (YAML reads off as a truth value: put it in quotes)" if value is False and "off" in words else ""
+        raise UsageError(f"spec {name} = {value!r}: choose one of {', '.join(words)}{hint}")

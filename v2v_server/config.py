@@ -115,7 +115,12 @@ class ServeConfig:
                 raise UsageError(f"--config {file}: unknown key {key!r}{hint}; known: {', '.join(known)}")
             kind = {"str": str, "int": int, "bool": bool}.get(str(known[key].type))
             if kind is not None and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
-                raise UsageError(f"--{key.replace('_', '-')} = {value!r}: expected a value of kind {kind.__name__}")
+                said = f"--{key.replace('_', '-')} = {value!r}: expected a value of kind {kind.__name__}"
+                # scene: off, say, of which the message would show nothing that was written.
+                bare = kind is str and isinstance(value, bool)
+                raise UsageError(
+                    f"{said} (YAML reads off, on, no and yes as truth values: put it in quotes)" if bare else said
+                )
         return cls(**values)
 
 

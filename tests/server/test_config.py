@@ -93,6 +93,7 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("insecure: 1", "--insecure = 1: expected a value of kind bool"),
         ("shuffle: 'no'", "--shuffle = 'no'"),
         ("bind: 5555", "--bind = 5555: expected a value of kind str"),
+        ("scene: off", "--scene = False: expected a value of kind str .*off, on, no and yes .* in quotes"),
         ("list: [a]", r"--list = \['a'\]: expected a value of kind str"),
         ("rows: top", "rows 'top'"),
         ("rows: top:1.5", "rows 0:1.5"),
