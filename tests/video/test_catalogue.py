@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pwd
 import shutil
 import sqlite3
 from contextlib import closing
@@ -19,6 +20,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoErro
 from v2v_server.video import catalogue as catalogue_module
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
+from v2v_server.video.refresh import index_path
 from v2v_server.video.rows import Rows
 from v2v_server.video.survey import survey
 
@@ -286,6 +288,19 @@ def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monk
     monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "chosen"))
     opener(corpus, cache_dir=None)
     assert len(list((tmp_path / "chosen").iterdir())) == 1
+
+
+def test_a_user_without_a_home_is_told_where_to_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("V2V_CACHE_DIR", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(user: int) -> None:
+        raise KeyError(user)
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    with pytest.raises(CorpusError, match=r"no home folder .* --cache-dir or V2V_CACHE_DIR"):
+        index_path(tmp_path, None)
+    assert index_path(tmp_path, tmp_path).parent == tmp_path
 
 
 def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:

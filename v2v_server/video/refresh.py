@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
+from v2v_protocol.errors import CorpusError
 from v2v_server.video.scenes import Looking
 from v2v_server.video.store import Record, Store
 from v2v_server.video.survey import survey
@@ -22,15 +23,29 @@ Progress = Callable[[int, int], None]
 
 
 def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
-    """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.video.catalogue.open_catalogue`."""
+    """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.video.catalogue.open_catalogue`.
+
+    Raises:
+        CorpusError: none was chosen, and this user has no home folder.
+    """
     if cache_dir is not None:
         folder = Path(cache_dir)
     elif chosen := os.environ.get("V2V_CACHE_DIR"):
         folder = Path(chosen)
     else:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or _home() / ".cache") / "v2v"
     name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
     return folder / f"catalogue-{name}.sqlite3"
+
+
+def _home() -> Path:
+    try:
+        return Path.home()
+    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
+        raise CorpusError(
+            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
+            "V2V_CACHE_DIR"
+        ) from error
 
 
 def up_to_date(
