@@ -13,7 +13,8 @@ from v2v_server.cli import serve
 from v2v_server.config import ServeConfig
 from v2v_server.quarantine_cli import main as quarantine
 
-UNIT = Path(__file__).parents[1] / "deploy" / "systemd" / "v2v-serve.service"
+DEPLOY = Path(__file__).parents[1] / "deploy"
+UNIT = DEPLOY / "systemd" / "v2v-serve.service"
 
 
 @pytest.fixture(scope="module")
@@ -46,3 +47,9 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
     quarantine(["--videos", str(tmp_path), "--cache-dir", str(tmp_path)])
     written = re.findall(r"^#   (\w+: .*)$", notes, re.MULTILINE)
     assert ServeConfig(**yaml.safe_load("\n".join(written))).workers == 8
+
+
+def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
+    (service,) = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].values()
+    assert service["init"] is True
+    assert "#   docker run --rm --init " in (DEPLOY / "Dockerfile").read_text()
