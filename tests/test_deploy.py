@@ -53,3 +53,10 @@ def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
     (service,) = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].values()
     assert service["init"] is True
     assert "#   docker run --rm --init " in (DEPLOY / "Dockerfile").read_text()
+
+
+def test_a_mistyped_folder_of_videos_is_not_made() -> None:
+    (service,) = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].values()
+    (videos,) = [volume for volume in service["volumes"] if "VIDEOS" in str(volume)]
+    assert (videos["type"], videos["target"], videos["read_only"]) == ("bind", "/videos", True)
+    assert videos["bind"] == {"create_host_path": False}
