@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from v2v_protocol.errors import UsageError
+from v2v_server.broker import Broker
 from v2v_server.cli import serve
 from v2v_server.config import ServeConfig
 from v2v_server.quarantine_cli import main as quarantine
@@ -18,11 +20,16 @@ UNIT = DEPLOY / "systemd" / "v2v-serve.service"
 
 
 @pytest.fixture(scope="module")
-def service() -> dict[str, str]:
+def unit() -> RawConfigParser:
     parser = RawConfigParser(strict=True)
     parser.optionxform = str  # type: ignore[assignment, method-assign]
     parser.read_string(UNIT.read_text())
-    return dict(parser["Service"])
+    return parser
+
+
+@pytest.fixture(scope="module")
+def service(unit: RawConfigParser) -> dict[str, str]:
+    return dict(unit["Service"])
 
 
 def test_the_unit_does_not_start_again_over_a_mistyped_key(
@@ -47,6 +54,14 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
     quarantine(["--videos", str(tmp_path), "--cache-dir", str(tmp_path)])
     written = re.findall(r"^#   (\w+: .*)$", notes, re.MULTILINE)
     assert ServeConfig(**yaml.safe_load("\n".join(written))).workers == 8
+
+
+def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawConfigParser) -> None:
+    # 192.0.2.0/24 is nobody's, like an address that the host does not have yet.
+    with pytest.raises(UsageError, match=r"--bind tcp://192\.0\.2\.1:5555"):
+        Broker("tcp://192.0.2.1:5555", "ipc://@v2v-test-deploy")
+    assert "network-online.target" in unit["Unit"]["After"].split()
+    assert unit["Unit"]["Wants"] == "network-online.target"
 
 
 def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
