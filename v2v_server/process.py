@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import platform
 import resource
 import signal
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
@@ -90,11 +92,35 @@ def open_many_files() -> None:
 
 
 def usable_cores() -> int:
-    """How many cores this process may run on: of a container, a batch system or ``taskset``, where they give fewer than
-    the machine has; of the machine where the system does not say."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """How many cores this process may use: those that a batch system, a container or ``taskset`` gave it, and no more
+    than the processor time that a container may spend amounts to; those of the machine where the system does not say.
+    """
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    return max(1, min(cores, math.ceil(min(_granted_cores(), cores))))
+
+
+def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float:
+    """Processor time that this process and its siblings are granted in a second, the strictest limit of its control
+    group (Linux, version 2) and of those above it: ``docker run --cpus``, a pod's limit, CPUQuota of systemd.
+
+    Returns:
+        seconds a second; infinite without a limit.
+    """
+    try:
+        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
+    except (OSError, ValueError):
+        return math.inf
+    least, folder = math.inf, groups
+    for part in ("", *path.strip("/").split("/")):
+        folder = folder / part
+        try:
+            quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()
+        except (OSError, ValueError):
+            continue  # the topmost group has none
+        if quota != "max":
+            least = min(least, int(quota) / int(period))
+    return least
 
 
 def give_way() -> None:

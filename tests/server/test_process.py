@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -35,6 +37,7 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
         "print(usable_cores())\n"
     )
     assert said == ["1"]
+    monkeypatch.setattr(process, "_granted_cores", lambda: math.inf)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 9})
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     processes = []
@@ -54,6 +57,31 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
     assert process.usable_cores() == 64
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert process.usable_cores() == 1
+
+
+def test_a_container_is_given_processor_time_instead_of_cores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own, groups = tmp_path / "own", tmp_path / "groups"
+    (groups / "pods" / "mine").mkdir(parents=True)
+    assert process._granted_cores(groups, own) == math.inf
+    own.write_text("1:name=systemd:/\n")  # version 1
+    assert process._granted_cores(groups, own) == math.inf
+    own.write_text("0::/pods/mine\n")
+    assert process._granted_cores(groups, own) == math.inf
+    (groups / "pods" / "mine" / "cpu.max").write_text("max 100000\n")
+    assert process._granted_cores(groups, own) == math.inf
+    (groups / "pods" / "cpu.max").write_text("250000 100000\n")
+    assert process._granted_cores(groups, own) == 2.5
+    (groups / "pods" / "mine" / "cpu.max").write_text("50000 100000\n")
+    assert process._granted_cores(groups, own) == 0.5
+    own.write_text("0::/\n")  # as in a container's own namespace
+    (groups / "cpu.max").write_text("150000 100000\n")
+    assert process._granted_cores(groups, own) == 1.5
+    own.write_text("0::/../elsewhere\n")  # moved there from outside
+    assert process._granted_cores(groups, own) == 1.5
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
+    for granted, cores in ((0.5, 1), (1.5, 2), (4.0, 4), (100.0, 64), (math.inf, 64)):
+        monkeypatch.setattr(process, "_granted_cores", lambda granted=granted: granted)
+        assert process.usable_cores() == cores
 
 
 def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:
