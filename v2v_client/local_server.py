@@ -15,6 +15,7 @@ from typing import IO
 import psutil
 
 from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.programs import environment
 
 _POLL_SECONDS = 0.05
 _LAST_LINES = 12
@@ -70,7 +71,11 @@ class LocalServer:
             command += ["--parent-pid", str(os.getpid())]
             try:
                 self._process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._errors
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=self._errors,
+                    env=environment(),
                 )
                 self.address = self._wait_for(port_file, self._process)
             except BaseException:

@@ -1,10 +1,13 @@
-"""The programs, as pip installs them. One whose packages were not installed along says so in a line."""
+"""The programs, as pip installs them. One whose packages were not installed along says so in a line; those that one
+starts come from where it came from."""
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks"})
 
@@ -37,6 +40,19 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
         return status
 
     return run
+
+
+def environment() -> dict[str, str]:
+    """The environment in which one of our processes starts another by ``python -m``.
+
+    That looks for modules in the folder that somebody happens to stand in, before all others: a checkout of another
+    state than the installed one, or a file named like a module. It shall look there only if this process did.
+    """
+    try:
+        is_home = Path(__file__).parents[1].samefile(os.curdir)
+    except OSError:  # the folder is gone
+        is_home = False
+    return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 
 
 serve = _program("v2v-serve", "v2v_server.cli", "serve", "server")

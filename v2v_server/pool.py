@@ -21,6 +21,7 @@ from pathlib import Path
 import psutil
 
 from v2v_protocol.errors import WorkerCrashLoop
+from v2v_protocol.programs import environment
 from v2v_server.blame import Cause, Loss
 from v2v_server.logbook import Logbook
 
@@ -199,7 +200,7 @@ class Pool:
             [*_command(self._address, self._root, name), "--logbook-fd", str(slot.logbook.descriptor)],
             stdin=subprocess.DEVNULL,
             pass_fds=(slot.logbook.descriptor,),
-            env=os.environ | _ONE_THREAD,
+            env=environment() | _ONE_THREAD,
             process_group=0,
         )
 

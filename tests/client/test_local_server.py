@@ -1,3 +1,5 @@
+import os
+
 import psutil
 import pytest
 
@@ -21,8 +23,10 @@ def program(tmp_path, monkeypatch):
     def write(text):
         package = tmp_path / "v2v_server"
         package.mkdir()
+        (package / "__init__.py").touch()
         (package / "__main__.py").write_text(BEGIN + text)
         monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
 
     return write
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import runpy
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -11,7 +13,8 @@ import pytest
 
 from v2v_protocol import programs
 
-SCRIPTS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
+HOME = Path(__file__).parents[2]
+SCRIPTS = tomllib.loads((HOME / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
 
 
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
@@ -64,3 +67,28 @@ def test_a_module_of_ours_that_is_missing_is_a_defect(monkeypatch: pytest.Monkey
     monkeypatch.setattr(programs, "import_module", load)
     with pytest.raises(ModuleNotFoundError):
         programs.serve()
+
+
+def test_what_a_program_starts_does_not_come_from_the_folder_that_somebody_stands_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "v2v_protocol").mkdir()
+    (tmp_path / "v2v_protocol" / "__init__.py").write_text("")
+    (tmp_path / "v2v_protocol" / "programs.py").write_text("print('of another state')")
+    monkeypatch.setenv("PYTHONPATH", str(HOME), prepend=os.pathsep)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+
+    def said(environment: dict[str, str]) -> str:
+        command = [sys.executable, "-m", "v2v_protocol.programs"]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    monkeypatch.chdir(tmp_path)
+    assert said(dict(os.environ)) == "of another state\n"
+    assert said(programs.environment()) == ""
+    monkeypatch.chdir(HOME)  # where nothing need be installed
+    assert programs.environment() == dict(os.environ)
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert "PYTHONSAFEPATH" in programs.environment()
