@@ -206,7 +206,10 @@ def work(asked: argparse.Namespace) -> int:
     Raises:
         V2VError: wrong usage, or no server.
     """
-    device = torch.device(asked.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    try:
+        device = torch.device(asked.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    except RuntimeError as error:
+        raise UsageError(f"--device {asked.device}: give cuda, cuda:N or cpu") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise UsageError(f"--device {device}: this PyTorch sees no CUDA device")
     if device.type == "cpu":

@@ -121,6 +121,8 @@ def main() -> int:
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    if arguments.turns < 1:
+        parser.error(f"--turns {arguments.turns}: give 1 or more")
     records = measure(arguments.turns)
     for record in records:
         print(

@@ -29,7 +29,7 @@ import numpy as np
 from benchmarks import plots
 from benchmarks.jobs import open_jobs, whole_sample
 from benchmarks.null_service import null_service
-from benchmarks.records import parser_of, recipe_of, run, server_flags, show, write
+from benchmarks.records import at_least, parser_of, recipe_of, run, server_flags, show, write
 from benchmarks.routes import Route, travel
 from benchmarks.usage import consume
 from v2v_client.dataset import V2VStreamDataset
@@ -131,6 +131,7 @@ def work(asked: argparse.Namespace) -> int:
     Raises:
         V2VError: wrong usage, or a process that died.
     """
+    at_least(asked, batch_size=1)
     recipe, size = recipe_of(asked.changes), asked.batch_size
     records, samples = made_alone(asked.videos, asked.rows, recipe, size, asked.seconds)
     nbytes = records[0]["bytes_per_batch"]

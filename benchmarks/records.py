@@ -73,6 +73,22 @@ def run(
         return 2
 
 
+def at_least(asked: argparse.Namespace, **least: int) -> None:
+    """Refuses numbers that are too small.
+
+    Args:
+        asked: the command line.
+        least: the least value of each flag, by its name in ``asked``.
+
+    Raises:
+        UsageError: one is smaller; the message names the flag.
+    """
+    for name, bound in least.items():
+        value = getattr(asked, name)
+        if value < bound:
+            raise UsageError(f"--{name.replace('_', '-')} {value}: give {bound} or more")
+
+
 def recipe_of(changes: Sequence[str]) -> Recipe:
     """The paper's recipe with the changes of ``--set``.
 

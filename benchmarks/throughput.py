@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks.contenders import BASELINE, LIMIT, Contender, Corpus, Measured, Setting, line_up
 from benchmarks.plots import bars, panels
-from benchmarks.records import Column, parser_of, run, say_missed, show, write
+from benchmarks.records import Column, at_least, parser_of, run, say_missed, show, write
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import SPEED_PRESETS
 from v2v_server.process import usable_cores
@@ -123,6 +123,7 @@ def _prepared(text: str) -> Corpus:
 
 
 def _work(asked: argparse.Namespace) -> int:
+    at_least(asked, workers=1, batch_size=1, turns=1, warmup_batches=0)
     unknown = set(asked.presets.split(",")) - set(SPEED_PRESETS)
     if unknown:
         raise UsageError(f"--presets {asked.presets}: choose of {', '.join(SPEED_PRESETS)}")

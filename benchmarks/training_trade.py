@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from benchmarks.records import Column, parser_of, run, show, write
+from benchmarks.records import Column, at_least, parser_of, run, show, write
 from trainer.checkpoint import load_checkpoint
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
@@ -166,6 +166,7 @@ def _seeds(text: str) -> tuple[int, ...]:
 
 
 def _work(asked: argparse.Namespace) -> int:
+    at_least(asked, workers=1, samples=1, steps=0)
     torch.set_num_threads(1)
     records = compare(asked)
     show(records, _COLUMNS)

@@ -37,3 +37,30 @@ def test_an_error_of_the_system_is_one_line_too(
 def test_what_is_unknown_is_named_with_what_is_known(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["nothing"]) == 2
     assert "no benchmark 'nothing'; known: chaos, chaos_check, corpus, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("throughput --videos clips --turns 0", "--turns 0: give 1 or more"),
+        ("throughput --videos clips --workers 0", "--workers 0: give 1 or more"),
+        ("throughput --videos clips --batch-size 0", "--batch-size 0: give 1 or more"),
+        ("throughput --videos clips --warmup-batches -1", "--warmup-batches -1: give 0 or more"),
+        ("limits --videos clips --batch-size 0", "--batch-size 0: give 1 or more"),
+        ("training_trade --videos clips --held-out more --samples 0", "--samples 0: give 1 or more"),
+        ("gpu_feed --videos clips --device gpu", "--device gpu: give cuda, cuda:N or cpu"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_in_a_line(
+    command: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, *rest = command.split()
+    assert cli.main([name, *rest]) == 2
+    assert capsys.readouterr().err == f"{name}: {said}\n"
+
+
+def test_no_turn_of_the_kernel_is_refused_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["kernel", "--turns", "0"])
+    assert ended.value.code == 2
+    assert "--turns 0: give 1 or more" in capsys.readouterr().err
