@@ -2,7 +2,7 @@
 
 NAME is a module of this package with a ``main``; it is imported only when asked for, so that one benchmark does not
 need the packages of another. ``v2v-bench NAME --help`` shows its flags. Exit status: 0 success, 1 a stated bar of the
-benchmark missed, 2 wrong usage or input.
+benchmark missed, 2 wrong usage or input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -10,14 +10,17 @@ from __future__ import annotations
 import ast
 import importlib
 import pkgutil
+import signal
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import benchmarks
 from v2v_protocol.errors import V2VError
 
+INTERRUPTED = 128 + signal.SIGINT
 _LINE_WIDTH = 104
 _PARTS = frozenset({"cli", "chaos_consumer", "null_worker", "route_process"})
 """Modules whose ``main`` is for processes that benchmarks start."""
@@ -54,13 +57,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Each main reads the command line itself, the way it does as a module of its own.
     before, sys.argv = sys.argv, [f"v2v-bench {name}", *rest]
     try:
-        status = importlib.import_module(f"benchmarks.{name}").main()
+        with _ended_by_sigterm():
+            status = importlib.import_module(f"benchmarks.{name}").main()
     except (V2VError, OSError) as error:  # of a result that was printed and cannot be written, say
         print(f"v2v-bench {name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print(f"v2v-bench {name}: interrupted", file=sys.stderr)
+        return INTERRUPTED
     finally:
         sys.argv = before
     return int(status)
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """A SIGTERM ends a benchmark as an exception does, so that everything that was started is ended too."""
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":

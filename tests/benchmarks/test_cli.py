@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,26 @@ def test_no_turn_of_the_kernel_is_refused_too(capsys: pytest.CaptureFixture[str]
         cli.main(["kernel", "--turns", "0"])
     assert ended.value.code == 2
     assert "--turns 0: give 1 or more" in capsys.readouterr().err
+
+
+def test_a_signal_ends_a_benchmark_in_order(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended: list[str] = []
+
+    def signalled(number: signal.Signals) -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            ended.append(number.name)  # processes and folders, say
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(corpus, "main", lambda: signalled(signal.SIGTERM))
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["corpus"])
+    assert exit_.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is before
+    monkeypatch.setattr(corpus, "main", lambda: signalled(signal.SIGINT))
+    assert cli.main(["corpus"]) == 130
+    assert capsys.readouterr().err == "v2v-bench corpus: interrupted\n"
+    assert ended == ["SIGTERM", "SIGINT"]
