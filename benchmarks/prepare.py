@@ -3,11 +3,12 @@
     python -m benchmarks.prepare --videos DIR --seconds 120 --json prepare.json --plot prepare.png
 
 A job is what a sample asks of the decoder: one crop of 201 consecutive frames, file opened and sought. All settings
-take turns with the source, job by job, until the time is up; ratios are medians over pairs taken side by side, in
-processor time. Transcoding comes before that and takes as long as it takes.
+take turns with the source, job by job, until the time is up; a setting has the ratio of the processor time of all
+jobs. Transcoding comes before that and takes as long as it takes.
 
 The second table changes only how a file is decoded: H.264 without its loop filter, and the codecs whose standards leave
-the inverse transform open, in FFmpeg's bit-exact mode. There, speed is relative to the same file decoded plainly.
+the inverse transform open, in FFmpeg's bit-exact mode. There, speed is relative to the same file decoded plainly: the
+median over pairs taken side by side.
 """
 
 from __future__ import annotations
