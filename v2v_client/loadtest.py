@@ -262,6 +262,13 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
     )
 
 
+def _server_flags(arguments: argparse.Namespace) -> list[str]:
+    # A server looks at its own recipe to say which videos are long enough, so it is given ours.
+    settings = {"--rows": arguments.rows, "--recipe": arguments.recipe}
+    flags = [part for flag, value in settings.items() if value for part in (flag, value)]
+    return [*flags, *(part for change in arguments.changes for part in ("--set", change))]
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Measures, prints, writes; returns the exit status.
 
@@ -283,10 +290,9 @@ def run(arguments: argparse.Namespace) -> int:
         dataset = _dataset(arguments, arguments.connect)
         results.append(measure(dataset, address=arguments.connect, workers=None, server=None, **options))
     else:
-        flags = ["--rows", arguments.rows] if arguments.rows else []
         _dataset(arguments, "tcp://127.0.0.1:0")  # a wrong option should not cost the start of a server
         for workers in arguments.workers or (1, 2):
-            with LocalServer(arguments.videos, workers=workers, flags=flags) as server:
+            with LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server:
                 dataset = _dataset(arguments, server.address)
                 results.append(measure(dataset, address=server.address, workers=workers, server=server, **options))
     records = [record for record, _ in results]

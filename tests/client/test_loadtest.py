@@ -1,4 +1,5 @@
 import json
+import os
 
 import pytest
 
@@ -69,6 +70,34 @@ def test_wrong_usage_is_one_line_and_status_2(server, tmp_path, capsys, flags, w
     error = capsys.readouterr().err
     assert word in error
     assert error.count("\n") == 1
+
+
+def test_a_server_of_its_own_has_the_recipe_that_is_asked_for(server, monkeypatch):
+    started = []
+
+    class Local:
+        pid = os.getpid()
+
+        def __init__(self, videos, *, workers, flags):
+            self.address = server.address
+            started.append((videos, workers, flags))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def cpu_seconds(self):
+            return {}
+
+        rss_bytes = cpu_seconds
+
+    monkeypatch.setattr(loadtest, "LocalServer", Local)
+    flags = ["--videos", "clips", "--workers", "3", "--batch-size", "4", "--seconds", "0.1", "--rows", "top:0.5"]
+    # With its own, the paper's 201 frames, it would refuse clips that are long enough for this.
+    assert loadtest.main([*flags, "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"]) == 0
+    assert started == [("clips", 3, ["--rows", "top:0.5", "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"])]
 
 
 def test_no_server_is_status_2(capsys):
