@@ -100,10 +100,12 @@ def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
 
 
 def _server_flags(stream: StreamConfig) -> list[str]:
-    # A server looks at its own recipe to say which videos are long enough, so it is given ours.
+    # A server looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what
+    # the videos show only if it is told at its start.
     recipe = stream.resolved_recipe.to_dict().items()
     flags = [text for key, value in recipe for text in ("--set", f"{key}={json.dumps(value)}")]
-    return ["--rows", stream.rows, *flags, *(("--list", stream.list) if stream.list else ())]
+    asked = {"--list": stream.list, "--scene": stream.spec.get("scene")}
+    return ["--rows", stream.rows, *flags, *(part for flag, value in asked.items() if value for part in (flag, value))]
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -15,15 +15,28 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trainer.config import StreamConfig
 from trainer.distributed import Ranks, ranks
 from trainer.ema import AveragedNetwork, decay_at
 from trainer.interruption import StopRequest
 from trainer.models import FireNet
 from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
 from trainer.reporting import METRICS, Meter, Reporter, read_metrics
+from trainer.train import _server_flags
 from v2v_protocol.errors import ServerLost, UsageError
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
+
+
+def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
+    recipe = {"preset": "clean", "bins": 3}
+    plain = _server_flags(StreamConfig(videos="clips", recipe=recipe, rows="top:0.5"))
+    assert plain[:2] == ["--rows", "top:0.5"]
+    assert plain[plain.index("bins=3") - 1] == "--set"
+    assert "--list" not in plain
+    assert "--scene" not in plain
+    asked = _server_flags(StreamConfig(videos="clips", recipe=recipe, list="some.txt", spec={"scene": "auto"}))
+    assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
 
 
 # --- the averaged network ---------------------------------------------------------------------------------------------
