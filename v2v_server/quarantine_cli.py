@@ -46,7 +46,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _root(source: Path) -> Path:
     """The corpus folder that a catalogue of this source would have."""
-    if not source.exists():
+    try:
+        is_there = source.exists()
+    except OSError as error:
+        raise CorpusError(f"--videos {source}: cannot be looked at: {error.strerror or error}") from error
+    if not is_there:
         raise CorpusError(f"--videos {source}: there is no such folder, video or list file")
     return (source if source.is_dir() else source.parent).resolve()
 

@@ -300,13 +300,17 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.logbook`.
 
     Raises:
-        CorpusError: the folder is missing.
+        CorpusError: the folder is missing, or this user may not look at it.
         UsageError: the address cannot be connected to.
         RemoteError, VersionMismatch: the server refuses this worker.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    if not root.is_dir():
+    try:
+        is_there = root.is_dir()
+    except OSError as error:
+        raise CorpusError(f"--videos {root}: cannot be looked at: {error.strerror or error}") from error
+    if not is_there:
         raise CorpusError(f"--videos {root}: no such folder on this host")
     keep_freed_memory()
     # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.

@@ -19,7 +19,7 @@ import zmq
 
 from tests.protocol.wire_messages import example
 from v2v_protocol import PROTOCOL_VERSION
-from v2v_protocol.errors import VersionMismatch, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import CorpusError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (
     Begun,
     ErrorCode,
@@ -178,6 +178,11 @@ def test_what_its_host_lacks_is_not_called_the_videos_fault(server: Server, kind
     assert server.heard() == Begun(1)
     server.lets_it_finish(error=kind("a.mp4", None, "cannot be read"))
     assert server.heard() == JobFailed(1, None, "cannot be read", here=True)
+
+
+def test_a_corpus_that_cannot_be_looked_at_is_said() -> None:
+    with pytest.raises(CorpusError, match=r"--videos x+: cannot be looked at: File name too long"):
+        run_worker("tcp://127.0.0.1:1", Path("x" * 300), None, None)
 
 
 def test_a_worker_told_to_stop_begins_nothing_more(server: Server) -> None:

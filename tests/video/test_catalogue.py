@@ -20,6 +20,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoErro
 from v2v_server.video import catalogue as catalogue_module
 from v2v_server.video.catalogue import Catalogue, open_catalogue
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
+from v2v_server.video.manifest import MANIFEST_NAME
 from v2v_server.video.refresh import index_path
 from v2v_server.video.rows import Rows
 from v2v_server.video.survey import survey
@@ -98,6 +99,18 @@ def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> N
     ]
 
 
+def denied_at(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Permission is denied to look at this path alone."""
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if os.fspath(path) == str(place):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(os, "stat", denied)
+
+
 def test_an_index_keeps_what_cannot_be_looked_at_today(
     corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +131,22 @@ def test_an_index_keeps_what_cannot_be_looked_at_today(
     again = opener(corpus)
     assert again.digest == first.digest
     assert opener.probed == [3, 0, 0]
+
+
+@pytest.mark.parametrize("where", ["", MANIFEST_NAME])
+def test_a_corpus_that_cannot_be_looked_at_is_one_line(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    denied_at(corpus / where, monkeypatch)
+    with pytest.raises(CorpusError, match=rf"^{corpus}: cannot be looked at: Permission denied$"):
+        opener(corpus)
+
+
+def test_a_folder_that_may_be_listed_but_not_entered_keeps_nobody_out(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denied_at(corpus / "sub" / MANIFEST_NAME, monkeypatch)
+    assert len(opener(corpus).videos) == 3
 
 
 def test_storage_that_fails_for_a_moment_costs_nothing(

@@ -218,10 +218,14 @@ def open_catalogue(
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
 
     Raises:
-        CorpusError: there is no such folder or list, it makes no sense, or not one video of it can be used.
+        CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
+            be used.
     """
-    root, listed = _wanted(Path(source), list_file)
-    manifest = find_manifest(root)
+    try:
+        root, listed = _wanted(Path(source), list_file)
+        manifest = find_manifest(root)
+    except OSError as error:  # a folder that this user may not enter, a share that has gone
+        raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
     refused: dict[str, str] = {}
     if manifest is not None:
         manifest.check_served(rows)

@@ -175,6 +175,7 @@ def find_manifest(root: Path) -> Manifest | None:
 
     Raises:
         CorpusError: the manifest makes no sense, or the folder is a part of a prepared one.
+        OSError: the folder cannot be looked into.
     """
     for folder in root.parents:
         if (folder / MANIFEST_NAME).exists():
@@ -192,7 +193,11 @@ def refuse_prepared_below(root: Path, ids: Iterable[str]) -> None:
         CorpusError: one does.
     """
     for folder in sorted({parent for id in ids for parent in PurePosixPath(id).parents}):
-        if (root / folder / MANIFEST_NAME).exists():
+        try:
+            is_prepared = (root / folder / MANIFEST_NAME).exists()
+        except OSError:  # where nobody may look, no video can be read either: each says so itself
+            continue
+        if is_prepared:
             raise CorpusError(
                 f"{root / folder} is a prepared folder and cannot be a part of another corpus: name it itself, or move "
                 "it out"
