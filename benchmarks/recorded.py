@@ -56,7 +56,7 @@ def read_recording(path: Path) -> Recording:
     try:
         import faery
     except ImportError as error:
-        raise UsageError("--recording needs faery: pip install 'v2v-stream[convert]'") from error
+        raise UsageError("--recording needs faery: pip install '.[convert]' in a checkout of v2v-stream") from error
     if not path.is_file():
         raise UsageError(f"--recording {path}: no such file")
     frames, times, parts = [], [], []

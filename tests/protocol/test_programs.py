@@ -46,6 +46,13 @@ def test_a_missing_package_is_named(
     assert "pip install '.[convert]'" in line
 
 
+def test_nobody_is_sent_to_an_index_that_does_not_have_us() -> None:
+    folders = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks", "docs")
+    texts = [path for folder in folders for path in (HOME / folder).rglob("*") if path.suffix in (".py", ".md")]
+    assert len(texts) > 100
+    assert not [path for path in (HOME / "README.md", *texts) if "install 'v2v-stream" in path.read_text("utf-8")]
+
+
 def test_a_local_server_without_its_packages_says_so_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

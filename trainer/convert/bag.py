@@ -49,7 +49,9 @@ def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
     try:
         from rosbags.rosbag1 import Reader, ReaderError
     except ImportError as error:
-        raise UsageError("bags need the rosbags package: pip install 'v2v-stream[convert]'") from error
+        raise UsageError(
+            "bags need the rosbags package: pip install '.[convert]' in a checkout of v2v-stream"
+        ) from error
     try:
         with Reader(path) as bag:
             connections = list(bag.connections)

@@ -168,7 +168,9 @@ def _faery() -> ModuleType:
     try:
         import faery
     except ImportError as error:
-        raise UsageError("this form needs the faery package: pip install 'v2v-stream[convert]'") from error
+        raise UsageError(
+            "this form needs the faery package: pip install '.[convert]' in a checkout of v2v-stream"
+        ) from error
     module: ModuleType = faery
     return module
 

@@ -233,7 +233,8 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for module in ("faery", "rosbags", "rosbags.rosbag1"):
         if module.startswith(package):
             monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match=rf"{package} package: pip install 'v2v-stream\[convert\]'"):
+    remedy = rf"{package} package: pip install '\.\[convert\]' in a checkout of v2v-stream$"
+    with pytest.raises(UsageError, match=remedy):
         convert(source, tmp_path / "a.h5")
 
 
