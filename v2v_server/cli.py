@@ -61,8 +61,11 @@ def serve(argv: Sequence[str] | None = None) -> None:
         from v2v_server.serve import serve as run_server
 
         flags = {name: value for name, value in vars(arguments).items() if name not in ("debug", "config", "set")}
-        flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
-        run_server(ServeConfig.load(arguments.config, flags))
+        # Without --recipe the fields of --set are changed in what the file says.
+        settings = arguments.set if arguments.recipe is None else []
+        if arguments.recipe is not None:
+            flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
+        run_server(ServeConfig.load(arguments.config, flags, settings))
 
     run_command(parser, run, argv)
 

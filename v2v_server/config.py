@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import ipaddress
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -93,8 +93,13 @@ class ServeConfig:
         object.__setattr__(self, "spec", spec)
 
     @classmethod
-    def load(cls, file: str | None, flags: Mapping[str, Any]) -> ServeConfig:
+    def load(cls, file: str | None, flags: Mapping[str, Any], settings: Sequence[str] = ()) -> ServeConfig:
         """The configuration from an optional YAML file and the flags that were given (None: not given).
+
+        Args:
+            file: the YAML file.
+            flags: by the names of the attributes.
+            settings: of `--set`, to change single fields of the recipe.
 
         Raises:
             UsageError: the file cannot be read, it has a key twice, or see the class.
@@ -121,15 +126,18 @@ class ServeConfig:
                 raise UsageError(
                     f"{said} (YAML reads off, on, no and yes as truth values: put it in quotes)" if bare else said
                 )
+        if settings:
+            values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
         return cls(**values)
 
 
-def recipe_setting(recipe: str | None, settings: list[str]) -> Any:
+def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Any:
     """What `--recipe` and any number of `--set KEY=VALUE` ask for together.
 
     Args:
         recipe: a preset's name, a YAML file of recipe fields (it may name its ``preset``), or None.
         settings: "key=value" texts, values in YAML ("[0.2, 0.5]", "true", "3").
+        configured: what a configuration file says instead of ``recipe``: a preset's name or a mapping of fields.
 
     Returns:
         None when nothing was asked, else something ``StreamSpec.from_dict`` takes as ``recipe``.
@@ -143,6 +151,8 @@ def recipe_setting(recipe: str | None, settings: list[str]) -> Any:
     if recipe is not None:
         is_file = recipe.endswith((".yaml", ".yml"))
         fields = read_yaml_mapping("--recipe", recipe) if is_file else {"preset": recipe}
+    elif configured is not None:
+        fields = dict(configured) if isinstance(configured, Mapping) else {"preset": configured}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
+from v2v_server.cli import serve
 from v2v_server.config import DEFAULT_BIND, ServeConfig, read_yaml_mapping, recipe_setting
 
 
@@ -64,6 +65,38 @@ def test_keys_may_be_written_as_the_flags_are(tmp_path: Path) -> None:
         load(tmp_path, "videos: a\nport-file: a\nport_file: b\n")
     with pytest.raises(UsageError, match=r"unknown key 'worker_bin' \(did you mean 'worker_bind'\?\)"):
         load(tmp_path, "videos: a\nworker-bin: a\n")
+
+
+@pytest.mark.parametrize(
+    ("flags", "recipe"),
+    [
+        ("", "clean gamma=1.5"),
+        ("--set bins=3", "clean gamma=1.5 bins=3"),
+        ("--set gamma=2 --set bins=3", "clean gamma=2 bins=3"),
+        ("--recipe davis346", "davis346"),
+        ("--recipe davis346 --set bins=3", "davis346 bins=3"),
+    ],
+)
+def test_single_fields_are_changed_in_the_recipe_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, recipe: str
+) -> None:
+    file = tmp_path / "serve.yaml"
+    file.write_text("videos: a\nrecipe: {preset: clean, gamma: 1.5}\n")
+    served: list[ServeConfig] = []
+    monkeypatch.setattr("v2v_server.serve.serve", served.append)
+    serve(["--config", str(file), *flags.split()])
+    name, *changes = recipe.split()
+    assert served[0].spec.recipe == recipe_setting(name, changes)
+
+
+def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tmp_path: Path) -> None:
+    file = tmp_path / "serve.yaml"
+    file.write_text("videos: a\nrecipe: clean\n")
+    assert ServeConfig.load(str(file), {}, ["bins=3"]).spec.recipe == preset("clean").replace(bins=3)
+    assert ServeConfig.load(None, {"videos": "a"}, ["bins=3"]).spec.recipe == Recipe(bins=3)
+    file.write_text("videos: a\nrecipe: 5\n")
+    with pytest.raises(RecipeError, match="unknown recipe preset 5"):
+        ServeConfig.load(str(file), {}, ["bins=3"])
 
 
 def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
