@@ -14,7 +14,8 @@ import pytest
 from v2v_protocol import programs
 
 HOME = Path(__file__).parents[2]
-SCRIPTS = tomllib.loads((HOME / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
+PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text("utf-8"))["project"]
+SCRIPTS = PROJECT["scripts"]
 
 
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
@@ -44,6 +45,12 @@ def test_a_missing_package_is_named(
     line = capsys.readouterr().err
     assert line.startswith(f"v2v-convert: needs the Python package {said}, ")
     assert "pip install '.[convert]'" in line
+
+
+def test_no_decoder_is_installed_that_does_not_tell_damage() -> None:
+    (bound,) = [text for text in PROJECT["optional-dependencies"]["server"] if text.startswith("av")]
+    # PyAV 14 lacks what is imported; 15 has FFmpeg 7, which delivers damaged FFV1 without a word.
+    assert int(bound.removeprefix("av>=")) >= 16
 
 
 def test_nobody_is_sent_to_an_index_that_does_not_have_us() -> None:
