@@ -205,7 +205,7 @@ class Position:
             self._progress.set(state.epoch, shared)
             self._empty_rest = consumer.rest(saved) if state.epoch > saved.epoch else None
         else:
-            self._progress.set(state.epoch, shared, iteration=self._name(loader))
+            self._progress.set(state.epoch, shared, iteration=self._name(loader), worker=loader.id)
             self._loaded = state
         self._here = state
 

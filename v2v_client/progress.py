@@ -50,7 +50,8 @@ class Standing:
     state: ResumeState | None = None
     stream: Stream | None = None
     stale: bool = False
-    tokens: set[str] = field(default_factory=set)
+    loads: dict[tuple[str, int], int] = field(default_factory=dict)
+    tokens: set[tuple[str, int]] = field(default_factory=set)
     starts: dict[tuple[str, int], int] = field(default_factory=dict)
     decisions: dict[tuple[str, int], tuple[int, ResumeState | None]] = field(default_factory=dict)
     beginnings: int = 0
@@ -61,10 +62,8 @@ class Standing:
         """One more line of the log."""
         match line["kind"]:
             case "set":
-                if line["token"] in self.tokens:
-                    return  # every loader worker loads its own copy of what is one event
-                if line["token"] is not None:
-                    self.tokens.add(line["token"])
+                if line["token"] is not None and not self._is_first_of_its_event(line["token"], line["worker"]):
+                    return
                 self._begin(line["epoch"], line["state"])
                 self.stale = self.stale and line["keeps_stale"]
             case "main":
@@ -90,12 +89,22 @@ class Standing:
         """One of its own, to be gone on with."""
         return replace(
             self,
+            loads=dict(self.loads),
             tokens=set(self.tokens),
             starts=dict(self.starts),
             decisions=dict(self.decisions),
             decided_after=dict(self.decided_after),
             finished={iteration: set(workers) for iteration, workers in self.finished.items()},
         )
+
+    def _is_first_of_its_event(self, token: str, worker: int) -> bool:
+        """Whether a loader worker loads what none beside it has loaded yet: each has its own copy of one event. Where a
+        loader is restored again, that is another one, although it has the seeds, so the token, of the first time."""
+        self.loads[token, worker] = self.loads.get((token, worker), 0) + 1
+        event = token, self.loads[token, worker]
+        first = event not in self.tokens
+        self.tokens.add(event)
+        return first
 
     def _begin(self, epoch: int, state: Mapping[str, Any] | None) -> None:
         self.beginnings += 1
@@ -152,14 +161,17 @@ class Progress:
             self._known = end, standing
         return standing
 
-    def set(self, epoch: int, state: ResumeState | None, *, iteration: str | None = None) -> None:
+    def set(
+        self, epoch: int, state: ResumeState | None, *, iteration: str | None = None, worker: int | None = None
+    ) -> None:
         """The next iteration delivers ``epoch``, from ``state`` on.
 
         Args:
-            iteration: given by loader workers that all load the same state: counts once.
+            iteration, worker: given by loader workers that all load the same state: counts once.
         """
         plain = None if state is None else state.to_dict()
-        self._append(kind="set", token=iteration, epoch=epoch, state=plain, keeps_stale=iteration is not None)
+        keeps_stale = iteration is not None
+        self._append(kind="set", token=iteration, worker=worker, epoch=epoch, state=plain, keeps_stale=keeps_stale)
 
     def main(self) -> None:
         """The process that owns the dataset iterates by itself."""

@@ -160,3 +160,12 @@ def test_the_state_of_a_rank_is_taken_up_by_workers(server):
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(2)][-1]
     assert in_order(run(dataset(server), 100, [state, state])) == whole(0, first=2)
+
+
+def test_a_state_that_is_loaded_again_is_where_the_next_iteration_begins(server):
+    """As after two losses that are not finite. A loader's state has its seeds, so they are those of the first time."""
+    stream = dataset(server)
+    states = [outcome.batches[-1][2] for outcome in run(stream, 100, most=(2, 1))]
+    for _ in range(2):
+        assert in_order(run(stream, 100, states)) == [whole(0)[4], whole(0)[3]]
+        assert in_order(run(stream, 200)) == whole(1)
