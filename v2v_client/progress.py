@@ -15,6 +15,9 @@ answers. It has no name, so that it is gone with the last process that has it op
     stream  what a server offered first; all others must offer the same
 
 The order of the lines is the order of the events; no lock, no clock.
+
+A rank, or any other process that is no loader worker, may be forked or spawned with the dataset too. Its epochs are its
+own, so it goes on with a copy of the log, made before it or a loader worker of its own adds to it.
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.context import get_spawning_popen
 from multiprocessing.reduction import DupFd
 from typing import Any
+
+from torch.utils.data import get_worker_info
 
 from v2v_client.state import ResumeState, Stream
 
@@ -116,8 +121,8 @@ class Standing:
 
 
 class Progress:
-    """The log, as one process sees it. Pickled while a process is being spawned it stays the same log; copied in any
-    other way it becomes a log of its own, with the same lines."""
+    """The log, as one process sees it. Pickled while a loader worker is being spawned it stays the same log; copied in
+    any other way it becomes a log of its own, with the same lines."""
 
     def __init__(self, epoch: int) -> None:
         self._create()
@@ -130,21 +135,34 @@ class Progress:
             descriptor, path = tempfile.mkstemp(prefix="v2v-progress-")
             os.unlink(path)
         fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | os.O_APPEND)
-        self._adopt(descriptor)
+        self._adopt(descriptor, os.getpid())
 
-    def _adopt(self, descriptor: int) -> None:
+    def _adopt(self, descriptor: int, process: int) -> None:
         self._descriptor = descriptor
+        self._process = process  # whose log it is: its own and that of its loader workers
         self._known = 0, Standing()  # bytes of the log, and what they say
-        weakref.finalize(self, os.close, descriptor)
+        self._close = weakref.finalize(self, os.close, descriptor)
+        _logs.add(self)
+
+    def part(self) -> None:
+        """Goes on with a log of its own, if this is that of another process, whose loader worker this one is not."""
+        if self._process == os.getpid() or get_worker_info() is not None:
+            return
+        lines, close = self._lines(0)[0], self._close
+        self._create()
+        close()
+        for line in lines:
+            self._append(**line)
 
     def __getstate__(self) -> dict[str, Any]:
+        self.part()
         if get_spawning_popen() is not None:
-            return {"descriptor": DupFd(self._descriptor)}
+            return {"descriptor": DupFd(self._descriptor), "process": self._process}
         return {"lines": self._lines(0)[0]}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         if "descriptor" in state:
-            self._adopt(state["descriptor"].detach())
+            self._adopt(state["descriptor"].detach(), state["process"])
             return
         self._create()
         for line in state["lines"]:
@@ -152,6 +170,7 @@ class Progress:
 
     def standing(self) -> Standing:
         """What the log says now. Only what is new is read: a week may have a hundred thousand epochs."""
+        self.part()
         end, standing = self._known
         lines, end = self._lines(end)
         if lines:
@@ -194,6 +213,7 @@ class Progress:
         self._append(kind="stream", stream=plain | {"spec": dict(stream.spec)})
 
     def _append(self, **line: Any) -> None:
+        self.part()
         os.write(self._descriptor, json.dumps(line).encode() + b"\n")
 
     def _lines(self, start: int) -> tuple[list[dict[str, Any]], int]:
@@ -204,3 +224,16 @@ class Progress:
             content += piece
         whole = content[: content.rfind(b"\n") + 1]  # what has no end yet is still being written
         return [json.loads(line) for line in whole.splitlines()], start + len(whole)
+
+
+_logs: weakref.WeakSet[Progress] = weakref.WeakSet()
+
+
+def _part_before_fork() -> None:
+    for progress in list(_logs):
+        progress.part()
+
+
+if hasattr(os, "register_at_fork"):
+    # What is forked may be a loader worker, and must find the log of the process that it works for.
+    os.register_at_fork(before=_part_before_fork)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import pickle
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch.utils.data._utils.worker as torch_worker
 
 from v2v_client import progress as progress_module
 from v2v_client.progress import Progress
 from v2v_client.state import ResumeState
 
 WORKERS = range(2)
+FORK = multiprocessing.get_context("fork")
 
 
 def test_the_epoch_ends_with_the_last_loader_worker() -> None:
@@ -50,6 +54,54 @@ def test_workers_that_finish_what_was_left_early_do_not_end_the_epoch_that_was_s
         progress.finish("again", 1, worker, len(WORKERS))
     standing = progress.standing()
     assert (standing.epoch, standing.state) == (4, None)
+
+
+def test_ranks_that_get_a_dataset_from_one_process_each_have_their_own_epochs() -> None:
+    """As torch.multiprocessing.spawn and notebook launchers hand it over. Ranks that are seeded alike name their
+    iterations alike."""
+    progress = Progress(3)
+    progress.start("before", 0)
+    for _ in range(2):
+        assert _forked(_rank, progress) == (3, 4)
+    assert progress.standing().epoch == 3
+
+
+def _rank(progress: Progress) -> tuple[int, int]:
+    first: int = _forked(_loader_worker, progress)
+    return first, progress.standing().epoch
+
+
+def _loader_worker(progress: Progress) -> int:
+    torch_worker._worker_info = torch_worker.WorkerInfo(id=0, num_workers=1, seed=7, dataset=None)
+    number, epoch, _ = progress.start("iteration", 0)
+    progress.finish("iteration", number, 0, 1)
+    return epoch
+
+
+def _forked(function: Callable[[Progress], Any], progress: Progress) -> Any:
+    here, there = FORK.Pipe()
+
+    def run() -> None:
+        there.send(function(progress))
+        os._exit(0)
+
+    process = FORK.Process(target=run)
+    process.start()
+    there.close()
+    found = here.recv()
+    process.join()
+    process.close()
+    here.close()
+    return found
+
+
+def test_a_rank_that_is_spawned_has_its_own_epochs() -> None:
+    progress = Progress(3)
+    spawned = Progress.__new__(Progress)
+    descriptor = SimpleNamespace(detach=lambda: os.dup(progress._descriptor))
+    spawned.__setstate__({"descriptor": descriptor, "process": os.getpid() + 1})
+    spawned.set(4, None)
+    assert (progress.standing().epoch, spawned.standing().epoch) == (3, 4)
 
 
 def test_an_epoch_takes_no_longer_for_all_that_went_before(monkeypatch: pytest.MonkeyPatch) -> None:
