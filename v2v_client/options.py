@@ -29,8 +29,7 @@ class Options:
     """
 
     def __init__(self, arrays: tuple[str, ...], **fields: Any) -> None:
-        recipe = fields.get("recipe")
-        fields = fields | {"recipe": recipe.to_dict() if isinstance(recipe, Recipe) else recipe}
+        fields = fields | {"recipe": _plain(fields.get("recipe"))}
         self._asked = {name: value for name, value in fields.items() if value is not None}
         others = {name: value for name, value in self._asked.items() if name != "flow_from"}
         spec = StreamSpec.from_dict(others, default=_ANY)
@@ -58,3 +57,12 @@ class Options:
         ours = dataclasses.replace(pinned, spec=spec.to_dict(), spec_digest=spec.digest)
         ours.require_same(pinned, ours="the options given to this dataset", theirs=side)
         return dict(pinned.spec)
+
+
+def _plain(recipe: Any) -> Any:
+    """A recipe in plain values that are ours: whoever gave a mapping may change it for the next dataset."""
+    if isinstance(recipe, Recipe):
+        return recipe.to_dict()
+    if not isinstance(recipe, Mapping):
+        return recipe
+    return {key: list(value) if isinstance(value, list | tuple) else value for key, value in recipe.items()}

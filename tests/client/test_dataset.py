@@ -5,6 +5,7 @@ import os
 import pickle
 import tempfile
 import threading
+from types import MappingProxyType
 
 import numpy as np
 import psutil
@@ -760,3 +761,13 @@ def test_a_batch_does_not_change_when_a_given_up_worker_writes_late(server):
 def test_recipes_may_be_given_as_objects(server):
     recipe = Recipe(voxels_per_clip=1, bins=1, crop_height_px=2, crop_width_px=2)
     assert next(iter(dataset(server, recipe=recipe))).voxels.shape == (4, 1, 1, 2, 2)
+
+
+def test_a_recipe_that_is_changed_for_the_next_dataset_stays_that_of_the_first(server):
+    recipe = {"voxels_per_clip": 1, "gamma": 2.0, "threshold": [0.2, 0.5]}
+    stream = dataset(server, recipe=MappingProxyType(recipe))
+    recipe["gamma"] = 1.5
+    recipe["threshold"][0] = 0.3
+    next(iter(stream))
+    assert server.hellos[0].spec["recipe"] == {"voxels_per_clip": 1, "gamma": 2.0, "threshold": [0.2, 0.5]}
+    next(iter(stream))
