@@ -142,6 +142,7 @@ class Connection:
             self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, *self._form.sizes)
             self._link.connect(self._largest_frame_bytes)
             self._await_welcome()
+            self._liveness.pause(self._clock())  # until here we listened
         except BaseException:
             self.close()
             raise

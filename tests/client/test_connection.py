@@ -89,6 +89,31 @@ def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypa
         assert _next(connection) == 0
 
 
+def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that took most of the deadline to start, and is killed then, is missed after one deadline, not two."""
+    waited: list[float] = []
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+
+    def clock() -> float:
+        return time.monotonic() + sum(waited)
+
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
+        listen = link.Link.receive
+
+        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+            if len(waited) < 20:
+                waited.append(0.9)
+                return None
+            return listen(self, seconds)
+
+        monkeypatch.setattr(link.Link, "receive", receive)
+        connection.open()
+        assert connection.receive(wait=False) is None
+        assert connection._liveness.silence(clock()) >= 0.0
+
+
 @pytest.mark.parametrize(
     ("address", "kinds"),
     [("tcp://localhost:1", [0, 1, 0]), ("tcp://127.0.0.1:1", [0, 1, 0]), ("tcp://[::1]:1", [1] * 3)],
