@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import resource
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -22,6 +23,8 @@ from v2v_client.loan import Bytes, lend
 from v2v_protocol.arena import ArenaName, Slot, array_offsets
 from v2v_protocol.sample import Form, Layout, new_arrays
 
+_DESCRIPTORS_AN_ARENA = 8
+"""It has two open files, its own and its mapping's; all arenas leave three quarters of what a process may have."""
 _POPULATE_READ = 22
 """MADV_POPULATE_READ of Linux 5.14, asm-generic/mman-common.h: all pages at once is cheaper than one at a time."""
 _THE_FILES = np.uint64(1 << 63 | 1 << 61)
@@ -56,6 +59,7 @@ class Arena:
         weakref.finalize(self, os.close, self._descriptor).atexit = False
         self._memory: Bytes | None = None  # mapped for an earlier batch, which nothing looks at any more
         self._name = str(ArenaName(self.process, self._descriptor, slots, token))
+        _arenas.add(self)
 
     def slot(self, row: int) -> Slot:
         """What a worker is told, to put a sample into that row."""
@@ -137,8 +141,14 @@ def _is_unwritten(memory: Bytes) -> bool:
     return len(said) == pages and bool(np.all(said & _THE_FILES == _THE_FILES))
 
 
+_arenas: weakref.WeakSet[Arena] = weakref.WeakSet()
+
+
 def open_arena(layout: Layout, slots: int) -> Arena | None:
-    """An arena; None where the system has none, and samples come in messages."""
+    """An arena; None where the system has none, or this process enough of them, and samples come in messages."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and _DESCRIPTORS_AN_ARENA * len(_arenas) >= files:
+        return None
     try:
         return Arena(layout, slots)
     except OSError:

@@ -31,6 +31,7 @@ class _Draft:
     def __init__(self, buffers: BatchBuffers, samples: int, *, shared: bool) -> None:
         self._buffers = buffers
         self._memory: Memory = (buffers.shared() if shared else None) or buffers.own()
+        self.lent = isinstance(self._memory, SharedMemory)
         self._left: SharedMemory | None = None
         self.headers: list[SampleHeader | None] = [None] * samples
         self.cpu_seconds = 0.0
@@ -130,7 +131,8 @@ def deliver(
         ask()
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
         draft = drafts.pop(number)
-        lend = lend and draft.in_place > 0  # workers elsewhere have no use for it, and a message is cheaper without
+        # Workers elsewhere have no use for it, and a message is cheaper without.
+        lend = lend and (draft.in_place > 0 or not draft.lent)
         provenance = tuple(connection.provenance(header) for header in draft.headers if header is not None)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
         yield _finished(

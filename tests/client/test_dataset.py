@@ -3,6 +3,7 @@ import dataclasses
 import gc
 import os
 import pickle
+import resource
 import tempfile
 import threading
 from types import MappingProxyType
@@ -738,6 +739,19 @@ def test_memory_is_lent_no_more_once_a_whole_batch_came_in_messages(server):
     lent = [slot != NO_SLOT for slot in server.slots]
     assert lent == sorted(lent, reverse=True)
     assert 0 < sum(lent) <= 8 + 2 * 2
+
+
+def test_many_small_batches_leave_a_process_its_open_files(monkeypatch):
+    """The rest of them comes in messages, and memory is lent on as it comes back."""
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
+    with FakeServer(sequences=160, credit=40) as server:
+        before, most = len(os.listdir("/proc/self/fd")), 0
+        for batch in dataset(server, batch_size=1):
+            assert_true_bytes(batch)
+            most = max(most, len(os.listdir("/proc/self/fd")))
+        assert most - before <= 64 // 4 + 20  # and those of the connection, and of the server's side in this process
+        assert set(server.slots[:40]) == {NO_SLOT, 1}
+        assert 1 in server.slots[-80:]
 
 
 def test_a_batch_does_not_change_when_a_given_up_worker_writes_late(server):
