@@ -72,8 +72,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     Memory of an iterating process (each loader worker is one), however slow its trainer, with S bytes in a sample, k
     batches that the trainer itself still holds, and a credit of C samples. The server grants twice ``batch_size``, or
-    twice its number of workers if that is more; ``samples_per_decode`` times as much (in whole batches) where siblings
-    share a decode; less where ``--max-credit-bytes`` says so.
+    twice its number of workers if that is more; where K = ``samples_per_decode`` share a decode, a seventh more than
+    K (1 + ceil(2 workers / batch_size)) batches. It never grants more than 400 samples, nor more than its
+    ``--max-credit-bytes`` hold.
 
         received, waiting              C S           (2 C S while everything is asked for again)
         batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
