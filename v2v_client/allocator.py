@@ -9,13 +9,13 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _NEVER_BYTES = (1 << 31) - 1
 
 
-def keep_freed_memory() -> bool:
+def keep_freed_memory(_loader_worker: int = 0) -> bool:
     """Makes this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
 
     Every sample is received into fresh memory, and fresh memory from the kernel is cleared and mapped page by page.
     Kept memory costs nothing of that. The price: the process stays as large as it ever was. It is a decision about the
     whole process, so nothing calls this by itself: call it before the first iteration, and with loader workers give
-    it to them, ``DataLoader(dataset, batch_size=None, num_workers=2, worker_init_fn=lambda _: keep_freed_memory())``.
+    it to them, ``DataLoader(dataset, batch_size=None, num_workers=2, worker_init_fn=keep_freed_memory)``.
 
     Returns:
         whether the C library understood; only glibc does.
