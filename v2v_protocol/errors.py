@@ -6,7 +6,8 @@
     |   |-- CorpusError              a folder, list file or index that gives no sequence
     |   `-- StateMismatch            a saved position that belongs to another stream
     |-- VideoError               the file: it cannot give what it promised (path, frame, reason)
-    |   `-- VideoChanged             it is not the file that was catalogued
+    |   |-- VideoChanged             it is not the file that was catalogued
+    |   `-- VideoUnreadable          this host cannot read it, whatever is in it
     |-- ProtocolError            the peer: it sent what no peer of ours would send
     |   |-- VersionMismatch          another protocol or numerics version
     |   `-- LimitExceeded            a message, a list or a credit larger than stated
