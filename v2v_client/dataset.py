@@ -40,7 +40,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     Iterate it directly, or through ``DataLoader(dataset, batch_size=None, num_workers=..., pin_memory=...)``. Each
     loader worker opens a connection of its own and takes every num_workers-th batch; the batches and their order are
-    the same however many there are.
+    the same however many there are. With ``in_order=False`` the order is not, and no state is right: that of a batch
+    counts those before it in the epoch as delivered.
 
     One iteration is one epoch from its beginning. Finishing it advances the epoch; leaving it early and iterating again
     repeats it. After :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples
