@@ -118,8 +118,10 @@ class LocalServer:
         """The end of what the server wrote to its standard error."""
         if self._errors is None:
             return "(it was not started)"
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        # The server writes where the file stands, and the two of us share that place: it must not be moved.
+        file = self._errors.fileno()
+        size = os.fstat(file).st_size
+        lines = os.pread(file, size, 0).decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-_LAST_LINES:]) or "(it wrote nothing)"
 
     def stop(self) -> None:

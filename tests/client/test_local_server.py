@@ -1,4 +1,5 @@
 import os
+import time
 
 import psutil
 import pytest
@@ -73,3 +74,17 @@ def test_flags_reach_the_server(program):
     program(LISTEN.replace("flags['--workers']", "flags['--rows']") + POLITE)
     with LocalServer("videos", flags=["--rows", "9"]) as server:
         assert server.address.endswith(":9")
+
+
+def test_what_a_server_writes_while_it_is_read_is_not_lost(program):
+    program(
+        LISTEN
+        + "import time\n"
+        + "for line in range(600): time.sleep(2e-4); sys.stderr.write(f'line {line:04d}\\n'); sys.stderr.flush()\n"
+        + POLITE
+    )
+    with LocalServer("videos") as server:
+        deadline = time.monotonic() + 20.0
+        while "line 0599" not in server.last_lines() and time.monotonic() < deadline:
+            pass  # as often as possible
+        assert os.fstat(server._errors.fileno()).st_size == 600 * len("line 0000\n")
