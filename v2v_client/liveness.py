@@ -27,7 +27,8 @@ class Due(Enum):
 class Patience:
     """
     Attributes:
-        ping_seconds: silence after which the server is asked whether it lives, and again as often.
+        ping_seconds: silence after which the server is asked whether it lives, and again as often; half of
+            ``timeout_seconds`` if that is less, because nobody is given up unasked.
         rewant_seconds: time without an answer to any request after which all of them are sent again, although the
             server lives: a cut of the network can swallow messages in either direction. If nothing at all was heard
             in that time, another connection is made. The wait doubles each time, up to ``timeout_seconds``, so that a
@@ -53,6 +54,7 @@ class Liveness:
 
     def __init__(self, patience: Patience, now: float) -> None:
         self._patience = patience
+        self._ping_seconds = min(patience.ping_seconds, patience.timeout_seconds / 2)
         self._rewant_seconds = min(patience.rewant_seconds, patience.timeout_seconds)
         self._heard = now
         self._answered = now
@@ -97,7 +99,7 @@ class Liveness:
             self._answered = self._pinged = now
             self._rewant_seconds = min(2 * self._rewant_seconds, self._patience.timeout_seconds)
             return Due.CONNECT_ANEW if silent else Due.WANT_AGAIN
-        if now - self._pinged >= self._patience.ping_seconds:
+        if now - self._pinged >= self._ping_seconds:
             self._pinged = now
             return Due.PING
         return None
@@ -109,7 +111,7 @@ class Liveness:
             min(
                 self._heard + self._patience.timeout_seconds,
                 self._answered + self._rewant_seconds,
-                self._pinged + self._patience.ping_seconds,
+                self._pinged + self._ping_seconds,
             )
             - now,
         )

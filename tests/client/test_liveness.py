@@ -36,6 +36,15 @@ def test_a_server_that_only_answers_pings_is_asked_again_ever_more_rarely_and_ne
     assert [now for now, due in done if due is Due.WANT_AGAIN] == [10, 30, 70, 130, 190]
 
 
+@pytest.mark.parametrize("timeout_seconds", [0.5, 2.0, 3.0])
+def test_nobody_is_given_up_unasked(timeout_seconds):
+    """However short the deadline is beside the time between pings: a server that is busy says nothing by itself."""
+    liveness = Liveness(Patience(timeout_seconds=timeout_seconds), 0.0)
+    now = liveness.next_due(0.0)
+    assert now < timeout_seconds
+    assert liveness.due(now) is Due.PING
+
+
 @given(st.floats(0, 1e6), st.floats(0, 50))
 def test_time_spent_elsewhere_is_no_silence(away, listened):
     liveness = Liveness(PATIENCE, 0.0)
