@@ -33,6 +33,13 @@ def serve(argv: Sequence[str] | None = None) -> None:
         "--videos", metavar="DIR", help="folder of videos (searched recursively), a video, or a list file"
     )
     parser.add_argument("--workers", type=int, metavar="N", help="local worker processes (default 2)")
+    parser.add_argument(
+        "--expect-workers",
+        type=int,
+        metavar="N",
+        help="workers that will serve in all, other hosts' too (default the local ones): a consumer's credit is "
+        "settled for them when it connects, up to 400 samples and --max-credit-bytes",
+    )
     parser.add_argument("--config", metavar="FILE", help="YAML file of these settings; a flag wins over it")
     parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts --videos")
     parser.add_argument(

@@ -28,6 +28,8 @@ class ServeConfig:
     Attributes:
         videos: folder tree, single video, or list file.
         workers: local worker processes.
+        expect_workers: workers that are expected to serve in all, this host's and others': a consumer's credit is
+            settled for as many when it connects. 0, or fewer than there are: for the local ones, or those there are.
         list: list file that restricts a folder.
         rows: rows of each picture that may be used.
         bind: address for consumers.
@@ -51,6 +53,7 @@ class ServeConfig:
 
     videos: str = ""
     workers: int = 2
+    expect_workers: int = 0
     list: str = ""
     rows: str = "full"
     bind: str = DEFAULT_BIND
@@ -82,6 +85,7 @@ class ServeConfig:
         if not self.videos:
             raise UsageError("--videos is missing: give a folder of videos, one video, or a list file")
         _whole("--workers", self.workers, 0, 4096)
+        _whole("--expect-workers", self.expect_workers, 0, 4096)
         _positive("--lease-deadline-seconds", self.lease_deadline_seconds)
         _positive("--session-idle-seconds", self.session_idle_seconds)
         _whole("--max-credit-bytes", self.max_credit_bytes, 1, 1 << 40)

@@ -61,8 +61,8 @@ class Dispatcher:
         max_credit_bytes: bound on the bytes in flight to one consumer.
         quarantine: the snapshots; verdicts that were written down are added to it.
         wall_clock: gives the time for a verdict, ISO 8601.
-        local_workers: workers that this server starts, counted before they have said hello: a consumer's credit is
-            settled when it connects, which may be before the first of them is there.
+        expected_workers: workers that will serve in all, this host's and others', counted before they have said
+            hello: a consumer's credit is settled when it connects, which may be before the first of them is there.
 
     Attributes:
         counters: what happened so far.
@@ -79,11 +79,11 @@ class Dispatcher:
         max_credit_bytes: int,
         quarantine: Quarantine,
         wall_clock: Callable[[], str],
-        local_workers: int = 0,
+        expected_workers: int = 0,
     ) -> None:
         self.counters = Counters()
         self.sessions = Sessions(session_idle_seconds)
-        self._local_workers = local_workers
+        self._expected_workers = expected_workers
         self._catalogue = catalogue
         self._quarantine = quarantine
         self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
@@ -143,7 +143,7 @@ class Dispatcher:
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
             return _refuse(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
-            workers = max(len(self._workers), self._local_workers)
+            workers = max(len(self._workers), self._expected_workers)
             session, welcome = self._reception.receive(identity, hello, workers, now)
         except (UsageError, CorpusError) as error:
             return _refuse(identity, ErrorCode.SPEC, str(error))

@@ -62,7 +62,7 @@ class Reception:
         Args:
             identity: the consumer's routing identity.
             hello: what it asks for.
-            workers: how many workers there are; the credit keeps all of them busy.
+            workers: how many workers there are, or will be; the credit keeps all of them busy, within its bounds.
             now: the time.
 
         Raises:

@@ -81,7 +81,7 @@ def serve(config: ServeConfig) -> None:
         lease_deadline_seconds=config.lease_deadline_seconds,
         session_idle_seconds=config.session_idle_seconds,
         max_credit_bytes=config.max_credit_bytes,
-        local_workers=config.workers,
+        expected_workers=max(config.workers, config.expect_workers),
     )
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()

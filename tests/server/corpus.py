@@ -35,6 +35,7 @@ class NamedCorpus:
     root: Path = Path("/corpus")
     digest: str = "c" * 32
     unreadable: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
 
     def digest_under(self, scene: str) -> str:
         """The digest; these videos have no statistics."""

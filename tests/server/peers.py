@@ -243,7 +243,7 @@ def peers(
     spec: StreamSpec = SMALL_SPEC,
     max_credit_bytes: int = 2 << 30,
     quarantine: Quarantine | None = None,
-    local_workers: int = 0,
+    expected_workers: int = 0,
 ) -> Peers:
     """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
     videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
@@ -256,6 +256,6 @@ def peers(
         max_credit_bytes=max_credit_bytes,
         quarantine=held,
         wall_clock=lambda: "2024-02-29T12:00:00+00:00",
-        local_workers=local_workers,
+        expected_workers=expected_workers,
     )
     return Peers(dispatcher, held)

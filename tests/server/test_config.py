@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.server.corpus import corpus, video
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
@@ -99,6 +100,24 @@ def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tm
         ServeConfig.load(str(file), {}, ["bins=3"])
 
 
+@pytest.mark.parametrize(
+    ("flags", "expected"), [("", 2), ("--workers 0 --expect-workers 64", 64), ("--workers 9 --expect-workers 5", 9)]
+)
+def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatch, flags: str, expected: int) -> None:
+    class Stopped(Exception):
+        pass
+
+    def dispatcher(*given: Any, expected_workers: int, **settings: Any) -> None:
+        raise Stopped(expected_workers)
+
+    for what_changes_this_process in ("keep_freed_memory", "open_many_files"):
+        monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
+    monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
+    with pytest.raises(Stopped, match=f"^{expected}$"):
+        serve(f"--videos a --set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8 {flags}".split())
+
+
 def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
     assert load(tmp_path, "", videos="a") == ServeConfig(videos="a")
 
@@ -121,6 +140,8 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("workers: 2.0", "--workers = 2.0"),
         ("workers: -1", "--workers -1: give a whole number from 0 to 4096"),
         ("workers: 4097", "--workers 4097"),
+        ("expect_workers: -1", "--expect-workers -1: give a whole number from 0 to 4096"),
+        ("expect-workers: 4097", "--expect-workers 4097"),
         ("max_credit_bytes: 0", "--max-credit-bytes 0"),
         ("max_credit_bytes: 1e9", "--max-credit-bytes = "),
         ("insecure: 1", "--insecure = 1: expected a value of kind bool"),

@@ -238,7 +238,7 @@ def test_credit_follows_batch_size_workers_and_bytes() -> None:
 
 def test_credit_counts_workers_that_are_still_starting() -> None:
     """A server is ready with its first worker, and the credit of whoever connects then holds for an epoch."""
-    at = peers(local_workers=20)
+    at = peers(expected_workers=20)
     assert at.hello(batch_size=12).credit == 40
     for number in range(3):
         at.join(b"w%d" % number)
@@ -246,6 +246,7 @@ def test_credit_counts_workers_that_are_still_starting() -> None:
     for number in range(25):
         at.join(b"elsewhere %d" % number)
     assert at.hello(batch_size=12).credit == 56
+    assert peers(expected_workers=4096).hello(batch_size=12).credit == 400
 
 
 def test_a_sample_that_the_credit_cannot_hold_is_refused_with_both_numbers() -> None:
