@@ -102,6 +102,7 @@ def _run(arguments: argparse.Namespace) -> bool:
             cache_dir=arguments.cache_dir,
             processes=arguments.workers,
             progress=probing,
+            notice=probing.notice,
         )
     with contextlib.closing(catalogue), _progress() as progress:
         report = prepare.prepare(

@@ -34,7 +34,7 @@ from v2v_server.workers import REST_SECONDS
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
-    """The catalogue the configuration asks for, with a progress bar on stderr while new files are probed.
+    """The catalogue the configuration asks for, with its progress on stderr.
 
     Raises:
         CorpusError: nothing there, or nothing that can be used.
@@ -48,6 +48,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             scene=config.spec.scene != "off",
             processes=max(1, min(config.workers, usable_cores())),
             progress=progress,
+            notice=progress.notice,
         )
 
 

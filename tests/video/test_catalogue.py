@@ -191,6 +191,28 @@ def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener)
         moved.frame_index("sub/b.mp4")
 
 
+def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    """On storage elsewhere a look takes a while too, and there may be a million files."""
+    notices: list[str] = []
+    opener(corpus)
+    write_clip(corpus / "a.mp4", panned_luma(12))
+    opener(corpus, notice=notices.append)
+    assert notices == [
+        *(f"looking for videos: {done} so far" for done in (1, 2, 3)),
+        *(f"looking at files: {done} of 3, 1 of them new or changed" for done in (1, 2, 3)),
+    ]
+    notices.clear()
+    listed = tmp_path / "list.txt"
+    listed.write_text("a.mp4\n")
+    opener(corpus, list_file=listed, notice=notices.append)
+    assert notices == [
+        "looking at the list's files: 1 of 1",
+        "looking at files: 1 of 1, 0 of them new or changed",
+        *(f"looking for files that are gone: {done} of 2 that this corpus does not name" for done in (1, 2)),
+    ]
+    assert opener.probed == [3, 1, 0]
+
+
 def test_the_digest_knows_rows_and_thresholds_but_not_the_place(corpus: Path, opener: Opener, tmp_path: Path) -> None:
     plain = opener(corpus)
     assert opener(corpus, rows=Rows.parse("top:0.54")).digest != plain.digest

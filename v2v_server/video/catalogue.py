@@ -14,6 +14,7 @@ from v2v_server.video.index import FrameIndex, unseekable
 from v2v_server.video.listfile import LIST_SUFFIXES, ListEntry, read_list, regular_files
 from v2v_server.video.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.refresh import Progress, index_path, up_to_date
+from v2v_server.video.round_trips import Notice
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import Scene
 from v2v_server.video.scenes import Looking
@@ -203,6 +204,7 @@ def open_catalogue(
     scene: bool = False,
     processes: int = 1,
     progress: Progress | None = None,
+    notice: Notice | None = None,
 ) -> Catalogue:
     """Take in a corpus: probe what is new or changed, forget what is gone.
 
@@ -216,6 +218,7 @@ def open_catalogue(
             :mod:`v2v_server.video.scene`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
+        notice: told what is looked at before that, file by file, and how far it is.
 
     Raises:
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
@@ -232,12 +235,12 @@ def open_catalogue(
         rows = None
         ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
     else:
-        ids = tuple(video_files(root, refused)) if listed is None else regular_files(root, listed, refused)
+        ids = _found(root, refused, notice) if listed is None else regular_files(root, listed, refused, notice)
         refuse_prepared_below(root, ids)
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
     looking = Looking(rows or Rows(), manifest) if scene else None
-    store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress)
+    store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress, notice)
     try:
         return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
     except BaseException:
@@ -259,6 +262,16 @@ def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Pat
     if printable(source.name) != source.name:
         raise CorpusError(f"{printable(source.name)}: its name is not UTF-8 text; rename it")
     return folder, (ListEntry(source.name),)
+
+
+def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
+    """The videos below a folder."""
+    ids = []
+    for id in video_files(root, refused):
+        ids.append(id)
+        if notice is not None:
+            notice(f"looking for videos: {len(ids)} so far")
+    return tuple(ids)
 
 
 def _snapshot(

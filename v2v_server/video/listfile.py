@@ -12,11 +12,12 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.video.round_trips import Notice, answers
 
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 
@@ -75,7 +76,9 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
     return tuple(found)
 
 
-def regular_files(root: Path, entries: Iterable[ListEntry], refused: dict[str, str]) -> tuple[str, ...]:
+def regular_files(
+    root: Path, entries: Sequence[ListEntry], refused: dict[str, str], notice: Notice | None = None
+) -> tuple[str, ...]:
     """The ids of a list but for those that name something else than a file.
 
     To open a named pipe waits for somebody to write into it, for ever if need be, and a device may not end. An id that
@@ -85,17 +88,23 @@ def regular_files(root: Path, entries: Iterable[ListEntry], refused: dict[str, s
         root: the folder that ids are relative to.
         entries: of the list.
         refused: receives, by id, why one cannot be taken in.
+        notice: told how far it is.
     """
-    ids = []
-    for entry in entries:
+
+    def may_be_read(id: str) -> bool:
         try:
-            is_regular = stat.S_ISREG(os.stat(root / entry.id).st_mode)
+            return stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
         except OSError:
-            is_regular = True
+            return True
+
+    ids = []
+    for done, (id, is_regular) in enumerate(answers(may_be_read, [entry.id for entry in entries]), 1):
+        if notice is not None:
+            notice(f"looking at the list's files: {done} of {len(entries)}")
         if is_regular:
-            ids.append(entry.id)
+            ids.append(id)
         else:
-            refused[entry.id] = "is no regular file"
+            refused[id] = "is no regular file"
     return tuple(ids)
 
 

@@ -22,6 +22,7 @@ from typing import Any
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.video.encode import Encoding
 from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.round_trips import answers
 from v2v_server.video.rows import Rows
 from v2v_server.video.scene import Scene
 from v2v_server.video.store import Record
@@ -192,12 +193,17 @@ def refuse_prepared_below(root: Path, ids: Iterable[str]) -> None:
     Raises:
         CorpusError: one does.
     """
-    for folder in sorted({parent for id in ids for parent in PurePosixPath(id).parents}):
+
+    def is_prepared(folder: PurePosixPath) -> bool:
         try:
-            is_prepared = (root / folder / MANIFEST_NAME).exists()
+            return (root / folder / MANIFEST_NAME).exists()
         except OSError:  # where nobody may look, no video can be read either: each says so itself
-            continue
-        if is_prepared:
+            return False
+
+    folders = {PurePosixPath(folder) for folder in {id.rpartition("/")[0] for id in ids}}
+    folders.update({parent for folder in folders for parent in folder.parents})
+    for folder, refused in answers(is_prepared, sorted(folders)):
+        if refused:
             raise CorpusError(
                 f"{root / folder} is a prepared folder and cannot be a part of another corpus: name it itself, or move "
                 "it out"

@@ -7,11 +7,12 @@ import hashlib
 import os
 import sqlite3
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.video.round_trips import Notice, answers
 from v2v_server.video.scenes import Looking
 from v2v_server.video.store import Record, Store
 from v2v_server.video.survey import survey
@@ -55,6 +56,7 @@ def up_to_date(
     looking: Looking | None,
     processes: int,
     progress: Progress | None,
+    notice: Notice | None,
 ) -> tuple[Store, dict[str, Record], list[str]]:
     """An open index that knows every id, its records, and notes for the user.
 
@@ -65,17 +67,17 @@ def up_to_date(
         ids: of the videos to know.
         path: of the index.
         looking: how to look at what the videos show; None does not.
-        processes, progress: as in :func:`v2v_server.video.catalogue.open_catalogue`.
+        processes, progress, notice: as in :func:`v2v_server.video.catalogue.open_catalogue`.
     """
     try:
-        return *_refreshed(path, root, ids, looking, processes, progress), []
+        return *_refreshed(path, root, ids, looking, processes, progress, notice), []
     except (sqlite3.Error, OSError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        return *_refreshed(None, root, ids, looking, processes, progress), [note]
+        return *_refreshed(None, root, ids, looking, processes, progress, notice), [note]
 
 
 def _refreshed(
@@ -85,13 +87,13 @@ def _refreshed(
     looking: Looking | None,
     processes: int,
     progress: Progress | None,
+    notice: Notice | None,
 ) -> tuple[Store, dict[str, Record]]:
     store = Store(path)
     try:
         known = store.records()
-        stale = [id for id in ids if id not in known or not _unchanged(root, known[id])]
-        wanted = set(ids)
-        store.forget([id for id in known if id not in wanted and _is_gone(root / id)])
+        stale = _stale(root, ids, known, notice)
+        store.forget(_gone(root, known.keys() - set(ids), notice))
         with closing(survey(root, stale, processes)) as found:
             for batch in _batches(found, len(stale), progress):
                 store.put(batch)
@@ -105,20 +107,43 @@ def _refreshed(
         raise
 
 
-def _is_gone(path: Path) -> bool:
-    """Whether there is no such file. One that cannot be looked at today is not gone."""
-    try:
-        return not stat.S_ISREG(path.stat().st_mode)
-    except OSError as error:
-        return error.errno in (errno.ENOENT, errno.ENOTDIR)
+def _stale(root: Path, ids: Sequence[str], known: Mapping[str, Record], notice: Notice | None) -> list[str]:
+    """Those of the ids whose files are new or changed."""
+
+    def is_unchanged(id: str) -> bool:
+        if id not in known:
+            return False
+        try:
+            status = os.stat(os.path.join(root, id))
+        except OSError:
+            return False
+        return (status.st_size, status.st_mtime_ns) == (known[id].size_bytes, known[id].mtime_ns)
+
+    stale = []
+    for done, (id, unchanged) in enumerate(answers(is_unchanged, ids), 1):
+        if not unchanged:
+            stale.append(id)
+        if notice is not None:
+            notice(f"looking at files: {done} of {len(ids)}, {len(stale)} of them new or changed")
+    return stale
 
 
-def _unchanged(root: Path, record: Record) -> bool:
-    try:
-        status = (root / record.id).stat()
-    except OSError:
-        return False
-    return (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns)
+def _gone(root: Path, ids: Iterable[str], notice: Notice | None) -> list[str]:
+    """Those of the ids of which there is no file any more. One that cannot be looked at today is not gone."""
+
+    def is_gone(id: str) -> bool:
+        try:
+            return not stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
+        except OSError as error:
+            return error.errno in (errno.ENOENT, errno.ENOTDIR)
+
+    unlisted, gone = sorted(ids), []
+    for done, (id, is_none) in enumerate(answers(is_gone, unlisted), 1):
+        if is_none:
+            gone.append(id)
+        if notice is not None:
+            notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
+    return gone
 
 
 def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:

@@ -73,5 +73,7 @@ def _below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused
 
 def printable(name: str) -> str:
     """The name with everything escaped that is not UTF-8 text or is a control character."""
+    if name.isascii() and name.isprintable():  # as nearly all are, and there may be a million of them
+        return name
     text = os.fsencode(name).decode("utf-8", "backslashreplace")
     return "".join(c if ord(c) >= 32 else f"\\x{ord(c):02x}" for c in text)
