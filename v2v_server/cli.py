@@ -82,16 +82,16 @@ def worker(argv: Sequence[str] | None = None) -> None:
     parser = new_parser("v2v-worker", "Work for a server: take leases, make samples.")
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
     parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus folder on this host")
-    parser.add_argument("--name", help="unique name (default: one with host and process id)")
+    parser.add_argument("--name", help="how its name begins in logs (default: host and process id)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
 
     def run(arguments: argparse.Namespace) -> None:
-        from v2v_server.worker import run_worker
+        from v2v_server.worker import run_worker, unshared_name
 
-        run_worker(
-            arguments.connect, Path(arguments.videos), arguments.name, arguments.parent_pid, arguments.logbook_fd
-        )
+        # Its own workers a server names itself, and knows them by it.
+        name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
+        run_worker(arguments.connect, Path(arguments.videos), name, arguments.parent_pid, arguments.logbook_fd)
 
     run_command(parser, run, argv)
 

@@ -284,9 +284,14 @@ class Worker:
         self._socket.send(last, copy=False)
 
 
-def _name() -> str:
-    """A name that no other worker has. Host and process id are for its operator: in containers they may be the same."""
-    return f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+def unshared_name(beginning: str | None) -> str:
+    """A name that no other worker has: of two of one name the server would hear one, and the other wait for ever.
+
+    Args:
+        beginning: what its operator calls it, and perhaps others too; None: host and process id, which in containers
+            may be the same for all.
+    """
+    return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 
 def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:
@@ -320,7 +325,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    worker = Worker(name or _name(), root, address, logbook)
+    worker = Worker(name or unshared_name(None), root, address, logbook)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.
     take_long_turns()

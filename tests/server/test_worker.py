@@ -36,6 +36,7 @@ from v2v_protocol.messages import (
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server import worker as worker_module
+from v2v_server.cli import worker as worker_command
 from v2v_server.clips import Clips
 from v2v_server.handover import Room
 from v2v_server.simulation.variants import Variant
@@ -287,6 +288,17 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     assert len(set(names)) == 3
     assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
     assert names[2] == "mine"
+
+
+def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A batch system starts all of them with the same command."""
+    names: list[str] = []
+    monkeypatch.setattr(worker_module, "run_worker", lambda address, root, name, *more: names.append(name))
+    command = ["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "node7"]
+    for more in ([], [], ["--logbook-fd", "3"]):
+        worker_command([*command, *more])
+    assert len(set(names)) == 3
+    assert [name[:6] for name in names] == ["node7-", "node7-", "node7"]
 
 
 class TestKernels:
