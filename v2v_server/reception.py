@@ -78,8 +78,11 @@ class Reception:
         quarantine = newest if hello.quarantine is None else hello.quarantine
         if quarantine > newest:
             raise CorpusError(
-                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: its quarantine file "
-                f"is not the one that the stream was begun with"
+                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream goes by "
+                "verdicts that this server has not read. Put the quarantine file of the server that it came from "
+                "in the place of this one's (v2v-quarantine --videos DIR says where each lies), and start this server "
+                'again; if both have the same file, only start it again. Or set "quarantine" of the saved state to '
+                "None, to go on under what this server has: sequences that the other had condemned then come again"
             )
         table = self._table(spec)
         schedule = Schedule.of(table, spec)

@@ -66,6 +66,20 @@ def test_the_quarantine_is_the_newest_unless_an_older_one_is_asked_for() -> None
         at.receive(b"c", hello(quarantine=4), 1, 0.0)
 
 
+def test_a_stream_from_a_server_that_knows_more_verdicts_is_told_what_to_do() -> None:
+    """Perhaps the file is another one; perhaps another server has added to it since this one read it."""
+    at = reception(quarantine=Quarantine(VERDICTS[:1]))
+    with pytest.raises(CorpusError) as refused:
+        at.receive(b"c", hello(quarantine=3), 1, 0.0)
+    for remedy in (
+        "v2v-quarantine --videos DIR",
+        "start this server again",
+        'set "quarantine" of the saved state to None',
+    ):
+        assert remedy in str(refused.value)
+    assert at.receive(b"c", hello(quarantine=None), 1, 0.0)[1].quarantine == 1
+
+
 @pytest.mark.parametrize("batch_size", [0, MOST_BATCH_SIZE + 1, 2**64 - 1])
 def test_batch_sizes_are_limited(batch_size: int) -> None:
     with pytest.raises(UsageError, match=f"batch_size = {batch_size}: give 1 to {MOST_BATCH_SIZE}"):
