@@ -9,6 +9,7 @@ again without a single sample being finished, something is wrong that restarting
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -27,6 +28,8 @@ from v2v_server.logbook import Logbook
 
 _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0
+_MEMORY_SECONDS = 5.0
+"""After the kernel has killed for want of memory, a worker's SIGKILL is taken for its doing: to end takes a moment."""
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
@@ -67,6 +70,7 @@ class Pool:
         self._deaths_in_a_row = 0
         self._samples_seen = 0
         self._memory_kills = _out_of_memory_kills()
+        self._short_of_memory_until = -math.inf
 
     @property
     def crash_budget(self) -> int:
@@ -100,10 +104,15 @@ class Pool:
             self._samples_seen = samples
             self._deaths_in_a_row = 0
         deaths = []
+        ended = {number for number, slot in enumerate(self._slots) if slot.process and slot.process.poll() is not None}
+        memory_kills = _out_of_memory_kills()  # counted before its victims are gone, so these are in it
+        if memory_kills > self._memory_kills:
+            self._memory_kills, self._short_of_memory_until = memory_kills, now + _MEMORY_SECONDS
         for number, slot in enumerate(self._slots):
-            if slot.process is not None and slot.process.poll() is not None:
+            if slot.process is not None and number in ended:
                 at = None if slot.logbook is None else slot.logbook.lease()
-                death = Death(slot.identity, replace(self._post_mortem(slot.process.returncode), lease=at))
+                loss = _post_mortem(slot.process.returncode, short_of_memory=now < self._short_of_memory_until)
+                death = Death(slot.identity, replace(loss, lease=at))
                 self._put_off(slot, death, now)
                 if not slot.given_up:
                     deaths.append(death)
@@ -155,21 +164,6 @@ class Pool:
                 return Loss(Cause.HUNG, reason, at)
         return None
 
-    def _post_mortem(self, returncode: int) -> Loss:
-        if returncode >= 0:
-            # An exception nobody foresaw, a broken installation: the trace is on stderr, whose fault it is is not.
-            return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
-        number = -returncode
-        name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
-        if number in _CRASH_SIGNALS:
-            return Loss(Cause.CRASHED, f"was ended by {name}")
-        kills, self._memory_kills = self._memory_kills, _out_of_memory_kills()
-        if number == signal.SIGKILL and self._memory_kills > kills:
-            return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
-        if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            return Loss(Cause.KILLED, f"was ended by {name} from outside")
-        return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
-
     def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
         """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
         processes = [slot.process for slot in self._slots if slot.process is not None]
@@ -212,6 +206,22 @@ def _command(address: str, root: Path, name: str) -> list[str]:
         *("--connect", address, "--videos", str(root), "--name", name),
         *("--parent-pid", str(os.getpid())),
     ]
+
+
+def _post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
+    """What the end of a worker means that was not asked for."""
+    if returncode >= 0:
+        # An exception nobody foresaw, a broken installation: the trace is on stderr, whose fault it is is not.
+        return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
+    number = -returncode
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    if number in _CRASH_SIGNALS:
+        return Loss(Cause.CRASHED, f"was ended by {name}")
+    if number == signal.SIGKILL and short_of_memory:
+        return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
+    if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        return Loss(Cause.KILLED, f"was ended by {name} from outside")
+    return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
 
 
 def _status(pid: int) -> str:

@@ -189,6 +189,32 @@ def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
     assert causes == [Cause.UNEXPLAINED, Cause.KILLED]
 
 
+def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_long_after(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kills = [7]
+    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: kills[0])
+    pool = start(2, SLEEPS)
+
+    def causes_of_deaths_at(now: float) -> list[Cause]:
+        for pid in pool.pids():
+            os.kill(pid, signal.SIGKILL)
+        all_dead(pool)
+        return [death.loss.cause for death in pool.check(now, 1)]
+
+    pool.check(0.0, 0)
+    kills[0] += 2
+    assert causes_of_deaths_at(10.0) == [Cause.UNEXPLAINED] * 2
+    pool.check(20.0, 1)
+    kills[0] += 1
+    pool.check(30.0, 1)  # what was killed takes a moment to be gone
+    assert causes_of_deaths_at(30.1) == [Cause.UNEXPLAINED] * 2
+    pool.check(40.0, 1)
+    kills[0] += 1  # something else on this host
+    pool.check(50.0, 1)
+    assert causes_of_deaths_at(1000.0) == [Cause.KILLED] * 2
+
+
 def test_the_kernels_count_of_such_kills_is_read() -> None:
     said = Path("/proc/vmstat").read_text(encoding="ascii")
     assert f"\noom_kill {pool_module._out_of_memory_kills()}\n" in said
