@@ -280,6 +280,7 @@ class Dispatcher:
         task = self._leases.task(result.lease, identity)
         session = None if task is None else self.sessions.get(task.session)
         instructions: list[Instruction] = []
+        decoded = True
         if task is None or session is None:
             self.counters.late_results += 1
         else:
@@ -289,9 +290,10 @@ class Dispatcher:
                 # No worker of ours does this, and one that did it once would do it again.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+            decoded = header.decoded
             if self._count(session, task, header, in_slot=len(payload) == 1):
                 instructions.append(ToConsumer(task.session, payload))
-        self._leases.finished(result.lease, identity, now)
+        self._leases.finished(result.lease, identity, now, decoded=decoded)
         self._leases.begun(result.begins, identity, now)
         return instructions + self._assign(now)
 

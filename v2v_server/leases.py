@@ -20,7 +20,7 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Refusal
 
 SLOW_FACTOR = 3.0
-"""A lease in work for this many times the median of its session is slow."""
+"""A lease in work for this many times the median of its session's decoded clips is slow."""
 _LEAST_SLOW_SECONDS = 1.0
 _REMEMBERED = 64
 _LEAST_REMEMBERED = 8
@@ -136,8 +136,14 @@ class LeaseBook:
         for other in self._held[worker]:
             self._leases[other].deadline = now + self.deadline_seconds
 
-    def finished(self, number: int, worker: bytes, now: float) -> Task | None:
+    def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Task | None:
         """The worker answered, well or badly.
+
+        Args:
+            number, worker: of the lease.
+            now: the time.
+            decoded: whether a clip was decoded for it. What a sibling of a decoded one takes says nothing of how long
+                a clip may take.
 
         Returns:
             the task, or None when nobody waits for this answer: the lease had been taken away from the worker, the
@@ -148,7 +154,7 @@ class LeaseBook:
             return None
         task = lease.task
         if task is not None:
-            if lease.begun_at is not None:
+            if lease.begun_at is not None and decoded:
                 remembered = self._durations.setdefault(task.session, deque(maxlen=_REMEMBERED))
                 remembered.append(now - lease.begun_at)
             self._retire(task.sample)

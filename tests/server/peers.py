@@ -45,12 +45,12 @@ def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
     return frames_of(array_layout(SMALL_SPEC.recipe, "int8", ("voxels",)), epoch, index, seed)
 
 
-def answer_to(lease: Lease, *, in_slot: bool = False, cpu_seconds: float = 0.1) -> list[Buffer]:
+def answer_to(lease: Lease, *, in_slot: bool = False, cpu_seconds: float = 0.1, decoded: bool = True) -> list[Buffer]:
     """What an honest worker sends behind its Result."""
     spec = StreamSpec.from_dict(json.loads(lease.spec))
     layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
     frames = frames_of(
-        layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds, quarantine=lease.quarantine
+        layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds, lease.quarantine, decoded
     )
     return frames[:1] if in_slot else frames
 
@@ -63,6 +63,7 @@ def frames_of(
     slot: int = NO_SLOT,
     cpu_seconds: float = 0.1,
     quarantine: int = 0,
+    decoded: bool = True,
 ) -> list[Buffer]:
     """A sample message of zeros in that layout."""
     header = SampleHeader(
@@ -74,6 +75,7 @@ def frames_of(
         provenance=encode_map({"seed": seed}),
         worker="w",
         cpu_seconds=cpu_seconds,
+        decoded=decoded,
         slot=slot,
         quarantine=quarantine,
     )
@@ -198,11 +200,18 @@ class Peers:
         return lease
 
     def finish(
-        self, identity: bytes = b"w", cpu_seconds: float = 0.1, *, in_slot: bool = False, begins: int = 0
+        self,
+        identity: bytes = b"w",
+        cpu_seconds: float = 0.1,
+        *,
+        in_slot: bool = False,
+        begins: int = 0,
+        decoded: bool = True,
     ) -> Lease:
         """Answers the oldest lease, in its slot if asked to and it has one, and says what it begins next."""
         lease = self.leases[identity].popleft()
-        frames = answer_to(lease, in_slot=in_slot and lease.slot != NO_SLOT, cpu_seconds=cpu_seconds)
+        in_slot = in_slot and lease.slot != NO_SLOT
+        frames = answer_to(lease, in_slot=in_slot, cpu_seconds=cpu_seconds, decoded=decoded)
         self.worker_says(identity, Result(lease.lease, begins), *frames)
         return lease
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from tests.server.corpus import SMALL_SPEC
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.messages import JobFailed, Lease, Result
 from v2v_server.blame import ALONE_AFTER, Cause
@@ -194,3 +197,22 @@ def test_a_twin_does_not_take_the_worker_that_a_lone_task_waits_for() -> None:
     at.finish(b"empties")
     assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"other"]
     assert hanging.indices == (20,)
+
+
+def test_a_clip_takes_as_long_as_other_clips_not_as_siblings_that_need_no_decoding() -> None:
+    at = peers(spec=replace(SMALL_SPEC, samples_per_decode=3))
+    at.join(b"w", credit=1)
+    at.hello(batch_size=4)
+    at.want(*range(24))
+    for place in range(24):
+        decodes = place % 3 == 0
+        at.begin()
+        at.now += 3.0 if decodes else 0.2
+        at.finish(decoded=decodes)
+    at.want(24, 28, 32)
+    at.begin()
+    at.join(b"idle")
+    at.tick(8.9)
+    assert not at.leases[b"idle"]
+    at.tick(0.2)
+    assert [lease.indices for lease in at.leases[b"idle"]] == [(24,)]
