@@ -288,11 +288,15 @@ def _section(kind: type[Any], name: str, content: Any) -> Any:
     for key in content:
         if key not in hints:
             raise UsageError(f"unknown key {name}.{key}{_nearest(str(key), hints)}; known: {', '.join(hints)}")
-    return kind(**{key: _value(f"{name}.{key}", hints[key], value) for key, value in content.items()})
+    return kind(**{key: setting_of(f"{name}.{key}", hints[key], value) for key, value in content.items()})
 
 
-def _value(key: str, hint: Any, value: Any) -> Any:
-    """``value`` in the kind of its field, within its limits."""
+def setting_of(key: str, hint: Any, value: Any) -> Any:
+    """``value`` in the kind that ``hint`` says, within the limits of its key.
+
+    Raises:
+        UsageError: it is of another kind, or outside; the message names the key.
+    """
     if typing.get_origin(hint) is Literal or key in _CHOICES:
         words = _CHOICES.get(key) or typing.get_args(hint)
         if value not in words:

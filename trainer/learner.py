@@ -14,7 +14,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from trainer.backbones import BACKBONES
 from trainer.checkpoint import Checkpoint, capture_rng, restore_rng
-from trainer.config import LossConfig, OptimizerConfig, TrainConfig
+from trainer.config import LossConfig, OptimizerConfig, TrainConfig, setting_of
 from trainer.distributed import Ranks
 from trainer.ema import AveragedNetwork
 from trainer.flow import WHERE_TO_GET_WEIGHTS, RaftFlow
@@ -146,11 +146,14 @@ def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any
 
 def _network(config: TrainConfig) -> ReconstructionNetwork:
     kind = NETWORKS[config.network.name]
-    known = [name for name in inspect.signature(kind).parameters if name != "bins"]
-    for name in config.network.options:
+    parameters = inspect.signature(kind, eval_str=True).parameters.items()
+    known = {name: parameter.annotation for name, parameter in parameters if name != "bins"}
+    options = {}
+    for name, value in config.network.options.items():
         if name not in known:
             raise UsageError(f"network.options.{name}: {config.network.name} knows {', '.join(known)}")
-    network = kind(bins=config.stream.resolved_recipe.bins, **config.network.options)
+        options[name] = setting_of(f"network.options.{name}", known[name], value)
+    network = kind(bins=config.stream.resolved_recipe.bins, **options)
     if config.network.weights:
         load_into(network, config.network.weights)
     return network

@@ -230,6 +230,12 @@ def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixt
             "loss.raft_weights is missing.*raft_small_C_T_V2",
         ),
         ({"network__options": {"chanels": 3}}, "network.options.chanels: firenet knows base_channels"),
+        ({"network__options": {"base_channels": 2.5}}, "network.options.base_channels = 2.5: give a whole number"),
+        ({"network__options": {"normalize_voxels": "no"}}, "network.options.normalize_voxels = 'no': give true or fal"),
+        (
+            {"network__name": "e2vid", "network__options": {"norm": "BN"}},
+            "network.options.norm = 'BN': choose one of none, batch",
+        ),
         ({"network__weights": "no.pt"}, "no file no.pt"),
     ],
 )
