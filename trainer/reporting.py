@@ -100,7 +100,7 @@ class Reporter:
         if speaks:
             out.mkdir(parents=True, exist_ok=True)
             _drop_after(out / METRICS, step)
-            self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1 if step else None)
+            self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1)
 
     def __enter__(self) -> Reporter:
         self._bar.start()

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
 from tests.client.fake_server import FakeServer
@@ -83,6 +84,16 @@ def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: 
     shutil.copy(early / LAST, run / LAST)
     trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12)
     assert losses(run) == losses(whole)
+
+
+def test_a_run_begun_anew_drops_what_an_ended_one_said(server: FakeServer, tmp_path: Path) -> None:
+    """One that ended before its first checkpoint, in the same folder."""
+    run = trained(tmp_path, server.address, "run", run__steps=3)
+    (run / LAST).unlink()
+    trained(tmp_path, server.address, "run", run__steps=2)
+    board = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert [event.step for event in board.Scalars("loss/total")] == [1, 2]
+    assert [record["step"] for record in losses(run)] == [1, 2]
 
 
 def test_a_reading_that_a_crash_cut_off_hinders_nobody(server: FakeServer, whole: Path, tmp_path: Path) -> None:
