@@ -67,7 +67,7 @@ def train(
     shown = stop.next(preview_batch(config, address)) if ranks.first and run.preview_every else None
 
     meter = Meter(ranks)
-    saved = None
+    begun, saved = step, None
 
     def look() -> None:
         """Read the meter: from time to time, and always before anything is saved."""
@@ -117,7 +117,8 @@ def train(
                 save(f"epoch-{epoch:04d}.pt")
             if shown is not None and step % run.preview_every == 0:
                 reporter.preview(step, films(learner.trained, shown, device))
-        if saved != step:
+        # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
+        if saved != step and (step > begun or stop.failure is None):
             look()
             save(LAST)
         if shown is not None and step % run.preview_every:
