@@ -1,4 +1,4 @@
-"""A clean end on Ctrl-C, on SIGTERM, at a time limit or without a server: between two steps, on all ranks the same.
+"""A clean end on Ctrl-C, on SIGTERM, at a time limit or without data: between two steps, on all ranks the same.
 
 The signal's handler only leaves a note, so no step is cut in half; but while the loop waits for data, which may take
 for ever (the same Ctrl-C reaches a server in the same terminal), the handler ends the wait.
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from types import FrameType
 from typing import TypeVar
 
-from v2v_protocol.errors import RemoteError, ServerLost
+from v2v_protocol.errors import V2VError
 
 Item = TypeVar("Item")
 
@@ -40,7 +40,7 @@ class StopRequest:
 
     def __init__(self, seconds: float = 0.0, agree: Callable[[bool], bool] = bool) -> None:
         self.signal = 0
-        self.failure: ServerLost | RemoteError | None = None
+        self.failure: V2VError | None = None
         self._count = 0
         self._waiting = False
         self._agree = agree
@@ -83,7 +83,7 @@ class StopRequest:
             return None
 
     def until(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items, up to the end or to the first one before which any rank wants to stop or has no server.
+        """The items, up to the end or to the first one before which any rank wants to stop or has no data.
 
         All ranks must have equally many.
         """
@@ -92,7 +92,7 @@ class StopRequest:
             item = None
             try:
                 item = None if self.wanted else self.next(iterator)
-            except (ServerLost, RemoteError) as error:
+            except V2VError as error:
                 self.failure = error
             except (RuntimeError, EOFError, OSError):
                 # What reached this process reached its loader workers too: PyTorch says that one is gone, or its pipe

@@ -41,7 +41,7 @@ def train(
 
     Raises:
         Diverged: see there.
-        V2VError: what the stream raises. A lost server costs no steps: they are saved first.
+        V2VError: what the stream raises. It costs no steps: they are saved first.
     """
     run, device = config.run, ranks.device
     bfloat16 = config.compute.precision == "bfloat16"

@@ -23,7 +23,7 @@ from trainer.models import FireNet
 from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
 from trainer.reporting import METRICS, Meter, Reporter, read_metrics
 from trainer.train import _server_flags
-from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
@@ -174,14 +174,15 @@ def test_a_time_limit_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stop.signal == 0
 
 
-def test_a_lost_server_is_kept_for_later() -> None:
+@pytest.mark.parametrize("error", [ServerLost("gone"), StateMismatch("other videos"), WorkerCrashLoop("no worker")])
+def test_why_the_data_ended_is_kept_for_later(error: V2VError) -> None:
     def items() -> Iterator[int]:
         yield 0
-        raise ServerLost("gone")
+        raise error
 
     with StopRequest() as stop:
         assert list(stop.until(items())) == [0]
-    assert isinstance(stop.failure, ServerLost)
+    assert stop.failure is error
 
 
 @pytest.mark.parametrize(
