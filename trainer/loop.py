@@ -75,9 +75,14 @@ def train(
         if not values:
             return
         if not math.isfinite(values["total"] + values["gradient_norm"]):
+            kept = (
+                "nothing was saved since this start"
+                if saved is None
+                else f"{out / LAST} is of step {saved}, before that"
+            )
             raise Diverged(
-                f"step {step}: loss {values['total']}, gradient norm {values['gradient_norm']} since the last reading. "
-                f"{out / LAST} is from before; try a lower optimizer.learning_rate or optimizer.clip_gradient_norm"
+                f"step {step}: loss {values['total']}, gradient norm {values['gradient_norm']} since the last reading; "
+                f"{kept}. Try a lower optimizer.learning_rate or optimizer.clip_gradient_norm"
             )
         reporter.metrics(step, epoch, float(learner.scheduler.get_last_lr()[0]), values)
 

@@ -271,7 +271,9 @@ def test_a_diverged_run_keeps_the_checkpoint_before(
     spoilt = {name: tensor * torch.nan for name, tensor in good.model.items()}
     save_checkpoint(tmp_path / "spoilt.pt", dataclasses.replace(good, model=spoilt))
     assert main(arguments(tmp_path, server.address, "run", resume="spoilt.pt", run__steps=3, run__save_every=1)) == 1
-    assert "step 2: loss nan" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "step 2: loss nan" in message
+    assert "nothing was saved since this start" in message
     assert same(load_checkpoint(run / LAST).model, good.model)
 
 
