@@ -99,7 +99,13 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
         content[item.name] = _plain(getattr(checkpoint, item.name), item.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
-        torch.save(content, file)
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:
+            # PyTorch closes its archive on the way out of the disk's error, and complains that bytes are missing.
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

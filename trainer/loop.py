@@ -18,7 +18,7 @@ from trainer.learner import Learner
 from trainer.preview import films
 from trainer.reporting import Meter, Reporter
 from trainer.resume import LAST
-from v2v_protocol.errors import V2VError
+from v2v_protocol.errors import UsageError, V2VError
 
 
 class Diverged(V2VError):
@@ -41,6 +41,7 @@ def train(
 
     Raises:
         Diverged: see there.
+        UsageError: a checkpoint cannot be written.
         V2VError: what the stream raises. It costs no steps: they are saved first.
     """
     run, device = config.run, ranks.device
@@ -87,8 +88,14 @@ def train(
         reporter.metrics(step, epoch, float(learner.scheduler.get_last_lr()[0]), values)
 
     def save(name: str) -> None:
-        if ranks.first:
+        if not ranks.first:
+            return
+        try:
             save_checkpoint(out / name, learner.checkpoint(step, position, config))
+        except OSError as error:
+            raise UsageError(
+                f"step {step} cannot be saved as {out / name}: {error.strerror}; what was saved before is as it was"
+            ) from error
 
     with Reporter(out, speaks=ranks.first, step=step) as reporter:
         for batch in stop.until(batches):

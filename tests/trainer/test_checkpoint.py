@@ -7,6 +7,7 @@ import dataclasses
 import os
 import pickle
 import random
+import resource
 from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any
@@ -372,6 +373,19 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: p
         save_checkpoint(path, run.checkpoint())
     assert path.read_bytes() == old
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
+
+
+def test_what_the_disk_says_is_what_is_raised(tmp_path: Path) -> None:
+    """Not what PyTorch's writer makes of it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    large = dataclasses.replace(Run().checkpoint(), ema={"weight": torch.zeros(60_000)})
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        with pytest.raises(OSError, match="File too large"):
+            save_checkpoint(tmp_path / "last.pt", large)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_data_are_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

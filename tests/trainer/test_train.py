@@ -277,6 +277,17 @@ def test_a_diverged_run_keeps_the_checkpoint_before(
     assert same(load_checkpoint(run / LAST).model, good.model)
 
 
+def test_a_disk_that_refuses_is_said(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("trainer.loop.save_checkpoint", full)
+    message = refused(tmp_path, server.address, capsys, run__steps=2)
+    assert re.search(r"step 2 cannot be saved as .*last\.pt: No space left on device", message)
+
+
 def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeServer(sequences=23) as server:
         sent = []
