@@ -1,7 +1,8 @@
-"""Which run a checkpoint belongs to, and where an earlier one must not be written over."""
+"""Which run a checkpoint belongs to, and which folder a run may write to."""
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 from trainer.checkpoint import Checkpoint
@@ -47,7 +48,29 @@ def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
 def require_fresh(out: Path) -> None:
     """
     Raises:
-        UsageError: the folder holds a run, which a new one would write over.
+        UsageError: the folder holds a run, which a new one would write over; or it may not be entered.
     """
-    if (out / LAST).exists():
+    try:
+        holds_run = (out / LAST).exists()
+    except OSError as error:
+        raise _unusable(out, error) from error
+    if holds_run:
         raise UsageError(f"{out} holds a run: go on with --resume {out / LAST}, or give another folder with --out")
+
+
+def require_writable(out: Path) -> None:
+    """Makes the folder where it is missing, before anything is started for nothing.
+
+    Raises:
+        UsageError: it cannot be made, or nothing can be written there.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise _unusable(out, error) from error
+
+
+def _unusable(out: Path, error: OSError) -> UsageError:
+    return UsageError(f"run.out = {out}: {error.strerror}; give another folder with --out")

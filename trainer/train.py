@@ -26,7 +26,7 @@ from trainer.distributed import Ranks, ranks
 from trainer.interruption import StopRequest
 from trainer.learner import build
 from trainer.loop import Diverged, train
-from trainer.resume import LAST, require_fresh, require_same_run
+from trainer.resume import LAST, require_fresh, require_same_run, require_writable
 from v2v_client.command import run_command
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError, V2VError
@@ -127,6 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
         torch.set_num_threads(config.compute.threads)
     with ranks(config.compute.device) as mine:
         learner = build(config, mine)
+        if mine.first:
+            require_writable(out)
         with serving(config.stream, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
             steps = train(config, learner, address, mine, stop, out, resume)
         if mine.first:

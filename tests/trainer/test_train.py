@@ -19,9 +19,10 @@ from tests.trainer.training import arguments, losses, trained
 from trainer.checkpoint import load_checkpoint, save_checkpoint
 from trainer.models import FireNet
 from trainer.reporting import METRICS
-from trainer.resume import LAST
+from trainer.resume import LAST, require_fresh
 from trainer.train import main
 from trainer.weights import load_into
+from v2v_protocol.errors import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -196,6 +197,26 @@ def test_a_folder_with_a_run_is_not_written_over(
 ) -> None:
     trained(tmp_path, server.address, "run", run__steps=1)
     assert "holds a run: go on with --resume" in refused(tmp_path, server.address, capsys)
+
+
+@pytest.mark.parametrize("out", ["file", "file/run"])
+def test_a_folder_that_cannot_be_written_is_said_before_anything_is_asked(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    (tmp_path / "file").touch()
+    before = len(server.hellos)
+    assert main(arguments(tmp_path, server.address, out, run__steps=1)) == 2
+    assert re.search(r"run\.out = .*file.*; give another folder with --out", capsys.readouterr().err)
+    assert len(server.hellos) == before
+
+
+def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(_: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "exists", denied)
+    with pytest.raises(UsageError, match=r"run\.out = .*: Permission denied; give another folder"):
+        require_fresh(tmp_path)
 
 
 def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
