@@ -121,12 +121,19 @@ class Reporter:
         self._bar.update(self._task, completed=step, total=self._total)
 
     def metrics(self, step: int, epoch: int, learning_rate: float, values: Mapping[str, float]) -> None:
-        """A reading of the meter."""
+        """A reading of the meter.
+
+        Raises:
+            UsageError: it cannot be written down.
+        """
         if self._board is None:
             return
         record: dict[str, Any] = {"step": step, "epoch": epoch, "learning_rate": learning_rate, **values}
-        with (self._out / METRICS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
+        try:
+            with (self._out / METRICS).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:
+            raise UsageError(f"{self._out / METRICS}: {error.strerror}") from error
         for name, value in record.items():
             if name != "step":
                 self._board.add_scalar(f"{_GROUPS.get(name, 'loss')}/{name}", value, step)

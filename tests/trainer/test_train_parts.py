@@ -252,6 +252,13 @@ def test_a_line_that_nobody_cut_off_is_said(tmp_path: Path, damaged: str) -> Non
             read_metrics(path)
 
 
+def test_a_reading_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    reporter = Reporter(tmp_path, speaks=True)
+    (tmp_path / METRICS).symlink_to("/dev/full")
+    with reporter, pytest.raises(UsageError, match=r"metrics\.jsonl: No space left"):
+        reporter.metrics(1, 0, 0.1, {"total": 1.0})
+
+
 def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
