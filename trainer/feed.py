@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from trainer.config import TrainConfig
 from v2v_client import Batch, V2VStreamDataset
+from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import LARGEST_SEED
 
 PREVIEW_SEED = 1 << 32
@@ -98,6 +99,10 @@ class Feed:
         began = time.perf_counter()
         try:
             return next(batches, None)
+        except V2VError as error:
+            if isinstance(self._source, DataLoader):
+                raise _without_trace(error) from error
+            raise
         finally:
             self.wait_seconds += time.perf_counter() - began
 
@@ -127,6 +132,12 @@ def _moved(batch: Batch, copies: torch.cuda.Stream) -> Batch:
         # Its memory belongs to the copying stream; without this the allocator could give it away while it is read.
         tensor.record_stream(compute)
     return moved
+
+
+def _without_trace(error: V2VError) -> V2VError:
+    """An error of a loader worker with its message alone: PyTorch puts the worker's trace, of many lines, before it."""
+    name = f"{type(error).__module__}.{type(error).__qualname__}"
+    return type(error)(str(error).rpartition(f"\n{name}: ")[2].rstrip("\n"))
 
 
 def _leave_signals_to_the_trainer(_worker: int) -> None:

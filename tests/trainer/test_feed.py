@@ -10,11 +10,13 @@ from collections.abc import Iterator
 import psutil
 import pytest
 import torch
+from torch._utils import ExceptionWrapper
 
 from tests.client.fake_server import FakeServer
-from trainer.feed import Feed
+from trainer.feed import Feed, _without_trace
 from trainer.interruption import StopRequest
 from v2v_client import V2VStreamDataset
+from v2v_protocol.errors import RemoteError, ServerLost, V2VError
 
 CPU = torch.device("cpu")
 
@@ -53,6 +55,22 @@ def test_the_handler_of_before_is_back_where_an_iteration_could_not_begin() -> N
     with pytest.raises(KeyboardInterrupt):
         next(Feed(dataset, CPU).epochs(0, 1))
     assert signal.getsignal(signal.SIGCHLD) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize(
+    "error", [ServerLost("tcp://host:1: nothing heard for 2 s"), RemoteError("no-sample", "it is gone")]
+)
+def test_an_error_of_a_loader_worker_is_its_message_alone(error: V2VError) -> None:
+    try:
+        raise error
+    except V2VError:
+        carried = ExceptionWrapper(where="in DataLoader worker process 0")
+    with pytest.raises(type(error), match="Traceback") as caught:
+        carried.reraise()
+    told = _without_trace(caught.value)
+    assert (type(told), str(told)) == (type(error), str(error))
+    assert str(_without_trace(error)) == str(error)
+    assert getattr(told, "code", None) == getattr(error, "code", None)
 
 
 def loader_worker(before: set[psutil.Process]) -> psutil.Process:
