@@ -157,7 +157,7 @@ class RunConfig:
         save_every: steps between two checkpoints; there is always one at the end.
         keep_epochs: also keep a checkpoint of the end of each epoch.
         preview_every: steps between previews; 0: none.
-        preview_samples: samples shown in a preview.
+        preview_samples: samples shown in a preview, if an epoch has so many.
     """
 
     out: str = ""

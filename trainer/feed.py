@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from trainer.config import TrainConfig
 from v2v_client import Batch, V2VStreamDataset
-from v2v_protocol.errors import V2VError
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.sample import LARGEST_SEED
 
 PREVIEW_SEED = 1 << 32
@@ -46,18 +46,31 @@ def stream(config: TrainConfig, address: str) -> V2VStreamDataset:
 
 
 def preview_batch(config: TrainConfig, address: str) -> Iterator[Batch]:
-    """Yields the batch that previews show, on the CPU: the same one whenever the run is started again."""
-    dataset = V2VStreamDataset(
-        address,
-        batch_size=config.run.preview_samples,
-        recipe=config.stream.resolved_recipe,
-        seed=(config.stream.seed + PREVIEW_SEED) % (LARGEST_SEED + 1),
-        rank=0,
-        world_size=1,
-        timeout_seconds=config.stream.timeout_seconds,
-        **config.stream.spec,
-    )
-    return islice(dataset, 1)
+    """Yields the batch that previews show, on the CPU: the same one whenever the run is started again.
+
+    It has ``run.preview_samples`` samples, or as many as an epoch has.
+    """
+
+    def preview(samples: int) -> V2VStreamDataset:
+        return V2VStreamDataset(
+            address,
+            batch_size=samples,
+            recipe=config.stream.resolved_recipe,
+            seed=(config.stream.seed + PREVIEW_SEED) % (LARGEST_SEED + 1),
+            rank=0,
+            world_size=1,
+            timeout_seconds=config.stream.timeout_seconds,
+            **config.stream.spec,
+        )
+
+    dataset = preview(config.run.preview_samples)
+    try:
+        yield from islice(dataset, 1)
+    except UsageError:
+        sequences = 0 if dataset.stream is None else dataset.stream.sequences
+        if not 0 < sequences < config.run.preview_samples:
+            raise
+        yield from islice(preview(sequences), 1)
 
 
 class Feed:

@@ -158,6 +158,21 @@ def test_a_preview_does_not_change_the_training(server: FakeServer, whole: Path,
     assert losses(run) == losses(whole)[:4]
 
 
+def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> None:
+    with FakeServer(sequences=1) as server:
+        run = trained(
+            tmp_path, server.address, "run", run__steps=1, run__preview_every=1, run__preview_samples=2,
+            stream__batch_size=1,
+        )  # fmt: skip
+    assert [path.name for path in (run / "previews").glob("*.png")] == ["step-0000001-0.png"]
+
+
+def test_too_large_a_batch_is_said_with_its_own_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeServer(sequences=1) as server:
+        told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
+    assert "no global batch of 1 x 4 = 4 samples" in told
+
+
 def test_loader_workers_change_nothing(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=7, stream__loader_workers=1)
     assert losses(run) == losses(whole)[:7]
