@@ -17,6 +17,7 @@ from trainer.checkpoint import Checkpoint, capture_rng, restore_rng
 from trainer.config import LossConfig, OptimizerConfig, TrainConfig, setting_of
 from trainer.distributed import Ranks
 from trainer.ema import AveragedNetwork
+from trainer.evaluation.network import fitting
 from trainer.flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.losses import ReconstructionLoss
 from trainer.lpips import HEADS_FROM, LPIPS
@@ -155,8 +156,29 @@ def _network(config: TrainConfig) -> ReconstructionNetwork:
         options[name] = setting_of(f"network.options.{name}", known[name], value)
     network = kind(bins=config.stream.resolved_recipe.bins, **options)
     if config.network.weights:
-        load_into(network, config.network.weights)
+        try:
+            load_into(network, config.network.weights)
+        except UsageError as error:
+            raise UsageError(f"network.weights: {_what_would_fit(config) or error}") from error
     return network
+
+
+def _what_would_fit(config: TrainConfig) -> str:
+    """What to set for the weights that do not fit; "" where the file does not tell, or tells what is set."""
+    weights, bins = config.network.weights, config.stream.resolved_recipe.bins
+    found = fitting(weights)
+    if found is None:
+        return ""
+    name, options = found
+    wanted = {"stream.recipe.bins": options.pop("bins", bins), "network.name": name}
+    signature = inspect.signature(NETWORKS[name]).parameters
+    own = {key: value for key, value in config.network.options.items() if key in signature}
+    changed = {key: value for key, value in options.items() if own.get(key, signature[key].default) != value}
+    if changed:
+        wanted["network.options"] = {**own, **changed}
+    present = {"stream.recipe.bins": bins, "network.name": config.network.name}
+    missing = [f"{key} = {value}" for key, value in wanted.items() if present.get(key) != value]
+    return f"{weights} does not fit this network; set {', '.join(missing)}" if missing else ""
 
 
 def _loss(config: LossConfig) -> ReconstructionLoss:

@@ -13,6 +13,7 @@ from trainer.config import TrainConfig
 from trainer.config_file import load_config
 from trainer.distributed import Ranks
 from trainer.learner import Learner, build
+from v2v_protocol.errors import UsageError
 
 
 def learner(folder: Path, *, channels_last: bool, fused: bool) -> tuple[Learner, TrainConfig]:
@@ -52,3 +53,24 @@ def test_the_optimiser_goes_on_in_another_memory_format(
     step(after)
     for name, tensor in before.network.state_dict().items():
         assert torch.allclose(after.network.state_dict()[name], tensor, rtol=0, atol=1e-5), name
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["network.options={}"], r"set network\.options = \{'base_channels': 2\}$"),
+        (
+            ["network.options={normalize_voxels: true}"],
+            r"set network\.options = \{'normalize_voxels': True, 'base_channels': 2\}$",
+        ),
+        (["stream.recipe.bins=5"], r"set stream\.recipe\.bins = 2$"),
+        (["network.name=e2vid"], r"set network\.name = firenet$"),
+    ],
+)
+def test_of_weights_that_do_not_fit_it_is_said_what_does(tmp_path: Path, settings: list[str], message: str) -> None:
+    first = build(load_config(configured(tmp_path)), Ranks(0, 1, torch.device("cpu")))
+    torch.save(first.network.state_dict(), tmp_path / "small.pth")
+    weights = f"network.weights={tmp_path / 'small.pth'}"
+    build(load_config(configured(tmp_path), [weights]), Ranks(0, 1, torch.device("cpu")))
+    with pytest.raises(UsageError, match=rf"network\.weights: .*small\.pth does not fit this network; {message}"):
+        build(load_config(configured(tmp_path), [weights, *settings]), Ranks(0, 1, torch.device("cpu")))

@@ -35,6 +35,29 @@ def load_network(
     Raises:
         UsageError: the file is not of this network, or an option is unknown.
     """
+    name, told = _recognised(weights, name, ema=ema)
+    arguments = {**told, **(options or {})}
+    try:
+        network = NETWORKS[name](**arguments)
+    except TypeError as error:
+        raise UsageError(f"options of {name}: {error}") from error
+    load_into(network, weights, ema=ema)
+    return network.eval(), name
+
+
+def fitting(weights: str | Path) -> tuple[str, dict[str, Any]] | None:
+    """Name and arguments of the network that a file of weights is of; None where nothing tells.
+
+    Raises:
+        UsageError: the file cannot be read.
+    """
+    state, _ = load_weights(weights)
+    if not any(head in state for head in HEADS.values()):
+        return None
+    return _recognised(weights, None, ema=False)
+
+
+def _recognised(weights: str | Path, name: str | None, *, ema: bool) -> tuple[str, dict[str, Any]]:
     state, report = load_weights(weights, ema=ema)
     trained = _trained_as(weights)
     if name is None:
@@ -44,13 +67,7 @@ def load_network(
     if name not in NETWORKS:
         raise UsageError(f"model {name!r}: give one of {', '.join(NETWORKS)}")
     stated = trained.get("options", {}) if name == trained.get("name") else {}
-    arguments = {**_told_by_tensors(name, state, report), **stated, **(options or {})}
-    try:
-        network = NETWORKS[name](**arguments)
-    except TypeError as error:
-        raise UsageError(f"options of {name}: {error}") from error
-    load_into(network, weights, ema=ema)
-    return network.eval(), name
+    return name, {**_told_by_tensors(name, state, report), **stated}
 
 
 def _trained_as(weights: str | Path) -> Mapping[str, Any]:
