@@ -96,6 +96,8 @@ def summary(done: Converted) -> str:
         f"{done.destination}: {written.events} events in {written.seconds:.3f} s, {written.images} images, "
         f"{written.size.width} x {written.size.height} ({done.form})"
     )
+    if written.size_is_guessed:
+        text += "\n  the size is only that of the events' area, nothing states the sensor's: give --size WxH"
     if written.reordered_events:
         text += f"\n  {written.reordered_events} times an event was earlier than the one before it; sorted"
     if written.backward_images:

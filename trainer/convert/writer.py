@@ -41,6 +41,7 @@ class Written:
         reordered_events: events that came earlier in time than their predecessor.
         backward_images: pictures whose time is not later than their predecessor's; kept as they are.
         size: of the sensor.
+        size_is_guessed: nothing stated it, so it is the smallest that holds all events.
     """
 
     events: int
@@ -49,6 +50,7 @@ class Written:
     reordered_events: int
     backward_images: int
     size: SensorSize
+    size_is_guessed: bool
 
 
 class RecordingWriter:
@@ -228,6 +230,7 @@ class RecordingWriter:
             reordered_events=self._reordered,
             backward_images=int(np.count_nonzero(np.diff(self._picture_times) <= 0)),
             size=size,
+            size_is_guessed=self._size is None and self._picture_size is None,
         )
 
     def _pair_pictures(self) -> None:

@@ -226,6 +226,17 @@ def test_blocks_may_end_anywhere(monkeypatch: pytest.MonkeyPatch, block: int) ->
         list(read_text_events(io.BytesIO(broken), "a.txt"))
 
 
+def test_it_is_said_where_the_size_is_that_of_the_events_area(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.txt").write_text("10 3 2 1\n20 7 4 0\n")
+    for name, flags, size, guessed in (("a", [], "8 x 5", True), ("b", ["--size", "24x18"], "24 x 18", False)):
+        cli.main([str(tmp_path / "own.txt"), "--out", str(tmp_path / f"{name}.h5"), *flags])
+        printed = capsys.readouterr().out
+        assert size in printed
+        assert ("give --size" in printed) == guessed
+
+
 @pytest.mark.parametrize("package", ["faery", "rosbags"])
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
     source = tmp_path / ("a.raw" if package == "faery" else "a.bag")
