@@ -88,6 +88,8 @@ def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
             raise UsageError(f"rank 0 could not start a server: {error}")
         yield address
         return
+    # What the server says of itself is not shown, and cataloguing a new corpus takes a while.
+    print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
     with ExitStack() as stack:
         try:
             server = LocalServer(stream.videos, workers=stream.workers, flags=_server_flags(stream))

@@ -110,7 +110,7 @@ class LocalServer:
             if time.monotonic() >= deadline:
                 raise ServerLost(
                     f"the local server does not listen after {self._start_seconds:g} s: {self.last_lines()}; "
-                    "give it longer with start_seconds"
+                    "give it longer with start_seconds, or start v2v-serve yourself and connect to it"
                 )
             time.sleep(_POLL_SECONDS)
 

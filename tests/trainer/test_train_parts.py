@@ -22,7 +22,7 @@ from trainer.interruption import StopRequest
 from trainer.models import FireNet
 from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
 from trainer.reporting import METRICS, Meter, Reporter, read_metrics
-from trainer.train import _server_flags
+from trainer.train import _server_flags, serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -37,6 +37,22 @@ def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
     assert "--scene" not in plain
     asked = _server_flags(StreamConfig(videos="clips", recipe=recipe, list="some.txt", spec={"scene": "auto"}))
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
+
+
+def test_it_says_what_server_it_starts_before_that_takes_its_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise ServerLost("it does not come up")
+
+    monkeypatch.setattr("trainer.train.LocalServer", never)
+    settings = StreamConfig(videos="clips", rows="top:0.54", workers=3)
+    with pytest.raises(ServerLost), serving(settings, ALONE):
+        pass
+    assert capsys.readouterr().err == "starting a server: clips, rows top:0.54, 3 workers\n"
+    with serving(StreamConfig(address="tcp://127.0.0.1:1"), ALONE) as address:
+        assert address == "tcp://127.0.0.1:1"
+    assert not capsys.readouterr().err
 
 
 # --- the averaged network ---------------------------------------------------------------------------------------------
