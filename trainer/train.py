@@ -51,7 +51,11 @@ def _parser() -> argparse.ArgumentParser:
         "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="change one key, repeatable"
     )
     parser.add_argument("--resume", metavar="FILE", help="checkpoint to go on from")
-    parser.add_argument("--out", metavar="DIR", help="folder of the run (run.out; default runs/NAME of the config)")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder of the run (run.out; default runs/NAME of the config, with --resume that of the checkpoint)",
+    )
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
@@ -117,11 +121,13 @@ def run(arguments: argparse.Namespace) -> int:
         V2VError: of the configuration, of what :func:`trainer.learner.build` reads, or of :func:`trainer.loop.train`.
     """
     config = load_config(arguments.config, _settings(arguments))
-    out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
     resume = None
     if arguments.resume is None:
+        out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
     else:
+        # Where the checkpoint is, not where a run of this configuration would begin: another one may be there.
+        out = Path(config.run.out or Path(arguments.resume).parent)
         resume = load_checkpoint(arguments.resume)
         for change in require_same_run(resume, config):
             print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)

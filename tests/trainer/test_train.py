@@ -234,6 +234,17 @@ def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: p
         require_fresh(tmp_path)
 
 
+def test_a_run_goes_on_in_its_own_folder(server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    without_out = ["small.yaml", "--connect", server.address, "--set", "run.steps=1"]
+    trained(tmp_path, server.address, "elsewhere", run__steps=1)
+    assert main(without_out) == 0
+    first = (tmp_path / "runs" / "small" / LAST).read_bytes()
+    assert main([*without_out, "--set", "run.steps=2", "--resume", f"elsewhere/{LAST}"]) == 0
+    assert load_checkpoint(tmp_path / "elsewhere" / LAST).step == 2
+    assert (tmp_path / "runs" / "small" / LAST).read_bytes() == first
+
+
 def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trained(tmp_path, server.address, "run", run__steps=1)
     message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", optimizer__learning_rate=0.5)
