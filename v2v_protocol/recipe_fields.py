@@ -73,7 +73,8 @@ def coerced(name: str, value: Any, default: Any) -> Any:
     if isinstance(default, float):
         return _number(name, value)
     ends = tuple(value) if isinstance(value, list | tuple) else (value, value)
-    if len(ends) != 2:
+    # 0.2,0.5 without brackets, or 0.2..0.5, is text in YAML.
+    if len(ends) != 2 or (isinstance(value, str) and not _reads_as_number(value)):
         raise RecipeError(f"recipe {name} = {value!r}: give one number, or a pair [lowest, highest]")
     low, high = (_number(name, end) for end in ends)
     if low > high:
@@ -103,6 +104,14 @@ def check_limits(values: Mapping[str, Any]) -> None:
             f"recipe photoreceptor_hz = {_shown(values['photoreceptor_hz'])}: give 0 for no low-pass, or a range from "
             f"{SMALLEST_PHOTORECEPTOR_HZ} upwards"
         )
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _number(name: str, value: Any) -> float:
