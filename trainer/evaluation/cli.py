@@ -139,6 +139,10 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         names = list(dict.fromkeys([*names, *(f"lpips_{net}" for net in lpips_files)]))
     if arguments.fps is not None and names:
         raise UsageError("--fps scores nothing, so it goes without --metrics")
+    if arguments.fps is not None and arguments.out is None:
+        raise UsageError(
+            "--fps scores nothing: --out DIR says where its pictures go, and --video adds a film of all of them"
+        )
     run = Run(
         network=network,
         voxels=voxels,

@@ -166,6 +166,7 @@ def test_without_pictures_only_at_a_given_rate(tmp_path: Path, weights: Path) ->
         (["paper-discrete", "--data", "{data}", "--metrics", "mse"], "holds no sequence of hqf/*.h5 (HQF), evaid"),
         (["--data", "{data}", "--model", "e2vid"], "the weights do not fit"),
         (["--data", "{data}", "--fps", "10", "--metrics", "mse"], "--fps scores nothing"),
+        (["--data", "{data}", "--fps", "10"], "--fps scores nothing: --out DIR says where"),
         (["--data", "{data}", "--rows", "0", "--out", "x"], "0 rows"),
         (["--data", "{data}", "--video"], "a video needs --out"),
         (["--data", "{data}", "--device", "gpu"], "--device gpu: PyTorch cannot compute there"),
