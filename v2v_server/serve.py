@@ -46,7 +46,8 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             rows=Rows.parse(config.rows),
             cache_dir=config.cache_dir or None,
             scene=config.spec.scene != "off",
-            processes=max(1, min(config.workers, usable_cores())),
+            # A host whose workers are all elsewhere has its cores to itself.
+            processes=min(config.workers or usable_cores(), usable_cores()),
             progress=progress,
             notice=progress.notice,
         )
