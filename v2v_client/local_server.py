@@ -31,14 +31,15 @@ class LocalServer:
         videos: folder or list of videos, as for ``v2v-serve --videos``.
         workers: server workers.
         flags: more flags for ``v2v-serve``; without ``--bind`` it listens on a free port of this host only.
-        start_seconds: how long it may take to come up; cataloguing a large folder for the first time takes minutes.
+        start_seconds: how long it may be silent until it listens. To catalogue a large folder for the first time takes
+            longer, but then it says every few seconds how far it is.
         stop_seconds: how long it may take to leave when asked, before it is killed.
 
     Attributes:
         address: where it listens.
 
     Entering raises UsageError when the server leaves with status 2 (its message says what is wrong with the videos or
-    flags) and ServerLost when it dies otherwise or does not come up in time; both quote the last lines it wrote.
+    flags) and ServerLost when it dies otherwise or is silent for too long; both quote the last lines it wrote.
     """
 
     address: str
@@ -98,7 +99,7 @@ class LocalServer:
         return self._process.pid
 
     def _wait_for(self, port_file: Path, process: subprocess.Popen[bytes]) -> str:
-        deadline = time.monotonic() + self._start_seconds
+        said, deadline = 0, time.monotonic() + self._start_seconds
         while True:
             if port_file.exists() and (address := port_file.read_text(encoding="utf-8").strip()):
                 return address
@@ -107,21 +108,25 @@ class LocalServer:
                 raise (UsageError if status == 2 else ServerLost)(
                     f"the local server ended with status {status} before it listened: {self.last_lines()}"
                 )
+            if self._said_bytes() > said:
+                said, deadline = self._said_bytes(), time.monotonic() + self._start_seconds
             if time.monotonic() >= deadline:
                 raise ServerLost(
-                    f"the local server does not listen after {self._start_seconds:g} s: {self.last_lines()}; "
-                    "give it longer with start_seconds, or start v2v-serve yourself and connect to it"
+                    f"the local server does not listen after {self._start_seconds:g} s of silence: "
+                    f"{self.last_lines()}; give it longer with start_seconds, or start v2v-serve yourself and connect "
+                    "to it"
                 )
             time.sleep(_POLL_SECONDS)
+
+    def _said_bytes(self) -> int:
+        return 0 if self._errors is None else os.fstat(self._errors.fileno()).st_size
 
     def last_lines(self) -> str:
         """The end of what the server wrote to its standard error."""
         if self._errors is None:
             return "(it was not started)"
         # The server writes where the file stands, and the two of us share that place: it must not be moved.
-        file = self._errors.fileno()
-        size = os.fstat(file).st_size
-        lines = os.pread(file, size, 0).decode(errors="replace").strip().splitlines()
+        lines = os.pread(self._errors.fileno(), self._said_bytes(), 0).decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-_LAST_LINES:]) or "(it wrote nothing)"
 
     def stop(self) -> None:

@@ -1,5 +1,7 @@
 import os
+import tempfile
 import time
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -68,6 +70,23 @@ def test_a_server_that_does_not_listen_in_time_is_stopped(program):
     with pytest.raises(ServerLost, match=r"does not listen after 0\.3 s"), LocalServer("videos", start_seconds=0.3):
         pass
     assert len(psutil.Process().children()) == before
+
+
+def test_a_server_that_says_how_far_it_is_has_longer(tmp_path, monkeypatch):
+    server, port_file = LocalServer("videos", start_seconds=60.0), tmp_path / "port"
+    now, steps = 0.0, iter([*[b"probing videos\n"] * 20, b"", b""])
+
+    def sleep(_):
+        nonlocal now
+        now += 50.0
+        server._errors.write(next(steps))
+        server._errors.flush()
+
+    monkeypatch.setattr("v2v_client.local_server.time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    silent = r"does not listen after 60 s of silence: .*probing videos"
+    with tempfile.TemporaryFile() as server._errors, pytest.raises(ServerLost, match=silent):
+        server._wait_for(port_file, SimpleNamespace(poll=lambda: None))
+    assert now == 22 * 50.0
 
 
 def test_flags_reach_the_server(program):
