@@ -55,6 +55,8 @@ from v2v_server.simulation.variants import USUAL
 from v2v_server.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 CREDIT = 2
+MOST_NAME_BYTES = 200
+"""What an operator may call a worker; a routing identity has 255 at most."""
 _PING_SECONDS = 5.0
 _MOST_SILENCES = 64
 """Of so many seconds each, until a silent server is asked again; before that, after 1, 2, 4, 8 ... of them. ZeroMQ
@@ -290,7 +292,12 @@ def unshared_name(beginning: str | None) -> str:
     Args:
         beginning: what its operator calls it, and perhaps others too; None: host and process id, which in containers
             may be the same for all.
+
+    Raises:
+        UsageError: it is too long to be a routing identity with what is added to it.
     """
+    if beginning is not None and len(beginning.encode()) > MOST_NAME_BYTES:
+        raise UsageError(f"--name has {len(beginning.encode())} bytes: give at most {MOST_NAME_BYTES}")
     return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 

@@ -301,6 +301,13 @@ def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.Mon
     assert [name[:6] for name in names] == ["node7-", "node7-", "node7"]
 
 
+def test_a_name_that_no_connection_can_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        worker_command(["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "n" * 300])
+    assert ended.value.code == 2
+    assert "--name has 300 bytes: give at most 200" in capsys.readouterr().err
+
+
 class TestKernels:
     """From lease 2 on a kernel is needed that the worker has not."""
 
