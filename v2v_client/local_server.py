@@ -113,8 +113,8 @@ class LocalServer:
             if time.monotonic() >= deadline:
                 raise ServerLost(
                     f"the local server does not listen after {self._start_seconds:g} s of silence: "
-                    f"{self.last_lines()}; give it longer with start_seconds, or start v2v-serve yourself and connect "
-                    "to it"
+                    f"{self.last_lines()}; start v2v-serve yourself, which shows what it is at, and connect to it, or "
+                    "give LocalServer more start_seconds"
                 )
             time.sleep(_POLL_SECONDS)
 

@@ -39,6 +39,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     Raises:
         CorpusError: nothing there, or nothing that can be used.
     """
+    cores = usable_cores()
     with catalogue_progress() as progress:
         return open_catalogue(
             config.videos,
@@ -47,7 +48,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             scene=config.spec.scene != "off",
             # A host whose workers are all elsewhere has its cores to itself.
-            processes=min(config.workers or usable_cores(), usable_cores()),
+            processes=min(config.workers or cores, cores),
             progress=progress,
             notice=progress.notice,
         )
