@@ -47,7 +47,7 @@ $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	touch $@
 
 test-old-numpy: $(OLD_NUMPY)/.ready
-	$(OLD_NUMPY)/bin/python -m pytest -q tests/simulation/test_golden.py
+	$(OLD_NUMPY)/bin/python -m pytest -q tests/server/simulation/test_golden.py
 
 check: $(READY)
 	$(BIN)/ruff format --check .

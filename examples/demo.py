@@ -15,7 +15,7 @@ from pathlib import Path
 from examples.demo_training import judge
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_server.picture import Row, draw_rows, write_png
+from v2v_server.offline.picture import Row, draw_rows, write_png
 
 _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2

@@ -9,8 +9,8 @@ import torch
 
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
-from trainer.preview import films, write_png
-from trainer.resume import LAST
+from trainer.run.preview import films, write_png
+from trainer.run.resume import LAST
 from trainer.weights import load_into
 from v2v_client import Batch, V2VStreamDataset
 

@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from v2v_protocol.errors import UsageError
-from v2v_server.broker import Broker
-from v2v_server.cli import serve
+from v2v_server.broker.sockets import Broker
+from v2v_server.commands.cli import serve
+from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.config import ServeConfig
-from v2v_server.quarantine_cli import main as quarantine
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
 UNIT = DEPLOY / "systemd" / "v2v-serve.service"

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks", "examples")
+PACKAGES = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "v2v_bench", "examples")
 
 FORBIDDEN: dict[str, set[str]] = {
-    "v2v_server": {"torch", "v2v_client", "trainer", "benchmarks", "examples"},
-    "v2v_client": {"v2v_server", "trainer", "benchmarks", "examples", "av", "numba", "cv2"},
-    "trainer": {"v2v_server", "benchmarks", "examples"},
+    "v2v_server": {"torch", "v2v_client", "trainer", "v2v_bench", "examples"},
+    "v2v_client": {"v2v_server", "trainer", "v2v_bench", "examples", "av", "numba", "cv2"},
+    "trainer": {"v2v_server", "v2v_bench", "examples"},
 }
 PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
@@ -83,7 +83,7 @@ def test_imports_are_absolute() -> None:
     [
         ("v2v_protocol.wire", ("torch", "zmq", "av", "numba", "cv2", "yaml")),
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
-        ("v2v_server.dispatcher", ("torch", "zmq", "numba", "cv2")),
+        ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:

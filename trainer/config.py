@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from trainer.backbones import BACKBONES
-from trainer.flow import WHERE_TO_GET_WEIGHTS
+from trainer.losses.backbones import BACKBONES
 from trainer.models import NETWORKS
+from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
@@ -84,7 +84,8 @@ class LossConfig:
         l1_weight, lpips_weight, temporal_weight: of the terms.
         lpips_network: "vgg", "alex" or "squeeze".
         lpips_backbone, lpips_heads: its weight files.
-        temporal_first_step, temporal_rule, temporal_as_published: see :class:`trainer.temporal.TemporalConsistency`.
+        temporal_first_step, temporal_rule, temporal_as_published: see
+        :class:`trainer.losses.temporal.TemporalConsistency`.
         flow: "raft" on this device, or "stream": estimated by the server's workers.
         raft_size, raft_weights: "small" or "large", and its weight file.
     """

@@ -12,17 +12,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from trainer.backbones import BACKBONES
-from trainer.checkpoint import Checkpoint, capture_rng, restore_rng
 from trainer.config import LossConfig, OptimizerConfig, TrainConfig, setting_of
-from trainer.distributed import Ranks
 from trainer.ema import AveragedNetwork
 from trainer.evaluation.network import fitting
-from trainer.flow import WHERE_TO_GET_WEIGHTS, RaftFlow
-from trainer.losses import ReconstructionLoss
-from trainer.lpips import HEADS_FROM, LPIPS
+from trainer.losses.backbones import BACKBONES
+from trainer.losses.lpips import HEADS_FROM, LPIPS
+from trainer.losses.reconstruction import ReconstructionLoss
+from trainer.losses.temporal import TemporalConsistency
 from trainer.models import NETWORKS, ReconstructionNetwork
-from trainer.temporal import TemporalConsistency
+from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
+from trainer.run.checkpoint import Checkpoint, capture_rng, restore_rng
+from trainer.run.distributed import Ranks
 from trainer.weights import load_into
 from v2v_client import Batch
 from v2v_protocol.errors import UsageError
@@ -92,7 +92,7 @@ class Learner:
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from there; the configurations must agree (see :func:`trainer.resume.require_same_run`)."""
+        """Go on from there; the configurations must agree (see :func:`trainer.run.resume.require_same_run`)."""
         self.network.load_state_dict(checkpoint.model)
         _restore_optimizer(self.optimizer, checkpoint.optimizer)
         if checkpoint.scheduler is not None:

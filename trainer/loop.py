@@ -9,15 +9,15 @@ from pathlib import Path
 import torch
 from torch.nn.utils import clip_grad_norm_
 
-from trainer.checkpoint import Checkpoint, save_checkpoint
 from trainer.config import TrainConfig
-from trainer.distributed import Ranks
 from trainer.feed import Feed, preview_batch, stream
-from trainer.interruption import StopRequest
 from trainer.learner import Learner
-from trainer.preview import films
-from trainer.reporting import Meter, Reporter
-from trainer.resume import LAST
+from trainer.run.checkpoint import Checkpoint, save_checkpoint
+from trainer.run.distributed import Ranks
+from trainer.run.interruption import StopRequest
+from trainer.run.preview import films
+from trainer.run.reporting import Meter, Reporter
+from trainer.run.resume import LAST
 from v2v_protocol.errors import UsageError, V2VError
 
 

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import torch
 
-from trainer.checkpoint import load_checkpoint
 from trainer.config import StreamConfig
 from trainer.config_file import load_config, shipped
-from trainer.distributed import Ranks, ranks
-from trainer.interruption import StopRequest
 from trainer.learner import build
 from trainer.loop import Diverged, train
-from trainer.resume import LAST, require_fresh, require_same_run, require_writable
+from trainer.run.checkpoint import load_checkpoint
+from trainer.run.distributed import Ranks, ranks
+from trainer.run.interruption import StopRequest
+from trainer.run.resume import LAST, require_fresh, require_same_run, require_writable
 from v2v_client.command import run_command
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError, V2VError

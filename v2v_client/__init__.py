@@ -6,9 +6,9 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
     batch.voxels  # int8 [B, T, bins, H, W]
 """
 
-from v2v_client.allocator import keep_freed_memory
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
+from v2v_client.memory.allocator import keep_freed_memory
 from v2v_protocol.errors import (
     ProtocolError,
     RecipeError,

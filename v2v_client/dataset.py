@@ -12,15 +12,15 @@ import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
-from v2v_client.buffers import BatchBuffers
-from v2v_client.connection import Connection
 from v2v_client.delivery import deliver
-from v2v_client.liveness import Patience
 from v2v_client.loader_exit import send_before_exit
+from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options
-from v2v_client.position import Consumer, Iteration, Position
-from v2v_client.state import ResumeState, Stream
-from v2v_client.world import EpochPlan
+from v2v_client.position.position import Consumer, Iteration, Position
+from v2v_client.position.state import ResumeState, Stream
+from v2v_client.position.world import EpochPlan
+from v2v_client.session.connection import Connection
+from v2v_client.session.liveness import Patience
 from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe

@@ -9,12 +9,12 @@ from typing import Any
 import numpy.typing as npt
 import torch
 
-from v2v_client.arrival import Arrival
 from v2v_client.batch import Batch
-from v2v_client.buffers import BatchBuffers, Memory, SharedMemory
-from v2v_client.connection import Connection
+from v2v_client.memory.buffers import BatchBuffers, Memory, SharedMemory
 from v2v_client.ordering import ReorderWindow
-from v2v_client.world import EpochPlan
+from v2v_client.position.world import EpochPlan
+from v2v_client.session.arrival import Arrival
+from v2v_client.session.connection import Connection
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import SampleHeader

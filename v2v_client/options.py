@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from v2v_client.state import Stream
+from v2v_client.position.state import Stream
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, StreamSpec

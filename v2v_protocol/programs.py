@@ -9,7 +9,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "benchmarks"})
+_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "v2v_bench"})
 
 Program = Callable[[], int | None]
 """Returns the exit status; None is success."""
@@ -55,13 +55,13 @@ def environment() -> dict[str, str]:
     return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 
 
-serve = _program("v2v-serve", "v2v_server.cli", "serve", "server")
-worker = _program("v2v-worker", "v2v_server.cli", "worker", "server")
-simulate = _program("v2v-simulate", "v2v_server.cli", "simulate", "server")
-prepare = _program("v2v-prepare", "v2v_server.prepare_cli", "main", "server")
-quarantine = _program("v2v-quarantine", "v2v_server.quarantine_cli", "main", "server")
-loadtest = _program("v2v-loadtest", "v2v_client.loadtest", "main", "client")
+serve = _program("v2v-serve", "v2v_server.commands.cli", "serve", "server")
+worker = _program("v2v-worker", "v2v_server.commands.cli", "worker", "server")
+simulate = _program("v2v-simulate", "v2v_server.commands.cli", "simulate", "server")
+prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
+quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
+loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
 train = _program("v2v-train", "trainer.train", "main", "trainer")
 evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")
 convert = _program("v2v-convert", "trainer.convert.cli", "main", "convert")
-bench = _program("v2v-bench", "benchmarks.cli", "main", "dev")
+bench = _program("v2v-bench", "v2v_bench.cli", "main", "dev")

@@ -48,8 +48,8 @@ class StreamSpec:
         samples_per_decode: K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its
             own. They are no more alike in their cameras than any others, but they show the same scene. An epoch has K
             samples of every sequence.
-        sibling_spacing: how far apart in the epoch those K are (``v2v_server.schedule``); 0 where K = 1. A consumer
-            that leaves it 0 with K > 1 gets its own stride from batch to batch, so that no batch holds two.
+        sibling_spacing: how far apart in the epoch those K are (``v2v_server.schedule.epoch``); 0 where K = 1. A
+            consumer that leaves it 0 with K > 1 gets its own stride from batch to batch, so that no batch holds two.
         flow_method: how flow is estimated where it is asked for; "auto" chooses for each step by how much moves.
         flow_direction: "forward", on the grid of a step's earlier frame, or "backward", on that of the later one.
         flow_from: flow of the voxels before this one is not computed but zero.

@@ -16,21 +16,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_server.blame import Cause, Loss
-from v2v_server.broker import Broker
+from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.sockets import Broker
+from v2v_server.broker.worker_registry import REST_SECONDS
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
-from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, LookFor, Record
-from v2v_server.pool import Pool
-from v2v_server.process import keep_freed_memory, open_many_files, usable_cores
-from v2v_server.progress import catalogue_progress
-from v2v_server.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
-from v2v_server.sequences import SequenceTable
-from v2v_server.status import StatusLine, summary, write
-from v2v_server.video.catalogue import Catalogue, open_catalogue
+from v2v_server.console.progress import catalogue_progress
+from v2v_server.console.status import StatusLine, summary, write
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.supervise.local_pool import Pool
+from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.rows import Rows
-from v2v_server.workers import REST_SECONDS
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:

@@ -25,13 +25,13 @@ from v2v_client import (
     UsageError,
     V2VStreamDataset,
 )
-from v2v_client.liveness import Patience
+from v2v_client.session.liveness import Patience
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Refused
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.wire import decode, decode_map, encode, encode_map
-from v2v_server.handover import slot_arrays
+from v2v_server.worker.handover import slot_arrays
 
 SEED = 5
 QUICK = Patience(ping_seconds=0.05, rewant_seconds=0.2)

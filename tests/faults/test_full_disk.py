@@ -23,14 +23,14 @@ from tests.stream.conftest import SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import Batch
 from v2v_client.local_server import LocalServer
-from v2v_server.quarantine import read_quarantine
+from v2v_server.broker.quarantine import read_quarantine
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.prepare.encode import Encoding
+from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.simulation.clip import warm_up
-from v2v_server.video.catalogue import open_catalogue
-from v2v_server.video.encode import Encoding
+from v2v_server.store.manifest import read_manifest
 from v2v_server.video.fingerprint import fingerprint
-from v2v_server.video.manifest import read_manifest
-from v2v_server.video.prepare import prepare
-from v2v_server.video.transcode import PARTIAL_SUFFIX
 
 INJECT = Path(__file__).parent / "inject"
 MPEG4 = Encoding("mpeg4", 2, 25)
@@ -179,7 +179,7 @@ def source(tmp_path: Path) -> Path:
 
 def _preparing(source: Path, out: Path, cache: Path) -> list[str]:
     settings = ["--codec", "mpeg4", "--gop", "25", "--workers", "2", "--cache-dir", str(cache), "--floor", "0"]
-    return ["v2v_server.prepare_cli", str(source), str(out), *settings]
+    return ["v2v_server.commands.prepare", str(source), str(out), *settings]
 
 
 def _require_it_goes_on(source: Path, out: Path, cache: Path) -> None:

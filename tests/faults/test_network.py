@@ -9,8 +9,8 @@ import pytest
 from tests.faults.proxy import Proxy, Way
 from tests.stream.conftest import SMALL, digest, epoch_of
 from v2v_client import ServerLost, V2VStreamDataset
-from v2v_client.liveness import Patience
 from v2v_client.local_server import LocalServer
+from v2v_client.session.liveness import Patience
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -22,9 +22,9 @@ from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import ServerLost
 from v2v_protocol.spec import StreamSpec
-from v2v_server.quarantine import read_quarantine
-from v2v_server.remake import remake
-from v2v_server.video.catalogue import open_catalogue
+from v2v_server.broker.quarantine import read_quarantine
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.offline.remake import remake
 
 INJECT = Path(__file__).parent / "inject"
 STAGES = ("decode", "simulate", "send")
@@ -59,7 +59,16 @@ def test_a_worker_whose_host_lacks_the_videos_changes_nothing(
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    command = [sys.executable, "-m", "v2v_server.cli", "worker", "--connect", address, "--videos", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "v2v_server.commands.cli",
+        "worker",
+        "--connect",
+        address,
+        "--videos",
+        str(tmp_path),
+    ]
     with LocalServer(clips, workers=1, flags=[*SMALL_FLAGS, "--worker-bind", address]) as server:
         with subprocess.Popen(command) as lacking:
             try:

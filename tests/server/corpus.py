@@ -11,8 +11,8 @@ import numpy as np
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.video.catalogue import Catalogue, Problem, VideoEntry
-from v2v_server.video.index import FrameIndex
+from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
 SMALL = Recipe(voxels_per_clip=2, bins=2, crop_height_px=8, crop_width_px=8)

@@ -28,11 +28,11 @@ from v2v_protocol.messages import (
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.blame import Cause, Loss
-from v2v_server.dispatcher import Dispatcher
-from v2v_server.instructions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
-from v2v_server.quarantine import Quarantine, Verdict
-from v2v_server.video.catalogue import Catalogue
+from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.catalogue.catalogue import Catalogue
 
 DEADLINE = 60.0
 IDLE = 600.0

@@ -14,7 +14,7 @@ from tests.server.corpus import corpus, video
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cli import serve
+from v2v_server.commands.cli import serve
 from v2v_server.config import DEFAULT_BIND, ServeConfig, read_yaml_mapping, recipe_setting
 
 

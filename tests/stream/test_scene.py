@@ -16,9 +16,9 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance, Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.remake import remake
-from v2v_server.scene_choice import MOVING
-from v2v_server.video.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.remake import remake
+from v2v_server.worker.scene_choice import MOVING
 
 ARRAYS = ("voxels", "frames", "flow", "flow_valid")
 STEADY = SMALL.replace(pause_probability=0.0)

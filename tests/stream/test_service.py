@@ -22,7 +22,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.messages import Hello, Ping, Pong, Refused, Want, Welcome
 from v2v_protocol.wire import decode, encode
-from v2v_server.cli import serve
+from v2v_server.commands.cli import serve
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from torch._utils import ExceptionWrapper
 
 from tests.client.fake_server import FakeServer
 from trainer.feed import Feed, _without_trace
-from trainer.interruption import StopRequest
+from trainer.run.interruption import StopRequest
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import RemoteError, ServerLost, V2VError
 

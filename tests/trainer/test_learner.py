@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tests.trainer.training import configured
-from trainer.checkpoint import load_checkpoint, save_checkpoint
 from trainer.config import TrainConfig
 from trainer.config_file import load_config
-from trainer.distributed import Ranks
 from trainer.learner import Learner, build
+from trainer.run.checkpoint import load_checkpoint, save_checkpoint
+from trainer.run.distributed import Ranks
 from v2v_protocol.errors import UsageError
 
 

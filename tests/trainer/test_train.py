@@ -16,10 +16,10 @@ from torch import Tensor
 
 from tests.client.fake_server import FakeServer
 from tests.trainer.training import arguments, losses, trained
-from trainer.checkpoint import load_checkpoint, save_checkpoint
 from trainer.models import FireNet
-from trainer.reporting import METRICS
-from trainer.resume import LAST, require_fresh
+from trainer.run.checkpoint import load_checkpoint, save_checkpoint
+from trainer.run.reporting import METRICS
+from trainer.run.resume import LAST, require_fresh
 from trainer.train import main
 from trainer.weights import load_into
 from v2v_protocol.errors import UsageError

@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.config import StreamConfig
-from trainer.distributed import Ranks, ranks
 from trainer.ema import AveragedNetwork, decay_at
-from trainer.interruption import StopRequest
 from trainer.models import FireNet
-from trainer.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
-from trainer.reporting import METRICS, Meter, Reporter, read_metrics
+from trainer.run.distributed import Ranks, ranks
+from trainer.run.interruption import StopRequest
+from trainer.run.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
+from trainer.run.reporting import METRICS, Meter, Reporter, read_metrics
 from trainer.train import _server_flags, serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from trainer.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
 
 SMALL: dict[str, Any] = {

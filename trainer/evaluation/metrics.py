@@ -27,8 +27,8 @@ import numpy.typing as npt
 import torch
 from skimage.metrics import structural_similarity
 
-from trainer.backbones import BACKBONES
-from trainer.lpips import LPIPS
+from trainer.losses.backbones import BACKBONES
+from trainer.losses.lpips import LPIPS
 from v2v_protocol.errors import UsageError
 
 GreyImage = npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> floa
 
 
 def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str = "cpu") -> Metric:
-    """LPIPS with weights from files, see :meth:`trainer.lpips.LPIPS.from_files`."""
+    """LPIPS with weights from files, see :meth:`trainer.losses.lpips.LPIPS.from_files`."""
     network = LPIPS.from_files(net, backbone, heads).to(device)
 
     def distance(prediction: GreyImage, target: GreyImage) -> float:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from v2v_server.flow import dis
 from v2v_server.flow.estimator import Picture, guarded
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 STILL = "zero"
 SLOW = "dis-ultrafast"

@@ -21,9 +21,9 @@ from v2v_server.flow.estimator import Estimator, Picture, one_thread
 from v2v_server.flow.methods import method
 from v2v_server.flow.settings import AUTO, FlowSettings
 from v2v_server.flow.validity import consistent
-from v2v_server.opencv import cv2
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window
+from v2v_server.system.opencv import cv2
 
 SKIPPED = "skipped"
 PAUSED = "paused"

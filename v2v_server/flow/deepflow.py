@@ -4,7 +4,7 @@ ICCV 2013) without deep matching, by OpenCV."""
 from __future__ import annotations
 
 from v2v_server.flow.estimator import Estimator, Field, Picture
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 SMALLEST_SIDE_PX = 16
 

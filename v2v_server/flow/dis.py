@@ -7,7 +7,7 @@ the picture's size. Scale 1 takes about four times as long and resolves motion t
 from __future__ import annotations
 
 from v2v_server.flow.estimator import Estimator, Field, Picture
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 ULTRAFAST, FAST, MEDIUM = range(3)
 """OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*: naming them here would load it."""

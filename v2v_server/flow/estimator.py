@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 Picture = npt.NDArray[np.uint8]
 """[h, w] uint8, C-contiguous."""

@@ -6,7 +6,7 @@ Farneback, "Two-Frame Motion Estimation Based on Polynomial Expansion", SCIA 200
 from __future__ import annotations
 
 from v2v_server.flow.estimator import Estimator, Field, Picture
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 SMALLEST_SIDE_PX = 16
 

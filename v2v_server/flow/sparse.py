@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2v_server.flow.estimator import Estimator, Field, Picture
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 SMALLEST_SIDE_PX = 64
 _GRID_STEP_PX = 8

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.flow.estimator import Field
-from v2v_server.opencv import cv2
+from v2v_server.system.opencv import cv2
 
 _SHARE = 0.01
 _FLOOR_PX2 = 0.5

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.opencv import cv2
 from v2v_server.simulation.draw import resized_size
+from v2v_server.system.opencv import cv2
 
 Frames = npt.NDArray[np.uint8]
 

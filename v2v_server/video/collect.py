@@ -12,7 +12,7 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.index import FrameIndex
+from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, Window
 

@@ -122,6 +122,6 @@ def stretch(frames: npt.NDArray[np.uint8], luma: LumaFormat) -> None:
     """
     if luma.bits == 8 and not luma.full_range:
         # Whoever only lists or opens videos does without the compiler.
-        from v2v_server.simulation.full_range import to_full_range
+        from v2v_server.video.full_range import to_full_range
 
         to_full_range(frames)

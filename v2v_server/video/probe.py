@@ -15,8 +15,8 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.hidden import is_hidden
-from v2v_server.video.index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.source import opened, packets, pictures, reason, time_base

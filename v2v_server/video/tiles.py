@@ -17,7 +17,7 @@ import numpy.typing as npt
 from av.container import InputContainer
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.index import MOST_TILES, Tile, make_up
+from v2v_server.video.frame_index import MOST_TILES, Tile, make_up
 from v2v_server.video.orientation import Window
 from v2v_server.video.source import picture_tracks
 

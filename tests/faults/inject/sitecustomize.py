@@ -15,7 +15,7 @@ from pathlib import Path
 
 def _is_worker() -> bool:
     arguments = Path("/proc/self/cmdline").read_bytes().split(b"\0")
-    return b"v2v_server.cli" in arguments and b"worker" in arguments
+    return b"v2v_server.commands.cli" in arguments and b"worker" in arguments
 
 
 def _act(fault: dict, video: str) -> None:
@@ -37,7 +37,9 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
-    from v2v_server import clips, produce, worker
+    from v2v_server.worker import conversation as worker
+    from v2v_server.worker import decode_cache as clips
+    from v2v_server.worker import produce
 
     at = {"video": ""}
     decode_for, decode_cuts, simulate_clip = clips.decode_for, produce.decode_cuts, produce.simulate_clip

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.trainer import numpy_networks
-from tests.trainer.test_lpips import heads_file, random_metric, torchvision_like
+from tests.trainer.losses.test_lpips import heads_file, random_metric, torchvision_like
+from tests.trainer.models import numpy_networks
 from trainer.evaluation.metrics import METRICS, make_metrics, mse, ssim
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError

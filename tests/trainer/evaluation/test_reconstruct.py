@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.trainer.evaluation.h5_file import random_recording
-from trainer.checkpoint import Checkpoint, capture_rng, save_checkpoint
 from trainer.evaluation.network import load_network
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, reconstruct
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import E2VID, FireNet, ReconstructionNetwork
+from trainer.run.checkpoint import Checkpoint, capture_rng, save_checkpoint
 from v2v_protocol.errors import UsageError
 
 

@@ -1,0 +1,54 @@
+"""Null workers: the server and its consumers cannot tell them from others by what they send."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.bench.small import FLAGS, RECIPE
+from tests.server.corpus import SMALL_SPEC, corpus, video
+from v2v_bench.speed.null_service import null_service
+from v2v_bench.speed.null_worker import answer
+from v2v_bench.usage import consume, peak_rss_bytes
+from v2v_client import V2VStreamDataset
+from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
+from v2v_protocol.wire import decode_map, decode_sample
+from v2v_server.broker.inspection import inspected
+from v2v_server.broker.jobs import describe
+from v2v_server.broker.leases import Task
+from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import SequenceTable
+
+
+@pytest.mark.parametrize("arrays", [DEFAULT_ARRAYS, ("frames",), ("voxels", "flow", "flow_valid")])
+def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ...]) -> None:
+    catalogue = corpus(video("a.mp4"), video("b.mp4"))
+    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
+    task = Task(b"consumer", 3, 1, snapshot=2)
+    lease = describe(
+        task, number=7, sequence=schedule.candidate(5, 3, 1, 0), quarantine=2, catalogue=catalogue, spec=SMALL_SPEC,
+        seed=5, arrays=arrays, deadline_seconds=60.0,
+    )  # fmt: skip
+    frames = answer(lease, "null-1")
+    layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
+    header = inspected(frames, task, Form.of(layout))
+    found = decode_sample(header, frames[1:])
+    assert {name: (array.dtype.name, array.shape) for name, array in found.items()} == layout
+    assert all(np.all(array == 1) for array in found.values())
+    provenance = Provenance.from_dict(decode_map(header.provenance))
+    assert provenance.id == SampleId(SMALL_SPEC.digest, catalogue.digest, provenance.id.numerics_version, 5, 3, 1)
+    assert (provenance.video, provenance.quarantine) == (lease.video, 2)
+
+
+@pytest.mark.slow
+def test_a_stream_of_null_workers_is_complete_and_in_order() -> None:
+    with null_service(RECIPE, workers=3, sequences=20, flags=FLAGS) as service:
+        dataset = V2VStreamDataset(service.server.address, batch_size=4, rank=0, world_size=1)
+        batches = list(dataset)
+        assert [index for batch in batches for index in batch.indices] == list(range(20))
+        assert {item.decoder for batch in batches for item in batch.provenance} == {"none"}
+        done = consume(dataset, service.roles, seconds=0.01, warmup_batches=6)
+        assert done.batches >= 1
+        assert done.nbytes == done.batches * batches[0].nbytes
+        assert done.cpu_seconds.keys() == {"workers", "broker", "client"}
+        assert peak_rss_bytes(service.server.pid) > 10_000_000

@@ -1,0 +1,329 @@
+"""Speed against accuracy: measures with known answers, the Pareto front, the chosen setting, one short run for real."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.bench.small import FLAGS, clips, is_picture, one_line, records
+from tests.clips import write_clip
+from v2v_bench.speed.kernel import textured_frames
+from v2v_bench.tradeoff import tradeoff
+from v2v_bench.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, at_threshold, spurious
+from v2v_bench.tradeoff.diversity import effective_samples, overlap
+from v2v_bench.tradeoff.errors import Tally, common_bins, compare, correlation
+from v2v_bench.tradeoff.forms import ENCODINGS, SOURCE
+from v2v_bench.tradeoff.front import best, dominates, dominators
+from v2v_bench.tradeoff.knobs import EXACT, Setting, settings, write_preset
+from v2v_bench.tradeoff.noise import cheap_kernel, run_kernel
+from v2v_bench.tradeoff.other import compressors
+from v2v_bench.tradeoff.speed import Speed, Work, measure
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import preset
+from v2v_protocol.sample import SampleParams
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.config import ServeConfig
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.pixel import simulate_pixels
+
+CAMERA = SampleParams(
+    threshold_pos=0.25, threshold_neg=0.25, noise_sigma=0.05, hot_pixel_count=0, hot_pixel_sigma=0.0, pauses=(),
+    scale=1.0, crop_top_px=0, crop_left_px=0, flip=False, contrast=0.0, noise_key=(1, 2, 3, 4),
+)  # fmt: skip
+
+
+def voxels(*values: float) -> np.ndarray[Any, Any]:
+    return np.array(values, np.float32).reshape(1, 1, 1, -1)
+
+
+def test_measures_of_a_known_pair() -> None:
+    tally = compare(voxels(3, -1, 0, 0), voxels(2, -1, 0, -2))
+    assert tally.voxel_error == pytest.approx((1 + 2) / 5)
+    assert tally.count_error == pytest.approx((4 - 5) / 5)
+    assert tally.changed_share == 0.5
+    assert tally.rising_share == 0.75
+    assert tally.reference_rising_share == 0.4
+
+
+def test_equal_voxels_have_no_error() -> None:
+    tally = compare(voxels(1, -2, 0), voxels(1, -2, 0))
+    assert (tally.voxel_error, tally.count_error, tally.changed_share) == (0, 0, 0)
+
+
+def test_int8_counts_are_not_subtracted_in_int8() -> None:
+    assert compare(np.full((1, 1, 1, 1), 127, np.int8), np.full((1, 1, 1, 1), -127, np.int8)).difference == 254
+
+
+def test_without_reference_events_no_relative_error_is_named() -> None:
+    tally = compare(voxels(1, 0), voxels(0, 0))
+    assert (tally.voxel_error, tally.count_error, tally.reference_rising_share) == (None, None, None)
+    assert tally.changed_share == 0.5
+    assert (Tally().changed_share, Tally().rising_share) == (None, None)
+
+
+def test_tallies_add_up_like_one_array() -> None:
+    one, other = voxels(3, -1, 0, 5), voxels(2, 0, 0, 5)
+    assert compare(one[..., :2], other[..., :2]) + compare(one[..., 2:], other[..., 2:]) == compare(one, other)
+
+
+def test_other_shapes_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"\[1, 1, 1, 2\] against a reference of \[1, 1, 1, 3\]"):
+        compare(voxels(1, 2), voxels(1, 2, 3))
+
+
+def test_common_bins_run_across_voxel_grids() -> None:
+    counts = np.arange(2 * 3 * 2 * 2).reshape(2, 3, 2, 2)
+    assert common_bins(counts, 2)[:, 0, 0].tolist() == [0 + 4, 8 + 12, 16 + 20]
+    assert common_bins(counts, side_px=2)[:, 0, 0].tolist() == [6 + 16 * step for step in range(6)]
+    assert common_bins(counts, 6, 2).tolist() == [[[counts.sum()]]]
+
+
+@pytest.mark.parametrize(("bins", "side"), [(4, 1), (1, 3)])
+def test_bins_that_do_not_divide_are_refused(bins: int, side: int) -> None:
+    with pytest.raises(UsageError, match="do not divide"):
+        common_bins(np.zeros((2, 3, 2, 2)), bins, side)
+
+
+def test_correlation_of_known_arrays() -> None:
+    assert correlation([1, 2, 3], [10, 20, 30]) == pytest.approx(1)
+    assert correlation([1, 2, 3], [5, 3, 1]) == pytest.approx(-1)
+    assert correlation([1, -1, 1, -1], [1, 1, -1, -1]) == 0
+    assert correlation([1, 2, 3], [7, 7, 7]) == 0
+
+
+def test_overlap_of_crops() -> None:
+    other = dataclasses.replace(CAMERA, crop_top_px=16, crop_left_px=32)
+    assert overlap(CAMERA, CAMERA, 64, 64) == 1
+    assert overlap(CAMERA, other, 64, 64) == pytest.approx(48 * 32 / 64**2)
+    assert overlap(CAMERA, dataclasses.replace(CAMERA, crop_left_px=64), 64, 64) == 0
+
+
+def test_siblings_are_worth_between_one_and_all_of_them() -> None:
+    assert effective_samples(4, 0.0) == effective_samples(4, -0.1) == 4
+    assert effective_samples(4, 1.0) == 1
+    assert effective_samples(2, 0.5) == pytest.approx(4 / 3)
+
+
+COSTS = st.dictionaries(st.text(min_size=1, max_size=3), st.tuples(*[st.integers(0, 4).map(float)] * 3), min_size=1)
+
+
+@given(COSTS)
+def test_the_front_holds_what_nothing_dominates_and_the_rest_names_its_better(
+    costs: dict[str, tuple[float, ...]],
+) -> None:
+    found = dominators(costs)
+    assert set(found) == set(costs)
+    front = [name for name, better in found.items() if better is None]
+    assert front
+    for name, better in found.items():
+        beaten = any(
+            all(a <= b for a, b in zip(other, costs[name], strict=True))
+            and any(a < b for a, b in zip(other, costs[name], strict=True))
+            for other in costs.values()
+        )
+        assert beaten == (better is not None)
+        if better is not None:
+            assert better in front
+            assert dominates(costs[better], costs[name])
+            assert not dominates(costs[name], costs[better])
+
+
+def record(name: str, rate: float, error: float, count: int) -> dict[str, Any]:
+    return {"name": name, "samples_per_core_second": rate, "e": error, "samples_per_decode": count}
+
+
+CHOICES = [
+    record("exact", 4, 0.0, 1), record("exact 2", 8, 0.0, 2), record("exact 4", 12, 0.0, 4),
+    record("prepared", 15, 0.3, 1), record("prepared worse", 20, 0.4, 1), record("prepared 4", 40, 0.3, 4),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rate", "error", "name"),
+    [
+        (1, None, "exact"), (4, None, "exact"), (5, None, "exact 2"), (13, None, "prepared"), (16, None, "prepared 4"),
+        (None, 0.0, "exact 4"), (None, 0.3, "prepared 4"), (None, 1.0, "prepared 4"),
+    ],
+)  # fmt: skip
+def test_the_best_setting(rate: float | None, error: float | None, name: str) -> None:
+    assert best(CHOICES, error_key="e", target_rate=rate, max_error=error)["name"] == name
+
+
+def test_wishes_that_nothing_fulfils_name_the_nearest() -> None:
+    with pytest.raises(UsageError, match="the fastest setting makes 40 samples"):
+        best(CHOICES, error_key="e", target_rate=41, max_error=None)
+    with pytest.raises(UsageError, match=r"the least wrong setting has 0\.3"):
+        best(CHOICES[3:], error_key="e", target_rate=None, max_error=0.1)
+
+
+def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = [
+        {"measure": "setting", "name": setting.name, **dataclasses.asdict(setting),
+         "samples_per_core_second": 5.0 * setting.samples_per_decode, "voxel_error_at_0.2": 0.25}
+        for setting in settings([])
+    ]  # fmt: skip
+    out = tmp_path / "chosen.yaml"
+    flags = ["--videos", "clips", "--most-samples-per-decode", "2", "--preset-out", str(out)]
+    assert tradeoff.choose(found, tradeoff.parser().parse_args([*flags, "--target-rate", "11"])) == 1
+    assert "bar missed: --target-rate 11: the fastest setting makes 10" in capsys.readouterr().err
+    assert not out.exists()
+    assert tradeoff.choose(found, tradeoff.parser().parse_args([*flags, "--max-error", "0.25"])) == 0
+    assert "best: source, K = 2" in capsys.readouterr().out
+    assert ServeConfig.load(str(out), {"videos": "clips"}).spec.samples_per_decode == 2
+
+
+def test_settings_have_names_of_their_own_and_begin_with_the_exact_one() -> None:
+    every = settings(list(ENCODINGS))
+    assert every[0] == EXACT
+    assert len({setting.name for setting in every}) == len(every) == 3 * (3 + len(ENCODINGS))
+
+
+@pytest.mark.parametrize("setting", settings(list(ENCODINGS)), ids=lambda setting: setting.name)
+def test_every_setting_is_a_configuration_of_the_server(setting: Setting, tmp_path: Path) -> None:
+    file = tmp_path / "preset.yaml"
+    write_preset(file, dataclasses.asdict(setting), "top:0.54", "a test")
+    config = ServeConfig.load(str(file), {"videos": "clips"})
+    assert config.rows == "top:0.54"
+    assert config.spec.loop_filter == setting.loop_filter
+    assert config.spec.samples_per_decode == setting.samples_per_decode
+    how = ENCODINGS.get(setting.form)
+    command = "" if how is None else f"--codec {how.codec} --quality {how.quality} --gop {how.gop}"
+    assert command in file.read_text(encoding="utf-8")
+
+
+def test_works_take_turns_and_the_fastest_round_of_each_place_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "process_time", lambda: clock[0])
+    costs = {"a": iter([9.0, 1.0, 4.0, 3.0, 2.0]), "b": iter([9.0, 10.0, 10.0, 20.0, 20.0])}
+    done: list[str] = []
+
+    def work(name: str) -> Work:
+        def do(place: int) -> None:
+            done.append(f"{name}{place}")
+            clock[0] += next(costs[name])
+
+        return Work(do, places=2, samples=2)
+
+    found = measure({name: work(name) for name in costs}, until=0.0)
+    assert done == ["a0", "b0", *["a0", "b0", "a1", "b1"], *["b0", "a0", "b1", "a1"]]
+    assert found["a"] == Speed(fastest=(1.0 + 2.0) / 2 / 2, median=1.25, rounds=2)
+    assert found["b"] == Speed(fastest=5.0, median=7.5, rounds=2)
+
+
+def test_works_of_different_places_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"\[1, 2\] places"):
+        measure({"a": Work(print, 1), "b": Work(print, 2)}, until=0.0)
+
+
+def test_the_kernel_that_is_compared_is_the_product() -> None:
+    recipe, frames = preset("noise-free"), textured_frames()
+    expected = simulate_clip(frames, CAMERA, recipe, "float32").voxels
+    np.testing.assert_array_equal(run_kernel(simulate_pixels, frames, CAMERA, recipe), expected)
+
+
+def test_cheap_noise_changes_nothing_else_and_has_the_right_moments() -> None:
+    recipe = preset("noise-free").replace(log_eps=1e-3)
+    frames, kernel = textured_frames(), cheap_kernel()
+    silent = dataclasses.replace(CAMERA, noise_sigma=0.0)
+    np.testing.assert_array_equal(
+        run_kernel(kernel, frames, silent, recipe), run_kernel(simulate_pixels, frames, silent, recipe)
+    )
+    # A sigma of many thresholds: a step's count is the noise itself, to within a threshold.
+    loud = dataclasses.replace(at_threshold(CAMERA, 2.0**-8), noise_sigma=1.0)
+    still = np.full((recipe.steps + 1, 64, 64), 100, np.uint8)
+    drawn = run_kernel(kernel, still, loud, recipe).reshape(recipe.steps, -1) * 2.0**-8
+    count = drawn.size
+    assert abs(drawn.mean()) < 5 / count**0.5
+    # Var of the variance of n draws is (kurtosis + 2) / n; that of the kurtosis about 24 / n. Rounding adds c^2 / 6.
+    assert abs(drawn.var() - 1.0 - 2.0**-16 / 6) < 5 * (1.85 / count) ** 0.5
+    kurtosis = (drawn**4).mean() / drawn.var() ** 2 - 3
+    assert abs(kurtosis - -1.2 * (256**2 + 1) / (256**2 - 1) / 8) < 5 * (24 / count) ** 0.5
+    assert np.abs(drawn).max() < 4.9
+    for lag in (1, 2, 3):
+        assert abs((drawn[lag:] * drawn[:-lag]).mean()) < 5 / (count - lag * drawn.shape[1]) ** 0.5
+    assert abs((drawn[:, 1:] * drawn[:, :-1]).mean()) < 5 / count**0.5
+
+
+def test_events_on_scenes_are_counted_per_pixel_and_frame(tmp_path: Path) -> None:
+    # MJPEG codes every frame alike, and a flat one exactly but for its range.
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    frames = np.full((11, 32, 48), 60, np.uint8)
+    for name in ("still", "lamp"):
+        write_clip(folder / f"{name}.mp4", frames, codec="mjpeg", pixel_format="yuvj420p", full_range=True)
+        frames[1::2] = 240
+    with contextlib.closing(open_catalogue(folder, cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        found = spurious(catalogue, (16, 16), "exact")
+    step = np.log(1e-3 + (240 / 255) ** 2.2) - np.log(1e-3 + (60 / 255) ** 2.2)
+    for threshold in (0.05, 0.2, 0.5, 1.0):
+        # Half of the scenes; a step of the lamp fires its size in thresholds, give or take the residual.
+        assert found[threshold] == pytest.approx(0.5 * step / threshold, abs=0.5)
+    with contextlib.closing(open_catalogue(folder / "still.mp4", cache_dir=tmp_path / "cache", processes=0)) as still:
+        assert set(spurious(still, (16, 16), "exact").values()) == {0.0}
+
+
+@pytest.mark.parametrize("name", compressors())
+def test_compressors_make_bins_of_zeros_small(name: str) -> None:
+    assert len(compressors()[name](bytes(100_000))) < 2_000
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--budget-minutes", "0"], ["--budget-minutes", "nan"], ["--places", "0"], ["--clips", "0"],
+        ["--target-rate", "-1"], ["--max-error", "nan"], ["--forms", "h265 1"], ["--preset-out", "x.yaml"],
+        ["--set", "gama=1"], ["--rows", "upper"],
+    ],
+)  # fmt: skip
+def test_wrong_usage_is_status_2(tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert tradeoff.main(["--videos", str(tmp_path), *flags]) == 2
+    assert one_line(capsys, "tradeoff")
+
+
+def test_a_corpus_without_videos_is_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tradeoff.main(["--videos", str(tmp_path)]) == 2
+    assert one_line(capsys, "tradeoff")
+
+
+@pytest.mark.slow
+def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, picture, chosen = tmp_path / "tradeoff.json", tmp_path / "tradeoff.png", tmp_path / "chosen.yaml"
+    flags = ["--videos", str(clips(tmp_path / "clips")), "--rows", "full", "--clips", "2", "--places", "3"]
+    flags += ["--forms", "mpeg4 4", "--budget-minutes", "0.01", "--max-error", "0", "--preset-out", str(chosen)]
+    assert tradeoff.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) == 0
+    found = records(out)
+    by_name = {item["name"]: item for item in found if item["measure"] == "setting"}
+    assert set(by_name) == {setting.name for setting in settings(["mpeg4 4"])}
+    exact, prepared = by_name[EXACT.name], by_name[Setting("mpeg4 4").name]
+    assert exact["speed_ratio"] == 1
+    for threshold in ("0.05", "0.2", "0.5", "1", "2"):
+        assert exact[f"bins_changed_at_{threshold}"] == 0
+    assert exact["voxel_error_at_0.2"] == 0 < prepared["voxel_error_at_0.2"]
+    assert prepared["bytes_ratio"] > 0
+    scale = {item["name"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
+    assert set(scale) == {NOISE_ROW, DRAW_ROW}
+    assert min(scale.values()) > 0
+    alike = {item["name"]: item for item in found if item["measure"] == "diversity"}
+    assert set(alike) == {"siblings", "batch"}
+    assert 1 <= alike["siblings"]["effective_samples_of_2"] <= alike["siblings"]["effective_samples_of_4"] <= 4
+    assert 0 < alike["siblings"]["crop_overlap"] <= 1
+    others = {item["name"]: item for item in found if item["measure"] == "other"}
+    assert others["float32 arithmetic"]["bins_changed_at_1"] < 1e-3
+    assert others["noise: sum of 8 bytes"]["voxel_error_at_0.2"] is None
+    assert is_picture(picture)
+    fastest = max((item for item in by_name.values() if item["form"] == SOURCE and not item["voxel_error_at_0.2"]),
+                  key=lambda item: item["samples_per_core_second"])  # fmt: skip
+    captured = capsys.readouterr()
+    assert f"best: {fastest['name']}" in captured.out
+    assert yaml.safe_load(chosen.read_text(encoding="utf-8"))["samples_per_decode"] == fastest["samples_per_decode"]

@@ -1,0 +1,260 @@
+"""An arena from both ends: a sample that a worker makes there is a row of the consumer's batch, or the worker says that
+it could not."""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_client.memory.arena import Arena, open_arena
+from v2v_client.memory.slots import Answer, Slots
+from v2v_protocol.arena import MOST_SLOTS, NO_SLOT, ArenaName, Slot, array_offsets
+from v2v_protocol.errors import ProtocolError
+from v2v_server.worker.handover import slot_arrays
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
+
+LAYOUT = {"voxels": ("int8", (3, 5, 7, 11)), "flow": ("float16", (3, 2, 7, 11)), "frames": ("uint8", (3, 1, 7, 11))}
+ROWS = 5
+
+
+def sample(seed: int) -> dict[str, np.ndarray]:
+    draw = np.random.default_rng(seed)
+    return {name: draw.integers(0, 100, shape).astype(dtype) for name, (dtype, shape) in LAYOUT.items()}
+
+
+def write(slot: Slot, seed: int) -> bool:
+    """What a worker does."""
+    there = slot_arrays(slot, LAYOUT)
+    for name, array in sample(seed).items():
+        if there is not None:
+            there[name][...] = array
+    return there is not None
+
+
+def holds(arrays: dict[str, np.ndarray], row: int, seed: int) -> bool:
+    return all(np.array_equal(arrays[name][row], array) for name, array in sample(seed).items())
+
+
+def nobody() -> None:
+    pass
+
+
+@pytest.fixture
+def arena() -> Arena:
+    return Arena(LAYOUT, ROWS)
+
+
+def allocated(arena: Arena) -> int:
+    return os.stat(ArenaName.parse(arena.slot(0).arena).path).st_blocks * 512
+
+
+def test_what_workers_write_are_the_rows_of_the_batch(arena: Arena) -> None:
+    for row in (3, 1, 2, 0):
+        assert write(arena.slot(row), row)
+    arena.put(4, sample(4))  # came in a message
+    arrays = arena.arrays(nobody)
+    assert {name: (str(array.dtype), array.shape) for name, array in arrays.items()} == {
+        name: (dtype, (ROWS, *shape)) for name, (dtype, shape) in LAYOUT.items()
+    }
+    assert all(holds(arrays, row, row) for row in range(ROWS))
+    assert all(array.flags.c_contiguous and array.flags.writeable for array in arrays.values())
+
+
+def test_what_the_holder_of_a_batch_writes_is_his_alone(arena: Arena) -> None:
+    assert write(arena.slot(2), 2)
+    for array in arena.arrays(nobody).values():
+        array[...] = 111
+    again = arena.arrays(nobody)
+    assert holds(again, 2, 2)
+
+
+def test_a_batch_is_mapped_once_while_nobody_writes_to_it(arena: Arena) -> None:
+    assert write(arena.slot(2), 1)
+    arrays = arena.arrays(nobody)
+    first = arrays["voxels"].ctypes.data
+    assert holds(arrays, 2, 1)
+    del arrays
+    assert write(arena.slot(2), 2)
+    arrays = arena.arrays(nobody)
+    assert arrays["voxels"].ctypes.data == first
+    assert holds(arrays, 2, 2)
+
+
+@pytest.mark.parametrize("name", list(LAYOUT))
+@pytest.mark.parametrize("row", [0, ROWS - 1])
+def test_nothing_is_left_of_what_an_earlier_holder_wrote(arena: Arena, name: str, row: int) -> None:
+    for other in range(ROWS):
+        assert write(arena.slot(other), other)
+    arrays = arena.arrays(nobody)
+    arrays[name][row].reshape(-1)[-1] += 1
+    assert not holds(arrays, row, row)
+    del arrays
+    assert write(arena.slot(1), 7)
+    arrays = arena.arrays(nobody)
+    assert [holds(arrays, other, 7 if other == 1 else other) for other in range(ROWS)] == [True] * ROWS
+
+
+@pytest.mark.parametrize("said", ["nothing", "zeros", "too little"])
+def test_a_kernel_that_does_not_say_who_wrote_is_no_reason_to_show_it(
+    arena: Arena, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pread(descriptor: int, count: int, offset: int) -> bytes:
+        if said == "nothing":
+            raise PermissionError
+        return bytes(count) if said == "zeros" else really(descriptor, count - 8, offset)
+
+    really = os.pread
+    monkeypatch.setattr(os, "pread", pread)
+    assert write(arena.slot(ROWS - 1), 5)
+    arena.arrays(nobody)["frames"].reshape(-1)[-1] += 1  # in the last page, of which it says too little
+    assert holds(arena.arrays(nobody), ROWS - 1, 5)
+
+
+def test_a_row_can_be_copied_out(arena: Arena) -> None:
+    assert write(arena.slot(1), 8)
+    copied = arena.get(1)
+    assert write(arena.slot(1), 9)
+    assert all(np.array_equal(copied[name], array) for name, array in sample(8).items())
+
+
+def test_it_is_known_when_nothing_looks_at_a_batch_any_more(arena: Arena) -> None:
+    seen = []
+    arrays = arena.arrays(lambda: seen.append("unused"))
+    view = arrays["flow"][1:, ::2]
+    del arrays
+    gc.collect()
+    assert seen == []
+    del view
+    gc.collect()
+    assert seen == ["unused"]
+
+
+def test_another_process_of_this_user_can_write(arena: Arena) -> None:
+    code = (
+        "import sys; from tests.client.memory.test_arena import Slot, write; "
+        "sys.exit(not write(Slot(sys.argv[1], int(sys.argv[2])), 4))"
+    )
+    slot = arena.slot(3)
+    command = [sys.executable, "-c", code, slot.arena, str(slot.number)]
+    assert subprocess.run(command, timeout=60, check=False).returncode == 0
+    assert holds(arena.arrays(nobody), 3, 4)
+
+
+def test_what_is_not_the_named_arena_is_not_touched(arena: Arena, tmp_path: Path) -> None:
+    name = ArenaName.parse(arena.slot(0).arena)
+    other = os.memfd_create("v2v-other")
+    file = os.open(tmp_path / "file", os.O_RDWR | os.O_CREAT)
+    try:
+        for descriptor in (other, file, 9999):
+            assert not write(Slot(str(ArenaName(name.pid, descriptor, ROWS, name.token)), 1), 1)
+        assert not write(Slot(str(ArenaName(name.pid, name.descriptor, ROWS, "0" * 32)), 1), 1)
+        assert not write(Slot("../../etc/passwd", 1), 1)
+        assert not write(Slot(str(name), ROWS + 1), 1)
+        assert not write(Slot(str(name), NO_SLOT), 1)
+        assert (os.fstat(other).st_size, os.fstat(file).st_size, allocated(arena)) == (0, 0, 0)
+    finally:
+        os.close(other)
+        os.close(file)
+
+
+@pytest.mark.parametrize("flaw", ["not sealed", "too small", "of more slots"])
+def test_memory_that_could_end_its_writer_is_left_alone(flaw: str) -> None:
+    """A page that is not there, or is taken away while one writes to it, is a signal that kills."""
+    import fcntl
+
+    good = ArenaName.parse(Arena(LAYOUT, ROWS).slot(0).arena)
+    *_, size = array_offsets([np.dtype(dtype).itemsize * int(np.prod(shape)) for dtype, shape in LAYOUT.values()], ROWS)
+    descriptor = os.memfd_create(good.memory_name, os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(descriptor, size - 4096 if flaw == "too small" else size)
+        if flaw != "not sealed":
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        name = ArenaName(os.getpid(), descriptor, ROWS + 100 * (flaw == "of more slots"), good.token)
+        assert not write(Slot(str(name), 1), 1)
+        assert os.fstat(descriptor).st_blocks == 0
+    finally:
+        os.close(descriptor)
+
+
+def test_its_size_cannot_be_changed(arena: Arena) -> None:
+    name = ArenaName.parse(arena.slot(0).arena)
+    for size in (0, os.fstat(name.descriptor).st_size + 1):
+        with pytest.raises(PermissionError):
+            os.ftruncate(name.descriptor, size)
+
+
+def test_the_arena_of_a_consumer_that_is_gone_cannot_be_reached_and_leaves_no_descriptor() -> None:
+    slot = Arena(LAYOUT, ROWS).slot(0)
+    gc.collect()
+    before = set(os.listdir("/proc/self/fd"))
+    assert not write(slot, 1)
+    assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_worker_keeps_nothing_of_an_arena(arena: Arena) -> None:
+    before = set(os.listdir("/proc/self/fd"))
+    assert write(arena.slot(0), 1)
+    gc.collect()
+    assert set(os.listdir("/proc/self/fd")) == before
+    assert ArenaName.parse(arena.slot(0).arena).token not in Path("/proc/self/maps").read_text()
+
+
+def test_without_memfd_there_is_no_arena(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    assert open_arena(LAYOUT, ROWS) is None
+
+
+@given(
+    pid=st.integers(0, 2**32),
+    descriptor=st.integers(0, 2**31),
+    slots=st.integers(1, MOST_SLOTS),
+    token=st.binary(min_size=16, max_size=16),
+)
+def test_a_name_survives_its_text(pid: int, descriptor: int, slots: int, token: bytes) -> None:
+    name = ArenaName(pid, descriptor, slots, token.hex())
+    assert ArenaName.parse(str(name)) == name
+
+
+@given(st.text(max_size=60) | st.from_regex(r"[0-9]{1,3}:[0-9]{1,3}:[0-9]{0,7}:[0-9a-f]{32}", fullmatch=True))
+def test_other_text_names_no_arena(text: str) -> None:
+    try:
+        name = ArenaName.parse(text)
+    except ProtocolError:
+        return
+    assert name.path.startswith("/proc/")
+    assert name.path.count("/") == 4
+    assert 0 < name.slots <= MOST_SLOTS
+
+
+@given(st.lists(st.integers(1, 10**9), min_size=1, max_size=5), st.integers(1, MOST_SLOTS))
+def test_arrays_begin_at_whole_pages_and_do_not_overlap(sizes: list[int], slots: int) -> None:
+    offsets = array_offsets(sizes, slots)
+    assert offsets[0] == 0
+    assert len(offsets) == len(sizes) + 1
+    for size, begin, end in zip(sizes, offsets, offsets[1:], strict=False):
+        assert begin % mmap.PAGESIZE == 0
+        assert size * slots <= end - begin < size * slots + mmap.PAGESIZE
+
+
+def test_what_an_arrival_says_of_its_slot() -> None:
+    slots = Slots()
+    for index in (10, 11, 12, 13):
+        slots.name(index, Slot("a", index - 9))
+    assert slots.answered(10, 1, in_message=False) is Answer.THERE
+    assert slots.of(10) is None
+    assert slots.answered(11, 2, in_message=True) is Answer.MESSAGE
+    assert slots.answered(12, NO_SLOT, in_message=True) is Answer.ABANDONED
+    assert slots.answered(13, 3, in_message=False) is Answer.NOWHERE
+    assert slots.of(13) == Slot("a", 4)
+    assert slots.answered(99, NO_SLOT, in_message=True) is Answer.MESSAGE
+    assert slots.answered(99, 7, in_message=False) is Answer.NOWHERE

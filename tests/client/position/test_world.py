@@ -1,0 +1,94 @@
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from v2v_client.position.world import EpochPlan, resumed
+from v2v_protocol.errors import UsageError
+
+SEQUENCES = st.integers(0, 300)
+RANKS = st.integers(1, 5)
+BATCH = st.integers(1, 7)
+
+
+def consumed(plans: list[EpochPlan]) -> list[int]:
+    return [index for plan in plans for batch in range(plan.batches) for index in plan.indices(batch)]
+
+
+def ranks(sequences: int, world: int, batch: int, origin: int = 0, position: int = 0) -> list[EpochPlan]:
+    return [EpochPlan(sequences, world, rank, batch, origin, position) for rank in range(world)]
+
+
+def test_index_of_a_local_position_is_that_of_the_definition():
+    plan = EpochPlan(sequences=100, world_size=3, rank=2, batch_size=4)
+    assert plan.indices(1) == tuple(position * 3 + 2 for position in (4, 5, 6, 7))
+
+
+@given(SEQUENCES, RANKS, BATCH, st.integers(1, 4))
+def test_ranks_and_loader_workers_take_the_prefix_once(sequences, world, batch, workers):
+    plans = ranks(sequences, world, batch)
+    assert len({plan.batches for plan in plans}) == 1
+    everything = sorted(consumed(plans))
+    assert everything == list(range(sequences - sequences % (world * batch)))
+    for plan in plans:
+        shares = [list(plan.batches_of_worker(worker, workers)) for worker in range(workers)]
+        assert sorted(number for share in shares for number in share) == list(range(plan.batches))
+
+
+@given(SEQUENCES, RANKS, BATCH, BATCH, st.integers(0, 40))
+def test_another_batch_size_goes_on_where_the_first_stopped(sequences, world, batch, other, taken):
+    plans = ranks(sequences, world, batch)
+    taken = min(taken, plans[0].batches)
+    position = taken * batch
+    before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
+    after = consumed(ranks(sequences, world, other, position=position))
+    both = sorted(before + after)
+    assert both == list(range(len(both)))
+    assert sequences - len(both) < world * other
+
+
+@given(SEQUENCES, RANKS, RANKS, BATCH, BATCH, st.integers(0, 40))
+def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world, other_world, batch, other, taken):
+    plans = ranks(sequences, world, batch)
+    taken = min(taken, plans[0].batches)
+    before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
+    origin, position = resumed(origin=0, position=taken * batch, saved_world_size=world, world_size=other_world)
+    after = consumed(ranks(sequences, other_world, other, origin, position))
+    both = sorted(before + after)
+    assert both == list(range(len(both)))
+    assert sequences - len(both) < other_world * other
+
+
+@given(SEQUENCES, RANKS, BATCH, st.integers(0, 40))
+def test_position_after_a_batch_resumes_at_the_next_one(sequences, world, batch, number):
+    plan = EpochPlan(sequences, world, world - 1, batch)
+    assume(number + 1 < plan.batches)
+    rest = EpochPlan(sequences, world, world - 1, batch, position=plan.position_after(number))
+    assert rest.indices(0) == plan.indices(number + 1)
+    assert rest.batches == plan.batches - number - 1
+
+
+def test_an_epoch_smaller_than_a_global_batch_says_so_with_the_numbers():
+    with pytest.raises(UsageError, match=r"23 sequences .* 3 x 8 = 24"):
+        EpochPlan(23, 3, 0, 8).require_batches()
+    EpochPlan(24, 3, 0, 8).require_batches()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"rank": 2, "world_size": 2},
+        {"world_size": 0},
+        {"batch_size": 0},
+        {"position": 11},
+        {"origin": -1},
+        {"origin": 8, "position": 3},
+    ],
+)
+def test_impossible_plans_are_refused(bad):
+    with pytest.raises(UsageError):
+        EpochPlan(**({"sequences": 10} | bad))
+
+
+def test_a_loader_worker_that_is_none_is_refused():
+    with pytest.raises(UsageError, match="worker 2 of 2"):
+        EpochPlan(10).batches_of_worker(2, 2)

@@ -1,0 +1,205 @@
+"""A connection by itself, where the order of messages matters and no clock may help."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from types import FrameType
+
+import pytest
+import zmq
+import zmq.sugar.context
+import zmq.sugar.socket
+
+from tests.client.fake_server import SPEC, FakeServer
+from tests.waiting import until
+from v2v_client.session import link
+from v2v_client.session.connection import Connection
+from v2v_client.session.liveness import Patience
+from v2v_protocol.messages import Hello
+from v2v_protocol.sample import DEFAULT_ARRAYS
+
+NEVER_BY_THE_CLOCK = Patience(timeout_seconds=20.0, ping_seconds=1000.0, rewant_seconds=1000.0)
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with FakeServer(sequences=23, credit=4) as running:
+        yield running
+
+
+def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(server: FakeServer) -> None:
+    """Asked again while it was on its way, sample 0 is made twice, and for the server it is still due."""
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+        connection.open()
+        server.held = True
+        connection.want(range(4))
+        until(lambda: len(server.wants) == 4)
+        server.call(lambda: server.answer(0, 0))
+        connection._resume()  # the network was cut and is back: all four are asked for again
+        until(lambda: len(server.wants) == 8)
+        assert _next(connection) == 0
+        connection.want([4])
+        until(lambda: server.refused_for_credit)
+        server.call(lambda: (server.answer(0, 0), setattr(server, "held", False)))
+        assert _next(connection) == 0
+        seen = set()
+        while seen != {1, 2, 3, 4}:  # or the server is given up
+            seen.add(_next(connection))
+    assert server.refused_for_credit == 1
+
+
+def test_a_session_is_opened_again_under_the_newest_snapshot_of_any_sample_that_came(server: FakeServer) -> None:
+    """Be it one whose provenance nobody has opened yet."""
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+        connection.open()
+        for index, snapshot in enumerate((7, 3)):
+            server.call(lambda snapshot=snapshot: setattr(server, "snapshot", snapshot))
+            connection.want([index])
+            assert _next(connection) == index
+        greeted = len(server.hellos)
+        server.forget()
+        connection.want([2])
+        assert _next(connection) == 2
+        assert [again.quarantine for again in server.hellos[greeted:]] == [7]
+
+
+def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For hours perhaps, with its server: what it could not hear meanwhile is no silence of the server's."""
+    stopped = [0.0]
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
+        connection.open()
+        listen = link.Link.receive
+
+        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+            if len(stopped) < 3:
+                stopped.append(3600.0)
+                return None
+            return listen(self, seconds)
+
+        monkeypatch.setattr(link.Link, "receive", receive)
+        connection.want([0])
+        assert _next(connection) == 0
+
+
+def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that took most of the deadline to start, and is killed then, is missed after one deadline, not two."""
+    waited: list[float] = []
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+
+    def clock() -> float:
+        return time.monotonic() + sum(waited)
+
+    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
+        listen = link.Link.receive
+
+        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+            if len(waited) < 20:
+                waited.append(0.9)
+                return None
+            return listen(self, seconds)
+
+        monkeypatch.setattr(link.Link, "receive", receive)
+        connection.open()
+        assert connection.receive(wait=False) is None
+        assert connection._liveness.silence(clock()) >= 0.0
+
+
+@pytest.mark.parametrize(
+    ("address", "kinds"),
+    [("tcp://localhost:1", [0, 1, 0]), ("tcp://127.0.0.1:1", [0, 1, 0]), ("tcp://[::1]:1", [1] * 3)],
+)
+def test_a_name_is_tried_as_an_ipv4_address_and_then_in_turn(address: str, kinds: list[int]) -> None:
+    """Most hosts have "localhost" in both kinds, and a server listens on 127.0.0.1."""
+    found = []
+    with closing(link.Link(address)) as tried:
+        for _ in kinds:
+            tried.connect(1 << 20, keep_name=bool(found))
+            assert tried._socket is not None
+            found.append(tried._socket.getsockopt(zmq.IPV6))
+    assert found == kinds
+
+
+def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeServer) -> None:
+    with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
+        connection.open()
+        made_anew = connection._open_link()
+        made_anew.connect(1 << 20, keep_name=True)
+        assert made_anew._socket is not None
+        assert made_anew._socket.getsockopt(zmq.IPV6) == 0
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("which", [1, 2])
+def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch, which: int
+) -> None:
+    """ZeroMQ's context waits for ever for a socket that nobody closed."""
+    connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
+    connection.open()
+    closing_socket, calls = zmq.Socket.close, iter(range(1, 100))
+
+    def interrupted(self: zmq.Socket[bytes], linger: int | None = None) -> None:
+        if next(calls) == which:
+            raise KeyboardInterrupt
+        closing_socket(self, linger)
+
+    monkeypatch.setattr(zmq.Socket, "close", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        connection.close()
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.filterwarnings("ignore:Unclosed (socket|context):ResourceWarning")  # the collector closes some of them
+def test_a_signal_anywhere_in_opening_and_closing_ends_in_its_exception_and_not_in_a_hang(server: FakeServer) -> None:
+    """ZeroMQ's context waits for ever for a socket that nobody closed, be it one that is being made, or whose closing
+    has begun. The exception's traceback keeps it alive, as that of an interrupted program does."""
+    sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
+
+    def interrupted_at(line: int) -> bool:
+        """Whether as many lines were run as it takes to be interrupted at that one."""
+        passed = 0
+
+        def trace(frame: FrameType, event: str, argument: object) -> object:
+            nonlocal passed
+            if frame.f_code.co_filename not in sugar or frame.f_code.co_name == "__del__":
+                return None
+            passed += event == "line"
+            if passed == line:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+            return trace
+
+        connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            connection.open()
+            connection.close()
+        except KeyboardInterrupt:
+            sys.settrace(None)
+            connection.close()
+            return True
+        finally:
+            sys.settrace(before)
+        return False
+
+    lines = itertools.count(1)
+    while interrupted_at(line := next(lines)):
+        pass
+    assert line > 100
+
+
+def _next(connection: Connection) -> int:
+    arrival = connection.receive()
+    assert arrival is not None
+    return arrival.header.index

@@ -1,0 +1,124 @@
+import json
+import os
+
+import pytest
+
+from tests.client.fake_server import FakeServer
+from v2v_client.tools import loadtest
+from v2v_protocol.errors import UsageError
+
+KEYS = {
+    "workers", "batches_per_second", "samples_per_second", "p50_ms", "p99_ms", "cpu_seconds_per_batch",
+    "bytes_per_second", "client_stall_fraction", "peak_rss_bytes", "lost", "duplicated", "accelerator_utilisation",
+    "samples_per_decode", "batches", "seconds", "warmup_batches", "batch_size", "epochs", "address",
+}  # fmt: skip
+
+
+@pytest.fixture
+def server():
+    with FakeServer(sequences=9, credit=8) as running:
+        yield running
+
+
+def run(server, tmp_path, *flags):
+    file = tmp_path / "out.json"
+    arguments = ["--connect", server.address, "--batch-size", "4", "--seconds", "0.2", "--json", str(file), *flags]
+    return loadtest.main(arguments), file
+
+
+def test_a_run_over_several_epochs_is_measured_and_faultless(server, tmp_path, capsys):
+    status, file = run(server, tmp_path, "--warmup-batches", "3", "--trainer-ms", "1", "--arrays", "voxels")
+    assert status == 0
+    (record,) = json.loads(file.read_text())
+    assert record.keys() >= KEYS
+    assert (record["lost"], record["duplicated"], record["warmup_batches"], record["batch_size"]) == (0, 0, 3, 4)
+    assert record["epochs"] == (record["batches"] + 3 - 1) // 2
+    assert record["bytes_per_second"] == pytest.approx(record["samples_per_second"] * 2 * 2 * 4 * 6)
+    assert 0 < record["client_stall_fraction"] < 1
+    assert record["accelerator_utilisation"] == pytest.approx(record["batches"] * 1e-3 / record["seconds"])
+    assert record["cpu_seconds_per_batch"] >= 4 * 0.25  # what the fake states for each sample
+    text = capsys.readouterr().out
+    assert "3 warm-up batches not timed" in text
+    assert "batch/s" in text
+
+
+def test_a_consumer_that_skips_batches_is_found_out(server, tmp_path, monkeypatch):
+    class Skipping(loadtest.V2VStreamDataset):
+        def __iter__(self):
+            return (batch for number, batch in enumerate(super().__iter__()) if number != 0)
+
+    monkeypatch.setattr(loadtest, "V2VStreamDataset", Skipping)
+    status, file = run(server, tmp_path)
+    assert status == 1
+    assert json.loads(file.read_text())[0]["lost"] > 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["--set", "gama=1"], "gama"),
+        (["--set", "gamma"], "KEY=VALUE"),
+        (["--arrays", "pixels"], "pixels"),
+        (["--seconds", "0"], "--seconds"),
+        (["--workers", "2"], "--workers"),
+        (["--json", "/nowhere/out.json"], "/nowhere/out.json"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_status_2(server, tmp_path, capsys, flags, word):
+    status, _ = run(server, tmp_path, *flags)
+    assert status == 2
+    error = capsys.readouterr().err
+    assert word in error
+    assert error.count("\n") == 1
+
+
+def test_a_server_of_its_own_has_the_recipe_that_is_asked_for(server, monkeypatch):
+    started = []
+
+    class Local:
+        pid = os.getpid()
+
+        def __init__(self, videos, *, workers, flags):
+            self.address = server.address
+            started.append((videos, workers, flags))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def cpu_seconds(self):
+            return {}
+
+        rss_bytes = cpu_seconds
+
+    monkeypatch.setattr(loadtest, "LocalServer", Local)
+    flags = ["--videos", "clips", "--workers", "3", "--batch-size", "4", "--seconds", "0.1", "--rows", "top:0.5"]
+    # With its own, the paper's 201 frames, it would refuse clips that are long enough for this.
+    assert loadtest.main([*flags, "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"]) == 0
+    assert started == [("clips", 3, ["--rows", "top:0.5", "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"])]
+
+
+def test_no_server_is_status_2(capsys):
+    arguments = ["--connect", "tcp://127.0.0.1:9", "--timeout-seconds", "0.2"]
+    assert loadtest.main(arguments) == 2
+    assert "nothing heard" in capsys.readouterr().err
+
+
+def test_changes_to_the_recipe_are_yaml():
+    assert loadtest.recipe_of(None, []) is None
+    assert loadtest.recipe_of("paper", []) == "paper"
+    assert loadtest.recipe_of("paper", ["threshold=[0.1, 0.5]", "bins=3"]) == {
+        "preset": "paper",
+        "threshold": [0.1, 0.5],
+        "bins": 3,
+    }
+    for change in ("bins={", "gamma=2001-99-99"):
+        with pytest.raises(UsageError, match="not YAML"):
+            loadtest.recipe_of(None, [change])
+
+
+@pytest.mark.parametrize(("share", "value"), [(0.5, 50), (0.99, 99), (0.0, 1), (1.0, 100), (0.001, 1)])
+def test_percentiles_are_nearest_rank(share, value):
+    assert loadtest.percentile(list(range(100, 0, -1)), share) == value

@@ -1,0 +1,930 @@
+"""The dispatcher with fake peers: who gets what, what happens when somebody dies, and that nobody can stop it."""
+
+from __future__ import annotations
+
+import gc
+import math
+import weakref
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import hypothesis.strategies as st
+import msgpack
+import pytest
+from hypothesis import given, settings
+
+from tests.protocol.wire_messages import messages
+from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
+from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
+from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
+from v2v_protocol.messages import (
+    Begun,
+    ErrorCode,
+    Goodbye,
+    Hello,
+    JobFailed,
+    Lease,
+    Message,
+    Ping,
+    Pong,
+    Refused,
+    Result,
+    SampleHeader,
+    Stop,
+    Want,
+    Welcome,
+    WorkerHello,
+)
+from v2v_protocol.recipe import preset
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_map, encode
+from v2v_server.broker import dispatcher as dispatcher_module
+from v2v_server.broker.actions import GiveUp, Record, ToConsumer
+from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
+from v2v_server.broker.blame import Cause
+from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
+from v2v_server.schedule.epoch import MOST_CANDIDATES
+from v2v_server.video.frame_index import FrameIndex
+
+
+def refused(replies: list[Message], code: ErrorCode) -> str:
+    """The text of the one reply, which must be a refusal of that kind."""
+    (reply,) = replies
+    assert isinstance(reply, Refused)
+    assert reply.code == code
+    return reply.text
+
+
+# --- the main path ----------------------------------------------------------------------------------------------------
+
+
+def test_hello_is_answered_with_the_resolved_spec() -> None:
+    at = peers()
+    welcome = at.hello(shuffle=False)
+    spec = replace(SMALL_SPEC, shuffle=False)
+    assert welcome == Welcome(spec.to_dict(), spec.digest, "c" * 32, NUMERICS_VERSION, 50, 8, 0)
+    assert StreamSpec.from_dict(welcome.spec).digest == welcome.spec_digest
+
+
+def test_a_sample_goes_from_want_to_answer() -> None:
+    at = peers()
+    at.join()
+    at.hello(seed=2**64 - 1)
+    assert at.want(7, epoch=3) == []
+    lease = at.begin()
+    assert (lease.epoch, lease.indices, lease.seed) == (3, (7,), 2**64 - 1)
+    assert (lease.reply_to, lease.arrays, lease.candidate) == (b"c", ("voxels",), 0)
+    assert (lease.spec, lease.spec_digest) == (SMALL_SPEC.canonical(), SMALL_SPEC.digest)
+    assert (lease.refusals, lease.thresholds) == ({"refusals": []}, ())
+    assert lease.fingerprint == f"fingerprint of {lease.video}"
+    frames = FrameIndex.from_bytes(lease.frame_index)
+    assert frames.position(lease.start_frame, SMALL.frames_needed) >= 0
+    at.finish()
+    assert at.samples() == [(3, 7)]
+    counters = at.dispatcher.counters
+    assert (counters.samples, counters.batches, counters.worker_cpu_seconds) == (1, 0.25, 0.1)
+    assert counters.bytes == sum(len(frame) for frame in at.frames[b"c"][-1][1:])
+    assert counters.faults == 0
+
+
+def test_payload_is_passed_on_untouched() -> None:
+    """The very objects: the header is read, nothing is copied."""
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    lease = at.begin()
+    payload: list[Any] = sample_frames(0, 0)
+    instructions = at.dispatcher.from_worker(b"w", [*encode(Result(lease.lease)), *payload], 0.0)
+    (forwarded,) = instructions
+    assert isinstance(forwarded, ToConsumer)
+    assert forwarded.identity == b"c"
+    assert [id(frame) for frame in forwarded.frames] == [id(frame) for frame in payload]
+
+
+def test_the_same_request_is_the_same_lease_on_any_server() -> None:
+    def leases() -> list[Lease]:
+        at = peers()
+        at.join(credit=8)
+        at.hello(seed=5)
+        at.want(*range(8), epoch=2)
+        return [replace(lease, lease=0) for lease in at.leases[b"w"]]
+
+    assert leases() == leases()
+
+
+def test_thresholds_travel_exactly_and_unknown_rates_as_zero() -> None:
+    listed = replace(video("v.mp4", rate=math.nan), threshold_pos=0.1, threshold_neg=1 / 3)
+    at = peers(corpus(listed))
+    at.join()
+    at.hello()
+    at.want(0)
+    lease = at.begin()
+    assert [float.fromhex(text) for text in lease.thresholds] == [0.1, 1 / 3]
+    assert lease.frames_per_second == 0.0
+
+
+def test_workers_hold_as_much_as_they_offer_and_share_evenly() -> None:
+    at = peers()
+    for name, credit in ((b"w1", 2), (b"w2", 2), (b"w3", 0), (b"w4", 2**64 - 1)):
+        at.join(name, credit)
+    at.hello(batch_size=40)
+    at.want(*range(50))
+    assert {name: len(held) for name, held in at.leases.items()} == {b"w1": 2, b"w2": 2, b"w3": 1, b"w4": 45}
+    at = peers()
+    for name in (b"w1", b"w2"):
+        at.join(name)
+    at.hello()
+    at.want(0, 1)
+    assert [len(held) for held in at.leases.values()] == [1, 1]
+
+
+def test_an_index_is_not_made_twice_while_it_is_in_work() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(1, 1)
+    at.want(1)
+    assert [lease.indices for lease in at.leases[b"w"]] == [(1,)]
+    at.work_off()
+    at.want(1)
+    at.work_off()
+    assert at.samples() == [(0, 1), (0, 1)]
+
+
+def test_pings_are_answered() -> None:
+    at = peers()
+    assert at.consumer_says(b"c", Ping()) == [Pong()]
+    at.join()
+    at.worker_says(b"w", Ping())
+    assert at.told[b"w"] == [Pong()]
+    at.carry_out(at.dispatcher.stop_workers())
+    assert at.told[b"w"] == [Pong(), Stop()]
+
+
+# --- refusals to consumers --------------------------------------------------------------------------------------------
+
+
+def test_want_without_a_session() -> None:
+    assert "Hello" in refused(peers().want(0), ErrorCode.UNKNOWN_SESSION)
+
+
+@pytest.mark.parametrize(
+    ("spec", "arrays", "batch_size", "text"),
+    [
+        ({"colour": 1}, ("voxels",), 4, "unknown spec key 'colour'"),
+        ({"recipe": "papers"}, ("voxels",), 4, "unknown recipe preset"),
+        ({"recipe": {"self": 1}}, ("voxels",), 4, "unknown recipe key 'self'"),
+        ({"recipe": {"bins": 1.5}}, ("voxels",), 4, "recipe bins = 1.5"),
+        ({}, (), 4, "arrays"),
+        ({}, ("depth",), 4, "unknown array 'depth'"),
+        ({}, ("voxels",), 0, "batch_size = 0"),
+        ({}, ("voxels",), MOST_BATCH_SIZE + 1, f"batch_size = {MOST_BATCH_SIZE + 1}"),
+        ({"recipe": "paper"}, ("voxels",), 4, "none of the 5 videos gives a sequence; v0.mp4: 100 frames"),
+        # A sample that no message could carry must not be tried: it would only exhaust the worker's memory.
+        (
+            {"recipe": {"crop_height_px": 16_384, "crop_width_px": 16_384, "resize_scale": [1, 100], "bins": 9}},
+            ("voxels",),
+            4,
+            "the limit is 2147483648",
+        ),
+    ],
+)
+def test_a_refused_hello_names_its_reason(
+    spec: dict[str, Any], arrays: tuple[str, ...], batch_size: int, text: str
+) -> None:
+    at = peers(corpus(*(video(f"v{number}.mp4", height_px=200, width_px=200) for number in range(5))))
+    assert text in refused(at.consumer_says(b"c", Hello(spec, arrays, batch_size, 0)), ErrorCode.SPEC)
+    assert len(at.dispatcher.sessions) == 0
+
+
+def test_a_refused_hello_leaves_the_session_alone() -> None:
+    at = peers()
+    at.hello()
+    at.want(0, 1)
+    refused(at.consumer_says(b"c", Hello({"colour": 1}, ("voxels",), 4, 0)), ErrorCode.SPEC)
+    at.join()
+    at.work_off()
+    assert at.samples() == [(0, 0), (0, 1)]
+
+
+def test_over_credit_and_out_of_range_take_nothing() -> None:
+    at = peers()
+    assert at.hello(batch_size=2).credit == 4
+    assert "the credit is 4" in refused(at.want(0, 1, 2, 3, 4), ErrorCode.CREDIT)
+    assert "index 50 of an epoch of 50" in refused(at.want(0, 50), ErrorCode.RANGE)
+    assert "epoch = 4294967296" in refused(at.want(0, epoch=2**32), ErrorCode.RANGE)
+    refused(at.want(0, 2**64 - 1), ErrorCode.RANGE)
+    refused(at.want(0, epoch=2**64 - 1), ErrorCode.RANGE)
+    at.join()
+    assert not at.leases[b"w"]
+    at.want(49, epoch=2**32 - 1)
+    at.work_off()
+    assert at.samples() == [(2**32 - 1, 49)]
+
+
+def test_credit_follows_batch_size_workers_and_bytes() -> None:
+    at = peers()
+    assert at.hello(batch_size=12).credit == 24
+    for number in range(20):
+        at.join(b"w%d" % number)
+    assert at.hello(batch_size=12).credit == 40
+    sample_bytes = 2 * 2 * 8 * 8
+    assert peers(max_credit_bytes=10 * sample_bytes - 1).hello(batch_size=12).credit == 9
+    assert peers(max_credit_bytes=sample_bytes).hello(batch_size=12).credit == 1
+
+
+def test_credit_counts_workers_that_are_still_starting() -> None:
+    """A server is ready with its first worker, and the credit of whoever connects then holds for an epoch."""
+    at = peers(expected_workers=20)
+    assert at.hello(batch_size=12).credit == 40
+    for number in range(3):
+        at.join(b"w%d" % number)
+    assert at.hello(batch_size=12).credit == 40
+    for number in range(25):
+        at.join(b"elsewhere %d" % number)
+    assert at.hello(batch_size=12).credit == 56
+    assert peers(expected_workers=4096).hello(batch_size=12).credit == 400
+
+
+def test_a_sample_that_the_credit_cannot_hold_is_refused_with_both_numbers() -> None:
+    at = peers(max_credit_bytes=255)
+    text = refused(at.consumer_says(b"c", Hello({}, ("voxels",), 1, 0)), ErrorCode.SPEC)
+    assert "one sample is 256 bytes; the server's --max-credit-bytes is 255" in text
+    assert len(at.dispatcher.sessions) == 0
+
+
+def test_a_full_server_is_busy_to_newcomers_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatcher_module, "MOST_SESSIONS", 3)
+    at = peers()
+    for identity in (b"c1", b"c2", b"c3"):
+        at.hello(identity)
+    hello = Hello({}, ("voxels",), 4, 0)
+    assert "3 consumers" in refused(at.consumer_says(b"c4", hello), ErrorCode.BUSY)
+    refused(at.want(0, identity=b"c4"), ErrorCode.UNKNOWN_SESSION)
+    # Those that are in may connect again, and whoever leaves makes room.
+    at.hello(b"c2", seed=1)
+    at.consumer_says(b"c3", Goodbye())
+    at.hello(b"c4")
+    assert len(at.dispatcher.sessions) == 3
+
+
+def test_consumers_do_not_hear_each_other() -> None:
+    at = peers()
+    at.join()
+    at.hello(b"c", seed=1)
+    at.hello(b"d", seed=2)
+    at.want(0, identity=b"c")
+    at.want(0, identity=b"d")
+    at.work_off()
+    assert at.samples(b"c") == at.samples(b"d") == [(0, 0)]
+
+
+# --- workers that die, hang or fail -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+def test_work_of_a_dead_worker_is_done_by_another_once(cause: Cause) -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0, 1, 2)
+    at.begin(b"w1")
+    at.join(b"w2")
+    held = at.die(b"w1", cause)
+    assert [lease.indices for lease in held] == [(0,), (1,)]
+    at.worker_says(b"w1", Result(held[0].lease), *sample_frames(0, 0))
+    at.work_off(b"w2")
+    assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2)]
+    # What the dead one still had in the post is told that nobody knows it.
+    assert [type(message) for message in at.told[b"w1"]] == [Refused]
+    assert at.dispatcher.counters.workers_lost == 1
+    assert at.dispatcher.counters.returned_leases == 2
+
+
+def test_a_late_result_of_an_old_lease_is_dropped_when_the_worker_came_back() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    (old,) = at.die()
+    at.join()
+    (new,) = at.leases[b"w"]
+    assert (new.indices, new.lease == old.lease) == ((0,), False)
+    at.worker_says(b"w", Result(old.lease), *sample_frames(0, 0))
+    assert at.samples() == []
+    assert at.dispatcher.counters.late_results == 1
+    at.work_off()
+    assert at.samples() == [(0, 0)]
+
+
+def test_a_worker_cannot_answer_anothers_lease() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0)
+    at.join(b"w2")
+    (lease,) = at.leases[b"w1"]
+    at.worker_says(b"w2", Result(lease.lease), *sample_frames(0, 0))
+    at.worker_says(b"w2", JobFailed(lease.lease, None, "mine"))
+    assert at.samples() == []
+    at.work_off(b"w1")
+    assert at.samples() == [(0, 0)]
+
+
+def test_returned_work_keeps_its_order() -> None:
+    at = peers()
+    at.join(b"w1", credit=3)
+    at.hello()
+    at.want(0, 1, 2, 3)
+    at.die(b"w1")
+    at.join(b"w2", credit=4)
+    assert [lease.indices[0] for lease in at.leases[b"w2"]] == [0, 1, 2, 3]
+
+
+def test_goodbye_gives_the_work_to_others_without_blame() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0)
+    at.begin(b"w1")
+    at.join(b"w2")
+    at.worker_says(b"w1", Goodbye())
+    assert at.leases[b"w2"][0].candidate == 0
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0)]
+    assert (at.dispatcher.workers, at.dispatcher.counters.workers_lost) == (1, 0)
+
+
+def test_a_second_hello_of_a_worker_returns_what_it_held() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0, 1)
+    at.begin()
+    at.join()
+    assert [lease.indices[0] for lease in at.leases[b"w"]] == [0, 1]
+    at.work_off()
+    assert at.samples() == [(0, 0), (0, 1)]
+
+
+def test_a_video_that_only_the_workers_host_lacks_is_made_elsewhere() -> None:
+    """Or the bytes behind a name would depend on who was asked. Storage may come back, so the worker only rests."""
+    at = peers()
+    at.join(b"w1", credit=1)
+    at.join(b"w2", credit=1)
+    at.hello()
+    at.want(3)
+    first = at.fail(b"w1", reason="cannot be read: No such file or directory", frame=None, here=True)
+    (second,) = at.leases[b"w2"]
+    assert (second.video, second.candidate, second.refusals) == (first.video, 0, {"refusals": []})
+    at.want(4)
+    assert not at.leases[b"w1"]
+    at.work_off(b"w2")
+    at.tick(REST_SECONDS - 0.1)
+    at.want(5, 6)
+    assert not at.leases[b"w1"]
+    at.tick(0.2)
+    assert len(at.leases[b"w1"]) == 1
+    for name in (b"w1", b"w2"):
+        at.work_off(name)
+    assert sorted(at.samples()) == [(0, 3), (0, 4), (0, 5), (0, 6)]
+    counters = at.dispatcher.counters
+    assert (counters.missing_videos, counters.refused_candidates, counters.faults) == (1, 0, 1)
+
+
+def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    at.gone.add(at.leases[b"w"][0].video)
+    at.fail(reason="changed since it was catalogued", frame=None, here=True)
+    (second,) = at.leases[b"w"]
+    assert (second.candidate, second.refusals["refusals"][0]["reason"]) == (1, "changed since it was catalogued")
+    assert at.dispatcher.counters.missing_videos == 0
+
+
+def test_a_single_worker_whose_storage_fails_goes_on_when_it_is_back() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    for _ in range(3):
+        at.fail(here=True)
+        assert not at.leases[b"w"]
+        at.tick(REST_SECONDS)
+    at.work_off()
+    assert at.samples() == [(0, 3)]
+    assert at.dispatcher.counters.refused_candidates == 0
+
+
+def test_who_waits_for_a_video_that_is_looked_for_may_leave() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    at.consumer_says(b"c", Goodbye())
+    at.fail(here=True)
+    assert (at.dispatcher.counters.missing_videos, at.dispatcher.waiting) == (0, 0)
+
+
+def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(3)
+    first = at.fail(reason="no frame", frame=17)
+    (second,) = at.leases[b"w"]
+    assert (second.candidate, second.indices) == (1, (3,))
+    assert second.refusals == {"refusals": [{"candidate": 0, "video": first.video, "frame": 17, "reason": "no frame"}]}
+    at.fail(reason="nor here", frame=None)
+    (third,) = at.leases[b"w"]
+    assert [refusal["reason"] for refusal in third.refusals["refusals"]] == ["no frame", "nor here"]
+    at.work_off()
+    assert at.samples() == [(0, 3)]
+    assert at.dispatcher.counters.refused_candidates == 2
+
+
+def test_when_every_candidate_fails_the_consumer_hears_the_whole_story_once() -> None:
+    at = peers()
+    at.join()
+    at.hello(batch_size=1)
+    at.want(3)
+    videos = [at.fail(reason=f"reason {number}").video for number in range(MOST_CANDIDATES)]
+    (message,) = at.unavailable()
+    assert (message.epoch, message.index) == (0, 3)
+    for number, name in enumerate(videos):
+        assert f"{name} at frame 7: reason {number}" in message.text
+    assert not at.leases[b"w"]
+    assert at.samples() == []
+    assert at.dispatcher.counters.unavailable == 1
+    # The credit is free again.
+    assert at.want(0, 1) == []
+
+
+def test_a_spec_that_substitutes_nothing_hears_of_the_first_failure() -> None:
+    at = peers()
+    at.join()
+    at.hello(on_bad_video="raise")
+    at.want(3)
+    at.fail(reason="no frame")
+    (message,) = at.unavailable()
+    assert "no frame" in message.text
+    assert not at.leases[b"w"]
+
+
+def test_a_video_whose_index_cannot_be_read_is_passed_over() -> None:
+    at = peers(corpus(video("good.mp4"), video("bad.mp4"), unreadable=("bad.mp4",)))
+    at.join(credit=8)
+    at.hello()
+    at.want(*range(8))
+    leases = list(at.leases[b"w"])
+    assert {lease.video for lease in leases} == {"good.mp4"}
+    assert sorted(lease.indices[0] for lease in leases) == list(range(8))
+    assert any(lease.candidate for lease in leases)
+    at.work_off()
+    assert sorted(at.samples()) == [(0, index) for index in range(8)]
+
+
+def test_a_corpus_that_cannot_be_read_at_all_answers_everything() -> None:
+    at = peers(corpus(video("bad.mp4"), unreadable=("bad.mp4",)))
+    at.join()
+    at.hello()
+    at.want(*range(8))
+    assert sorted(message.index for message in at.unavailable()) == list(range(8))
+    assert not at.leases[b"w"]
+
+
+def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0, 1)
+    at.begin(b"w1")
+    at.tick(DEADLINE)
+    assert at.given_up == []
+    at.join(b"w2")
+    at.tick(0.5)
+    assert at.given_up == [b"w1"]
+    assert at.dispatcher.workers == 1
+    first, second = at.leases[b"w2"]
+    assert (first.indices, second.indices) == ((0,), (1,))
+    at.tick(1.0)
+    assert at.given_up == [b"w1"]
+    # Its answer comes after all: too late.
+    at.finish(b"w1")
+    assert at.samples() == []
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0), (0, 1)]
+
+
+def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.join(b"w2")
+    at.hello()
+    at.want(0)
+    at.begin(b"w1")
+    at.tick(SILENCE_SECONDS)
+    assert at.given_up == []
+    at.tick(0.5)
+    assert at.given_up == [b"w2"]
+    at.tick(0.5)
+    assert (at.given_up, at.dispatcher.workers) == ([b"w2"], 1)
+    assert (at.recorded, at.dispatcher.counters.workers_lost) == ([], 1)
+    # Whoever holds a lease may be silent for as long as that lasts; a word counts, whatever it is.
+    at.finish(b"w1")
+    at.worker_says(b"w1", Ping())
+    at.tick(SILENCE_SECONDS)
+    assert at.given_up == [b"w2"]
+
+
+def test_a_hopeless_worker_is_reported_once_however_long_it_takes_to_end_it() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    assert [type(each) for each in at.dispatcher.tick(DEADLINE + 1)] == [GiveUp]
+    assert at.dispatcher.tick(DEADLINE + 2) == []
+    # Meanwhile it gets nothing more to do.
+    at.want(1)
+    assert len(at.leases[b"w"]) == 1
+
+
+def test_a_worker_that_cannot_be_reached_is_counted_once_and_its_work_given_to_others() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello()
+    at.want(0)
+    at.begin(b"w1")
+    at.join(b"w2")
+    for _ in range(3):
+        at.carry_out(at.dispatcher.worker_unreachable(b"w1", 0.0))
+        at.carry_out(at.dispatcher.worker_unreachable(b"never there", 0.0))
+    assert (at.dispatcher.counters.workers_lost, at.dispatcher.workers) == (1, 1)
+    assert at.leases[b"w2"][0].candidate == 0
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0)]
+
+
+def test_a_known_worker_that_comes_back_with_other_numerics_gives_its_work_back() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    at.leases[b"w"].clear()
+    at.worker_says(b"w", WorkerHello("w", "host", 1, NUMERICS_VERSION + 1, 2))
+    assert (at.dispatcher.workers, at.dispatcher.waiting) == (0, 1)
+    at.join(b"w2")
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0)]
+
+
+def test_a_worker_of_other_numerics_is_refused_with_both_numbers() -> None:
+    at = peers()
+    at.hello()
+    at.want(0)
+    at.worker_says(b"w", WorkerHello("w", "host", 1, NUMERICS_VERSION + 1, 2))
+    (reply,) = at.told[b"w"]
+    assert isinstance(reply, Refused)
+    assert reply.code == ErrorCode.VERSION
+    assert f"{NUMERICS_VERSION + 1}" in reply.text
+    assert f"{NUMERICS_VERSION}" in reply.text
+    assert at.dispatcher.workers == 0
+    assert b"w" not in at.leases
+
+
+# --- consumers that come and go ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["goodbye", "unreachable", "silent"])
+def test_a_consumer_that_is_gone_gets_nothing_more(how: str) -> None:
+    at = peers()
+    at.join()
+    at.hello(b"c")
+    at.want(0, 1, 2)
+    at.begin()
+    if how == "goodbye":
+        at.consumer_says(b"c", Goodbye())
+    elif how == "unreachable":
+        at.dispatcher.consumer_lost(b"c")
+    else:
+        at.leases[b"w"] = deque(at.leases[b"w"])
+        at.dispatcher.tick(IDLE + 1)
+    heard = len(at.heard[b"c"])
+    at.work_off()
+    assert at.samples() == []
+    assert len(at.heard[b"c"]) == heard
+    assert len(at.dispatcher.sessions) == 0
+    refused(at.want(3), ErrorCode.UNKNOWN_SESSION)
+
+
+def test_a_consumer_that_pings_is_not_forgotten() -> None:
+    at = peers()
+    at.hello()
+    for _ in range(4):
+        at.tick(IDLE - 1)
+        at.consumer_says(b"c", Ping())
+    assert len(at.dispatcher.sessions) == 1
+    at.tick(IDLE + 1)
+    assert len(at.dispatcher.sessions) == 0
+
+
+def test_consumers_that_come_and_go_do_not_pile_work_onto_workers() -> None:
+    """A worker still has to get through the leases of a consumer that left: it has no room for more meanwhile, and
+    those that wait behind them are not overdue for it."""
+    at = peers()
+    at.join()
+    for _ in range(20):
+        at.hello()
+        at.want(0, 1, 2)
+        assert len(at.leases[b"w"]) == CREDIT
+    at.begin()
+    at.now += DEADLINE - 1
+    at.finish()
+    at.begin()
+    at.tick(DEADLINE - 1)
+    assert at.given_up == []
+    at.work_off()
+    assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2)]
+
+
+def test_a_worker_that_hangs_over_a_consumer_that_left_is_given_up() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    at.begin()
+    at.consumer_says(b"c", Goodbye())
+    at.tick(DEADLINE + 1)
+    assert at.given_up == [b"w"]
+
+
+def test_a_reconnected_consumer_is_answered_once() -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0, 1)
+    at.begin()
+    at.hello()
+    at.want(0, 1)
+    at.work_off()
+    assert sorted(at.samples()) == [(0, 0), (0, 1)]
+    assert at.dispatcher.counters.late_results == 2
+
+
+def test_a_sample_of_the_session_before_is_no_answer_to_the_next() -> None:
+    """The same consumer, epoch and index, but another seed: the old sample would be the wrong one."""
+    at = peers()
+    at.join()
+    at.hello(seed=1)
+    at.want(0, 1)
+    at.begin()
+    at.hello(seed=2)
+    at.want(0, 1)
+    at.finish()
+    assert at.samples() == []
+    at.work_off()
+    samples = [message for message in at.heard[b"c"] if isinstance(message, SampleHeader)]
+    assert [(sample.index, decode_map(sample.provenance)) for sample in samples] == [(0, {"seed": 2}), (1, {"seed": 2})]
+
+
+def test_geometries_asked_for_once_do_not_stay_for_ever() -> None:
+    at = peers()
+    alive = []
+    for number in range(3 * MOST_TABLES):
+        at.hello(max_sequences_per_video=number + 1)
+        session = at.dispatcher.sessions.get(b"c")
+        assert session is not None
+        alive.append(weakref.ref(session.schedule._table))
+    del session
+    gc.collect()
+    assert sum(each() is not None for each in alive) == MOST_TABLES
+    # The session's own is not lost, whatever others ask for.
+    at.hello(b"other", max_sequences_per_video=100)
+    for number in range(2 * MOST_TABLES):
+        at.hello(max_sequences_per_video=200 + number)
+    at.join()
+    at.want(0, identity=b"other")
+    at.work_off()
+    assert at.samples(b"other") == [(0, 0)]
+
+
+# --- nobody can stop it -----------------------------------------------------------------------------------------------
+
+
+def still_serves(at: Peers) -> None:
+    """A consumer and a worker that behave are served as if nobody else were there."""
+    at.join(b"good worker")
+    at.hello(b"good consumer", seed=3)
+    at.want(0, 1, identity=b"good consumer")
+    for worker in sorted(at.leases):
+        at.work_off(worker)
+    assert sorted(at.samples(b"good consumer")) == [(0, 0), (0, 1)]
+
+
+GARBAGE: list[list[bytes]] = [
+    [],
+    [b""],
+    [b"garbage"],
+    [b"", b""],
+    [bytes(LARGEST_HEADER_BYTES + 1)],
+    [b"\x82\xa1v" + b"\x91" * 1000 + b"\x90" + b"\xa1t\xa4ping"],
+    [msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "ping"})],
+    [msgpack.packb({"v": PROTOCOL_VERSION, "t": "x" * 1000})],
+    [msgpack.packb({"v": "\0" * 500_000, "t": "ping"})],
+    [msgpack.packb({"v": PROTOCOL_VERSION, "t": "ping", "\0" * 500_000: 1})],
+]
+
+
+@pytest.mark.parametrize("frames", GARBAGE, ids=range(len(GARBAGE)))
+def test_garbage_is_counted_and_answered(frames: list[bytes]) -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.carry_out(at.dispatcher.from_consumer(b"c", frames, 0.0))
+    at.carry_out(at.dispatcher.from_worker(b"w", frames, 0.0))
+    at.carry_out(at.dispatcher.from_consumer(b"stranger", frames, 0.0))
+    at.carry_out(at.dispatcher.from_worker(b"stranger", frames, 0.0))
+    assert at.dispatcher.counters.malformed == 4
+    for answer in (at.refusals(b"c")[0], at.refusals(b"stranger")[0], at.told[b"w"][0], at.told[b"stranger"][0]):
+        assert isinstance(answer, Refused)
+        assert answer.code in (ErrorCode.MALFORMED, ErrorCode.VERSION)
+    still_serves(at)
+
+
+def test_another_protocol_version_is_refused_as_such_on_both_sides() -> None:
+    at = peers()
+    frames = [msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "ping"})]
+    at.carry_out(at.dispatcher.from_consumer(b"c", frames, 0.0))
+    at.carry_out(at.dispatcher.from_worker(b"w", frames, 0.0))
+    for answer in (at.refusals()[0], at.told[b"w"][0]):
+        assert isinstance(answer, Refused)
+        assert answer.code == ErrorCode.VERSION
+        assert str(PROTOCOL_VERSION) in answer.text
+
+
+@pytest.mark.parametrize("text", ["x" * 1_000_000, "\0" * 400_000, "\U0001f600" * 200_000])
+def test_what_is_quoted_in_a_refusal_never_makes_it_too_large(text: str) -> None:
+    """Quoting multiplies: a refused megabyte must not become an answer that no message can carry."""
+    at = peers()
+    for spec, arrays in (
+        ({text: 1}, ("voxels",)),
+        ({"recipe": {text: 1}}, ("voxels",)),
+        ({"recipe": text}, ("voxels",)),
+        ({"recipe": {"gamma": text}}, ("voxels",)),
+        ({"voxel_dtype": text}, ("voxels",)),
+        ({}, (text,)),
+    ):
+        hello = Hello(spec, arrays, 4, 0)
+        if len(encode(hello)[0]) <= LARGEST_HEADER_BYTES:
+            refused(at.consumer_says(b"c", hello), ErrorCode.SPEC)
+    still_serves(at)
+
+
+def test_reasons_of_any_length_still_travel() -> None:
+    at = peers()
+    at.join()
+    at.hello(batch_size=1)
+    at.want(0)
+    for _ in range(MOST_CANDIDATES):
+        at.fail(reason="\U0001f600" * 200_000)
+    (message,) = at.unavailable()
+    assert len(message.text) < 100_000
+    still_serves(at)
+
+
+@pytest.mark.parametrize("cpu_seconds", [-1e308, -1.0, 0.0, 1e-300, 1e300, 1.7e308])
+def test_absurd_costs_neither_stop_nor_unbalance(cpu_seconds: float) -> None:
+    at = peers()
+    at.join()
+    at.hello(b"c")
+    at.hello(b"d")
+    for identity in (b"c", b"d"):
+        at.want(*range(8), identity=identity)
+    at.finish(cpu_seconds=cpu_seconds)
+    at.finish(cpu_seconds=cpu_seconds)
+    at.work_off()
+    assert len(at.samples(b"c")) == len(at.samples(b"d")) == 8
+    assert 0.0 <= at.dispatcher.counters.worker_cpu_seconds < 1e6
+
+
+def _shortened(frames: list[Any]) -> list[Any]:
+    return [frames[0], frames[1][:-1]]
+
+
+NONSENSE: dict[str, Callable[[], list[Any]]] = {
+    "nothing": list,
+    "another quarantine snapshot": lambda: frames_of({"voxels": ("int8", (2, 2, 8, 8))}, 0, 0, 0, quarantine=1),
+    "garbage": lambda: [b"\xc1garbage", *sample_frames(0, 0)[1:]],
+    "another message": lambda: [*encode(Ping()), *sample_frames(0, 0)[1:]],
+    "header of another sample": lambda: sample_frames(0, 1),
+    "header of another epoch": lambda: sample_frames(1, 0),
+    "an array too short": lambda: _shortened(sample_frames(0, 0)),
+    "an array too many": lambda: [*sample_frames(0, 0), b"x"],
+    "no array": lambda: sample_frames(0, 0)[:1],
+    "another dtype": lambda: frames_of({"voxels": ("uint8", (2, 2, 8, 8))}, 0, 0, 0),
+    "another shape": lambda: frames_of({"voxels": ("int8", (2, 2, 4, 16))}, 0, 0, 0),
+    "another name": lambda: frames_of({"frames": ("int8", (2, 2, 8, 8))}, 0, 0, 0),
+}
+
+
+def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatcher_module, "MOST_WORKERS", 2)
+    at = peers()
+    for name in (b"a", b"b", b"c"):
+        at.join(name)
+    (refused,) = at.told[b"c"]
+    assert isinstance(refused, Refused)
+    assert (refused.code, refused.text) == (ErrorCode.BUSY, "this server has 2 workers, its limit")
+    at.join(b"a")  # one that is known says hello again
+    assert at.dispatcher.workers == 2
+
+
+@pytest.mark.parametrize("wrong", NONSENSE)
+def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_its_order(wrong: str) -> None:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0, 1, 2)
+    lease = at.begin()
+    at.worker_says(b"w", Result(lease.lease), *NONSENSE[wrong]())
+    assert at.samples() == []
+    counters = at.dispatcher.counters
+    assert (counters.malformed, counters.workers_lost, at.dispatcher.workers) == (1, 1, 0)
+    (reply,) = at.told[b"w"]
+    assert isinstance(reply, Refused)
+    assert reply.code == ErrorCode.MALFORMED
+    # Whatever else it says, nobody knows it any more.
+    at.worker_says(b"w", Result(lease.lease + 1), *sample_frames(0, 1))
+    assert at.samples() == []
+    at.join(b"w2", credit=3)
+    assert [(lease.indices[0], lease.candidate) for lease in at.leases[b"w2"]] == [(0, 0), (1, 0), (2, 0)]
+    at.work_off(b"w2")
+    assert at.samples() == [(0, 0), (0, 1), (0, 2)]
+    assert at.recorded == []
+
+
+_frames = st.lists(st.binary(max_size=30), max_size=3) | messages.map(encode)
+_hellos = st.builds(
+    Hello,
+    spec=st.dictionaries(
+        st.sampled_from(("recipe", "voxel_dtype", "shuffle", "max_sequences_per_video", "self")),
+        st.sampled_from((None, "paper", "int16", True, 1, 2.5, [1], {"gamma": 2}, {"bins": 1000}, {"": {}}, b"x")),
+        max_size=3,
+    ),
+    arrays=st.lists(st.sampled_from(("voxels", "frames", "depth")), max_size=3).map(tuple),
+    batch_size=st.integers(0, 2**64 - 1),
+    seed=st.integers(0, 2**64 - 1),
+)
+_near = st.one_of(
+    _hellos,
+    st.builds(
+        Want, epoch=st.integers(0, 3) | st.integers(0, 2**64 - 1), indices=st.lists(st.integers(0, 60)).map(tuple)
+    ),
+    st.builds(Begun, lease=st.integers(0, 20)),
+    st.builds(Result, lease=st.integers(0, 20), begins=st.integers(0, 20)),
+    st.builds(JobFailed, lease=st.integers(0, 20), frame=st.none(), reason=st.text(), here=st.booleans()),
+    st.builds(
+        WorkerHello,
+        name=st.text(),
+        host=st.text(),
+        pid=st.just(1),
+        numerics_version=st.sampled_from((NUMERICS_VERSION, 0)),
+        credit=st.integers(0, 2**64 - 1),
+    ),
+    st.sampled_from((Ping(), Goodbye(), Stop(), Pong())),
+).map(encode)
+
+
+@given(
+    st.lists(
+        st.tuples(st.booleans(), st.sampled_from((b"c", b"d", b"w", b"")), _near | _frames, st.floats(0.0, 100.0)),
+        max_size=25,
+    )
+)
+@settings(max_examples=150, deadline=None)
+def test_any_conversation_leaves_it_serving(said: list[tuple[bool, bytes, list[Any], float]]) -> None:
+    at = peers()
+    for by_worker, identity, frames, seconds in said:
+        speak = at.dispatcher.from_worker if by_worker else at.dispatcher.from_consumer
+        for instruction in speak(identity, [*frames, b"payload"] if by_worker else frames, at.now):
+            assert not isinstance(instruction, Record)
+            assert instruction.identity in (b"c", b"d", b"w", b"")
+        at.tick(seconds)
+    for identity in (b"c", b"d", b"w", b""):
+        at.consumer_says(identity, Goodbye())
+        at.die(identity)
+    still_serves(at)
+
+
+def test_the_paper_preset_is_served_where_videos_are_long_enough() -> None:
+    at = peers(corpus(video("a.mp4", 500, 336, 596)), StreamSpec(recipe=preset("paper")))
+    at.join()
+    assert at.hello(batch_size=12).sequences == 2
+    at.want(0, 1)
+    assert sorted(lease.start_frame for lease in at.leases[b"w"]) == [0, 200]
+    assert decode(encode(at.leases[b"w"][0])[0]) == at.leases[b"w"][0]

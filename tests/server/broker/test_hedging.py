@@ -1,0 +1,218 @@
+"""Second leases for slow samples: the consumer gets the sample once, whoever is first and whatever the other does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.server.corpus import SMALL_SPEC
+from tests.server.peers import DEADLINE, Peers, peers
+from v2v_protocol.messages import JobFailed, Lease, Result
+from v2v_server.broker.blame import ALONE_AFTER, Cause
+
+
+def practised() -> tuple[Peers, Lease]:
+    """A consumer whose samples take half a second, and a worker with room for no more that has begun its index 20."""
+    at = peers()
+    at.join(b"before")
+    at.hello(batch_size=20)
+    at.want(*range(8))
+    for _ in range(8):
+        at.begin(b"before")
+        at.now += 0.5
+        at.finish(b"before")
+    at.die(b"before")
+    at.join(b"slow", credit=1)
+    at.want(20)
+    return at, at.begin(b"slow")
+
+
+def slowed() -> tuple[Peers, Lease, Lease]:
+    """A worker that is slow at index 20, and another that has been given it as well."""
+    at, first = practised()
+    at.join(b"fast")
+    at.tick(1.5)
+    assert not at.leases[b"fast"]
+    at.tick(0.1)
+    (second,) = at.leases[b"fast"]
+    assert at.dispatcher.counters.second_leases == 1
+    return at, first, second
+
+
+def test_the_second_lease_is_the_first_but_for_its_number() -> None:
+    at, first, second = slowed()
+    assert first.lease != second.lease
+    assert (first.indices, first.candidate, first.video) == (second.indices, second.candidate, second.video)
+    # There is no third, however long it takes.
+    at.join(b"third")
+    for _ in range(20):
+        at.tick(1.0)
+    assert not at.leases[b"third"]
+
+
+@pytest.mark.parametrize("order", [(b"slow", b"fast"), (b"fast", b"slow")])
+def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes, bytes]) -> None:
+    at, *_ = slowed()
+    before = at.samples()
+    at.finish(order[0])
+    assert at.samples() == [*before, (0, 20)]
+    at.finish(order[1])
+    assert at.samples() == [*before, (0, 20)]
+    assert at.dispatcher.counters.late_results == 1
+    assert len(at.dispatcher._leases) == 0
+    # And the room of both is free again.
+    at.want(21, 22, 23, 24)
+    assert (len(at.leases[b"slow"]), len(at.leases[b"fast"])) == (1, 2)
+
+
+def test_a_failure_answers_for_both() -> None:
+    at, first, _ = slowed()
+    at.fail(b"fast")
+    # The next candidate is tried by whoever has room, and the slow one's sample of the one before comes too late.
+    assert [lease.candidate for lease in at.leases[b"fast"]] == [1]
+    before = at.samples()
+    at.finish(b"slow")
+    assert at.samples() == before
+    at.finish(b"fast")
+    assert at.samples() == [*before, (0, 20)]
+    at.worker_says(b"slow", JobFailed(first.lease, None, "late"))
+    at.worker_says(b"slow", Result(first.lease), b"late")
+    assert at.samples() == [*before, (0, 20)]
+    assert len(at.dispatcher._leases) == 0
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+@pytest.mark.parametrize("lost", [b"slow", b"fast"])
+def test_losing_one_of_the_two_changes_nothing(lost: bytes, cause: Cause) -> None:
+    at, *_ = slowed()
+    at.begin(b"fast")
+    at.die(lost, cause)
+    assert (at.recorded, at.dispatcher.waiting) == ([], 0)
+    left = b"fast" if lost == b"slow" else b"slow"
+    assert at.finish(left).candidate == 0
+    assert at.samples()[8:] == [(0, 20)]
+
+
+def test_losing_both_judges_the_last() -> None:
+    at, *_ = slowed()
+    at.begin(b"fast")
+    at.die(b"fast", Cause.CRASHED)
+    at.die(b"slow", Cause.CRASHED)
+    assert len(at.recorded) == 1
+    at.join(b"w")
+    assert at.leases[b"w"][0].candidate == 1
+    at.work_off(b"w")
+    assert at.samples()[8:] == [(0, 20)]
+
+
+def test_a_hang_under_two_leases_ends_in_one_verdict_and_an_answer() -> None:
+    at, *_ = slowed()
+    at.begin(b"fast")
+    while len(at.given_up) < 2:
+        at.tick(1.0)
+    assert at.given_up == [b"slow", b"fast"]
+    assert len(at.recorded) == 1
+    at.join(b"w")
+    at.work_off(b"w")
+    assert at.samples()[8:] == [(0, 20)]
+    assert at.now < 2 * DEADLINE + 20
+
+
+def test_what_waits_behind_a_hanging_sample_of_another_consumer_is_rescued() -> None:
+    at = peers()
+    at.join(b"w1")
+    at.hello(b"c", batch_size=20)
+    at.want(*range(8))
+    for _ in range(8):
+        at.begin(b"w1")
+        at.now += 0.5
+        at.finish(b"w1")
+    at.hello(b"hangs")
+    at.want(0, identity=b"hangs")
+    at.begin(b"w1")
+    at.want(8)
+    assert [lease.reply_to for lease in at.leases[b"w1"]] == [b"hangs", b"c"]
+    at.join(b"w2")
+    at.tick(2.0)
+    assert [lease.reply_to for lease in at.leases[b"w2"]] == [b"c"]
+    at.work_off(b"w2")
+    assert at.samples()[8:] == [(0, 8)]
+
+
+def test_a_lone_task_has_no_twin() -> None:
+    at = peers()
+    at.join(b"w")
+    at.hello(batch_size=20)
+    at.want(*range(8))
+    at.work_off(b"w")
+    at.die(b"w")
+    at.want(20)
+    for _ in range(ALONE_AFTER):
+        at.join(b"w")
+        at.begin(b"w")
+        at.die(b"w", Cause.UNEXPLAINED)
+    at.join(b"w")
+    at.begin(b"w")
+    at.join(b"idle")
+    at.tick(20.0)
+    assert not at.leases[b"idle"]
+    assert at.dispatcher.counters.second_leases == 0
+
+
+def test_a_twin_is_of_the_snapshot_of_the_first_though_a_verdict_fell_meanwhile() -> None:
+    """Both are the same candidate, chosen under the same snapshot; whoever makes it again asks for that one."""
+    at, hanging = practised()
+    at.want(21)
+    at.join(b"dies", credit=1)
+    at.begin(b"dies")
+    at.die(b"dies", Cause.CRASHED)
+    assert at.quarantine.latest == 1
+    at.join(b"fast", credit=1)
+    at.work_off(b"fast")
+    at.tick(2.0)
+    (twin,) = at.leases[b"fast"]
+    assert (twin.indices, twin.candidate, twin.quarantine) == (hanging.indices, 0, 0)
+
+
+def test_a_twin_does_not_take_the_worker_that_a_lone_task_waits_for() -> None:
+    at, hanging = practised()
+    at.hello(b"other")
+    at.want(1, identity=b"other")
+    for _ in range(ALONE_AFTER):
+        at.join(b"dies", credit=1)
+        at.begin(b"dies")
+        at.die(b"dies", Cause.UNEXPLAINED)
+    at.join(b"busy", credit=2)
+    (alone,) = at.leases[b"busy"]
+    assert alone.reply_to == b"other"
+    at.hello(b"third")
+    at.want(2, 3, identity=b"third")
+    at.join(b"empties", credit=2)
+    at.finish(b"empties")
+    at.die(b"busy", Cause.KILLED)
+    # The one in work is all that stands between the lone task and its worker, and nothing is added to it.
+    at.tick(2.0)
+    assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"third"]
+    at.finish(b"empties")
+    assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"other"]
+    assert hanging.indices == (20,)
+
+
+def test_a_clip_takes_as_long_as_other_clips_not_as_siblings_that_need_no_decoding() -> None:
+    at = peers(spec=replace(SMALL_SPEC, samples_per_decode=3))
+    at.join(b"w", credit=1)
+    at.hello(batch_size=4)
+    at.want(*range(24))
+    for place in range(24):
+        decodes = place % 3 == 0
+        at.begin()
+        at.now += 3.0 if decodes else 0.2
+        at.finish(decoded=decodes)
+    at.want(24, 28, 32)
+    at.begin()
+    at.join(b"idle")
+    at.tick(8.9)
+    assert not at.leases[b"idle"]
+    at.tick(0.2)
+    assert [lease.indices for lease in at.leases[b"idle"]] == [(24,)]

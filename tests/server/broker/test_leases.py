@@ -1,0 +1,359 @@
+"""The lease book against a model that keeps, for every task, the one place where it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
+
+from v2v_server.broker.leases import LeaseBook, Task
+
+DEADLINE = 60.0
+A, B = b"worker a", b"worker b"
+TASK = Task(b"consumer", 0, 0)
+
+
+def numbered(index: int, session: bytes = b"consumer") -> Task:
+    return Task(session, 0, index)
+
+
+def overdue_workers(book: LeaseBook, now: float) -> list[bytes]:
+    return sorted(book.overdue(now))
+
+
+# --- single steps -----------------------------------------------------------------------------------------------------
+
+
+def test_an_answer_returns_the_task_once() -> None:
+    book = LeaseBook(DEADLINE)
+    number = book.grant(TASK, A, 0.0)
+    assert (len(book), book.held_by(A), book.held_by(B)) == (1, 1, 0)
+    assert book.finished(number, B, 0.0) is None
+    assert book.finished(number + 1, A, 0.0) is None
+    assert book.finished(number, A, 0.0) is TASK
+    assert book.finished(number, A, 0.0) is None
+    assert (len(book), book.held_by(A)) == (0, 0)
+
+
+def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_suspect() -> None:
+    book = LeaseBook(DEADLINE)
+    numbers = [book.grant(numbered(index), A, 0.0) for index in range(3)]
+    other = book.grant(numbered(9), B, 0.0)
+    assert book.finished(numbers[0], A, 0.0) == numbered(0)
+    book.begun(numbers[1], A, 1.0)
+    book.begun(numbers[2], B, 1.0)
+    assert (book.task(numbers[1], A), book.task(numbers[1], B), book.task(0, A)) == (numbered(1), None, None)
+    assert book.lost(A) == [(numbered(1), True), (numbered(2), False)]
+    assert book.lost(A) == []
+    assert book.finished(numbers[1], A, 0.0) is None
+    assert book.finished(other, B, 0.0) == numbered(9)
+
+
+def test_a_late_answer_finds_nothing_even_when_the_task_went_back_to_the_same_worker() -> None:
+    book = LeaseBook(DEADLINE)
+    first = book.grant(TASK, A, 0.0)
+    book.lost(A)
+    second = book.grant(TASK, A, 1.0)
+    assert second != first
+    book.begun(first, A, 2.0)
+    assert book.finished(first, A, 0.0) is None
+    assert book.lost(A) == [(TASK, False)]
+
+
+def test_the_deadline_counts_from_the_grant_and_from_each_beginning() -> None:
+    book = LeaseBook(DEADLINE)
+    first, second = book.grant(numbered(0), A, 0.0), book.grant(numbered(1), A, 0.0)
+    assert overdue_workers(book, DEADLINE) == []
+    assert overdue_workers(book, DEADLINE + 0.5) == [A]
+    book.begun(first, A, 50.0)
+    assert overdue_workers(book, 50.0 + DEADLINE) == []
+    book.finished(first, A, 0.0)
+    book.begun(second, A, 100.0)
+    assert overdue_workers(book, 100.0 + DEADLINE) == []
+    assert overdue_workers(book, 100.5 + DEADLINE) == [A]
+    assert book.held_by(A) == 1
+
+
+def test_a_forgotten_consumer_gets_no_answer_but_its_leases_still_fill_the_worker() -> None:
+    """The worker does not know: it has to get through them, so it has no room for others, and may still hang."""
+    book = LeaseBook(DEADLINE)
+    gone, stays = book.grant(numbered(0, b"gone"), A, 0.0), book.grant(numbered(1, b"stays"), A, 0.0)
+    book.forget_session(b"gone")
+    assert book.held_by(A) == 2
+    assert overdue_workers(book, DEADLINE + 1) == [A]
+    book.begun(gone, A, 50.0)
+    assert overdue_workers(book, 50.0 + DEADLINE) == []
+    assert book.finished(gone, A, 0.0) is None
+    assert book.held_by(A) == 1
+    assert book.finished(stays, A, 0.0) == numbered(1, b"stays")
+    assert len(book) == 0
+
+
+def test_a_worker_lost_over_forgotten_leases_returns_nothing() -> None:
+    book = LeaseBook(DEADLINE)
+    number = book.grant(numbered(0, b"gone"), A, 0.0)
+    book.begun(number, A, 0.0)
+    book.forget_session(b"gone")
+    assert book.lost(A) == []
+    assert len(book) == 0
+    assert overdue_workers(book, 1000.0) == []
+
+
+def test_a_lease_begins_once() -> None:
+    """A worker that says so again and again must not put off its deadline for ever."""
+    book = LeaseBook(DEADLINE)
+    number = book.grant(TASK, A, 0.0)
+    for second in range(2 * int(DEADLINE)):
+        book.begun(number, A, float(second))
+    assert overdue_workers(book, DEADLINE) == []
+    assert overdue_workers(book, DEADLINE + 0.5) == [A]
+
+
+# --- twins ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fast", [A, B])
+def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
+    """Whether it is a sample or a failure: the book cannot tell, and both answer for the two of them."""
+    book = LeaseBook(DEADLINE)
+    numbers = {A: book.grant(TASK, A, 0.0), B: book.grant(TASK, B, 5.0)}
+    slow = B if fast == A else A
+    assert book.finished(numbers[fast], fast, 6.0) is TASK
+    assert book.task(numbers[slow], slow) is None
+    # The slower one does not know: it is still at it, fills its worker, and may be overdue.
+    assert (len(book), book.held_by(slow), list(book.tasks_of(slow))) == (1, 1, [])
+    assert overdue_workers(book, DEADLINE + 5.5) == [slow]
+    assert book.finished(numbers[slow], slow, 7.0) is None
+    assert (len(book), book.held_by(A), book.held_by(B)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("first", [A, B])
+def test_losing_one_of_two_returns_nothing_and_losing_both_returns_it_once(first: bytes) -> None:
+    book = LeaseBook(DEADLINE)
+    for worker in (A, B):
+        book.begun(book.grant(TASK, worker, 0.0), worker, 0.0)
+    assert book.lost(first) == []
+    assert book.lost(B if first == A else A) == [(TASK, True)]
+    assert len(book) == 0
+
+
+def test_a_retired_twin_returns_nothing_when_its_worker_is_lost() -> None:
+    book = LeaseBook(DEADLINE)
+    number = book.grant(TASK, A, 0.0)
+    book.begun(book.grant(TASK, B, 0.0), B, 0.0)
+    assert book.finished(number, A, 1.0) is TASK
+    assert book.lost(B) == []
+    assert len(book) == 0
+
+
+def test_a_forgotten_consumer_forgets_both() -> None:
+    book = LeaseBook(DEADLINE)
+    numbers = [book.grant(TASK, worker, 0.0) for worker in (A, B)]
+    book.forget_session(TASK.session)
+    assert [book.finished(number, worker, 1.0) for number, worker in zip(numbers, (A, B), strict=True)] == [None, None]
+    # What is asked again afterwards has nothing to do with them.
+    again = book.grant(TASK, A, 2.0)
+    assert book.finished(again, A, 3.0) is TASK
+
+
+# --- the slow ---------------------------------------------------------------------------------------------------------
+
+
+def practised(seconds: float, samples: int = 8, session: bytes = b"consumer") -> LeaseBook:
+    """A book that has seen that many samples of a consumer take that long."""
+    book = LeaseBook(DEADLINE)
+    for index in range(samples):
+        number = book.grant(numbered(1000 + index, session), B, 0.0)
+        book.begun(number, B, 0.0)
+        assert book.finished(number, B, seconds) is not None
+    return book
+
+
+@pytest.mark.parametrize(
+    ("seconds", "samples", "limit"),
+    [
+        (1.0, 8, 3.0),
+        (4.0, 8, 12.0),
+        (0.01, 8, 1.0),  # never before a second
+        (1.0, 7, None),  # too few to know what is usual
+        (1.0, 0, None),
+    ],
+)
+def test_slow_is_three_times_the_median_and_a_second(seconds: float, samples: int, limit: float | None) -> None:
+    book = practised(seconds, samples)
+    book.begun(book.grant(TASK, A, 100.0), A, 100.0)
+    if limit is None:
+        assert book.slow(100.0 + DEADLINE) == []
+    else:
+        assert book.slow(100.0 + limit) == []
+        assert book.slow(100.001 + limit) == [(TASK, A)]
+
+
+def test_the_median_is_of_the_last_samples_and_of_the_consumer_itself() -> None:
+    book = practised(1.0, 8)
+    for _ in range(64):
+        number = book.grant(numbered(1), B, 0.0)
+        book.begun(number, B, 0.0)
+        book.finished(number, B, 10.0)
+    book.begun(book.grant(TASK, A, 100.0), A, 100.0)
+    assert book.slow(130.0) == []
+    assert book.slow(130.5) == [(TASK, A)]
+    book.grant(numbered(0, b"a consumer of one sample"), b"worker c", 100.0)
+    assert book.slow(130.5) == [(TASK, A)]
+
+
+def test_only_the_oldest_of_a_consumer_is_slow_and_only_while_one_is_at_it() -> None:
+    book = practised(1.0)
+    book.grant(numbered(0), A, 0.0)
+    book.grant(numbered(1), B, 0.0)
+    assert book.slow(5.0) == [(numbered(0), A)]
+    twin = book.grant(numbered(0), b"worker c", 5.0)
+    assert book.slow(20.0) == []
+    assert book.lost(A) == []
+    # The twin is alone now, and not the oldest: the other has waited longer.
+    assert book.slow(20.0) == [(numbered(1), B)]
+    assert book.finished(twin, b"worker c", 21.0) == numbered(0)
+
+
+def test_a_task_queued_behind_one_that_hangs_is_slow() -> None:
+    """Its consumer waits for it, though the one in work is another's; but not while the worker gets on."""
+    book = practised(1.0)
+    hanging = book.grant(numbered(0, b"other"), A, 0.0)
+    between = book.grant(numbered(1, b"other"), A, 0.0)
+    book.grant(numbered(2), A, 0.0)
+    book.begun(hanging, A, 0.0)
+    assert book.slow(3.5) == [(numbered(2), A)]
+    book.finished(hanging, A, 3.5)
+    book.begun(between, A, 3.5)
+    assert book.slow(6.5) == []
+    assert book.slow(6.6) == [(numbered(2), A)]
+
+
+def test_what_was_usual_goes_with_the_consumer() -> None:
+    book = practised(1.0)
+    book.forget_session(b"consumer")
+    book.grant(TASK, A, 0.0)
+    assert book.slow(50.0) == []
+
+
+# --- any order --------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Place:
+    task: Task
+    worker: bytes
+    begun: bool
+    deadline: float
+    retired: bool
+
+
+class LeaseModel(RuleBasedStateMachine):
+    """Every lease is with one worker until that answers or is lost. A task may be out twice: it comes back once, by the
+    first answer, or when the last worker at it is lost; a forgotten one never."""
+
+    numbers = Bundle("numbers")
+    workers = st.sampled_from((A, B, b"worker c"))
+    sessions = st.sampled_from((b"s1", b"s2"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.book = LeaseBook(DEADLINE)
+        self.out: dict[int, Place] = {}
+        self.now = 0.0
+        self.tasks = 0
+        self.ever: set[int] = set()
+
+    def _granted(self, task: Task, worker: bytes) -> int:
+        number = self.book.grant(task, worker, self.now)
+        assert number not in self.ever
+        self.ever.add(number)
+        self.out[number] = Place(task, worker, False, self.now + DEADLINE, False)
+        return number
+
+    def _retire(self, task: Task) -> None:
+        for place in self.out.values():
+            place.retired |= place.task == task
+
+    @rule(target=numbers, worker=workers, session=sessions)
+    def grant(self, worker: bytes, session: bytes) -> int:
+        self.tasks += 1
+        return self._granted(Task(session, 0, self.tasks), worker)
+
+    @rule(target=numbers, number=numbers, worker=workers)
+    def twin(self, number: int, worker: bytes) -> object:
+        place = self.out.get(number)
+        if place is None or place.retired:
+            return multiple()
+        if worker in {other.worker for other in self.out.values() if other.task == place.task}:
+            return multiple()  # nobody is given a task that it has
+        return self._granted(place.task, worker)
+
+    @rule(number=numbers, worker=workers)
+    def begun(self, number: int, worker: bytes) -> None:
+        self.book.begun(number, worker, self.now)
+        place = self.out.get(number)
+        if place is not None and place.worker == worker and not place.begun:
+            place.begun = True
+            for other in self.out.values():
+                if other.worker == worker:
+                    other.deadline = self.now + DEADLINE
+
+    @rule(number=numbers, worker=workers)
+    def finished(self, number: int, worker: bytes) -> None:
+        place = self.out.get(number)
+        asked = self.book.task(number, worker)
+        task = self.book.finished(number, worker, self.now)
+        assert task == asked
+        if place is None or place.worker != worker:
+            assert task is None
+            return
+        assert task == (None if place.retired else place.task)
+        del self.out[number]
+        self._retire(place.task)
+
+    @rule(worker=workers)
+    def lost(self, worker: bytes) -> None:
+        mine = [place for place in self.out.values() if place.worker == worker]
+        self.out = {number: place for number, place in self.out.items() if place.worker != worker}
+        elsewhere = {place.task for place in self.out.values()}
+        expected: dict[Task, bool] = {}
+        for place in mine:
+            if not place.retired and place.task not in elsewhere:
+                expected[place.task] = place.begun
+        assert self.book.lost(worker) == list(expected.items())
+
+    @rule(session=sessions)
+    def forget(self, session: bytes) -> None:
+        self.book.forget_session(session)
+        for place in self.out.values():
+            place.retired |= place.task.session == session
+
+    @rule(seconds=st.floats(0.0, 2 * DEADLINE))
+    def time_passes(self, seconds: float) -> None:
+        self.now += seconds
+
+    @invariant()
+    def every_lease_is_in_one_place(self) -> None:
+        assert len(self.book) == len(self.out)
+        for worker in (A, B, b"worker c"):
+            mine = [place for place in self.out.values() if place.worker == worker]
+            clips = {place.task.clip for place in mine if not place.retired}
+            assert self.book.held_by(worker) == len(clips) + sum(place.retired for place in mine)
+            assert list(self.book.tasks_of(worker)) == [place.task for place in mine if not place.retired]
+
+    @invariant()
+    def overdue_is_what_the_clock_says(self) -> None:
+        assert self.book.overdue(self.now) == {p.worker for p in self.out.values() if self.now > p.deadline}
+
+    @invariant()
+    def the_slow_are_out_once(self) -> None:
+        for task, worker in self.book.slow(self.now):
+            assert [place.worker for place in self.out.values() if place.task == task] == [worker]
+
+
+TestLeaseModel = LeaseModel.TestCase
+TestLeaseModel.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)

@@ -1,0 +1,309 @@
+"""The quarantine: snapshots in memory against a slow model, and the file that several processes write to."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.broker.quarantine import (
+    VERDICTS_PER_VIDEO,
+    Quarantine,
+    Verdict,
+    clearing,
+    quarantine_path,
+    read_quarantine,
+    write_verdict,
+)
+
+TIME = "2024-02-29T12:00:00+00:00"
+
+
+def verdict(path: str = "v.mp4", frame: int = 0, fingerprint: str = "f", reason: str = "crash") -> Verdict:
+    return Verdict(0, path, fingerprint, frame, reason, TIME)
+
+
+def numbered(*verdicts: Verdict) -> list[Verdict]:
+    return [replace(each, snapshot=number) for number, each in enumerate(verdicts, 1)]
+
+
+# --- snapshots --------------------------------------------------------------------------------------------------------
+
+
+def test_snapshot_0_is_empty_and_there_is_no_other_at_first() -> None:
+    quarantine = Quarantine()
+    assert quarantine.latest == 0
+    assert quarantine.verdicts(0) == []
+    assert quarantine.refusal(0, "v.mp4", "f", 0) is None
+    for snapshot in (-1, 1):
+        with pytest.raises(CorpusError, match=rf"snapshot {snapshot}: there are 0 \.\. 0"):
+            quarantine.verdicts(snapshot)
+        with pytest.raises(CorpusError, match=rf"snapshot {snapshot}: there are 0 \.\. 0"):
+            quarantine.refusal(snapshot, "v.mp4", "f", 0)
+
+
+def test_a_verdict_refuses_its_sequence_and_two_the_whole_video() -> None:
+    assert VERDICTS_PER_VIDEO == 2
+    quarantine = Quarantine(numbered(verdict(frame=5, reason="SIGSEGV"), verdict(frame=10, reason="SIGBUS")))
+    assert quarantine.refusal(0, "v.mp4", "f", 5) is None
+    assert quarantine.refusal(1, "v.mp4", "f", 5) == "sequence in quarantine snapshot 1: SIGSEGV"
+    assert quarantine.refusal(1, "v.mp4", "f", 10) is None
+    for frame in (5, 10, 15):
+        refusal = quarantine.refusal(2, "v.mp4", "f", frame)
+        assert refusal == "video in quarantine snapshot 2 (2 verdicts): SIGBUS"
+    for snapshot in (0, 1, 2):
+        assert quarantine.refusal(snapshot, "w.mp4", "f", 5) is None
+
+
+def test_another_fingerprint_is_another_file() -> None:
+    quarantine = Quarantine(numbered(verdict(frame=5), verdict(frame=10, fingerprint="g")))
+    assert quarantine.refusal(2, "v.mp4", "f", 10) is None
+    assert quarantine.refusal(2, "v.mp4", "g", 5) is None
+    assert quarantine.refusal(2, "v.mp4", "f", 5) is not None
+    assert quarantine.refusal(2, "v.mp4", "g", 10) is not None
+    assert quarantine.refusal(2, "v.mp4", "h", 5) is None
+
+
+def test_a_clearing_begins_anew_and_leaves_the_old_snapshots() -> None:
+    quarantine = Quarantine(numbered(verdict(frame=5), clearing(TIME), verdict(frame=10)))
+    assert [quarantine.refusal(n, "v.mp4", "f", 5) is not None for n in range(4)] == [False, True, False, False]
+    # Verdicts of before the clearing do not make up two with those after it.
+    assert [quarantine.refusal(n, "v.mp4", "f", 10) is not None for n in range(4)] == [False, False, False, True]
+    assert [len(quarantine.verdicts(n)) for n in range(4)] == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("number", [0, 1, 3, -1])
+def test_numbers_go_on_where_they_ended(number: int) -> None:
+    quarantine = Quarantine(numbered(verdict()))
+    with pytest.raises(CorpusError, match=f"line 2 has snapshot number {number}"):
+        quarantine.extend([replace(verdict(), snapshot=number)])
+    assert quarantine.latest == 1
+
+
+_verdicts = st.lists(
+    st.builds(verdict, st.sampled_from(("v", "w")), st.integers(0, 2), st.sampled_from("fg")) | st.just(clearing(TIME)),
+    max_size=10,
+)
+
+
+@given(_verdicts)
+@settings(max_examples=150, deadline=None)
+def test_every_snapshot_against_its_definition(verdicts: list[Verdict]) -> None:
+    """Snapshot n + 1 is snapshot n and one verdict more, or nothing."""
+    quarantine = Quarantine()
+    held: list[Verdict] = []
+    snapshots: list[list[Verdict]] = [[]]
+    for each in numbered(*verdicts):
+        quarantine.extend([each])
+        held = [*held, each] if each.path else []
+        snapshots.append(held)
+    assert quarantine.latest == len(verdicts)
+    for number, expected in enumerate(snapshots):
+        assert quarantine.verdicts(number) == expected
+        counts = Counter((each.path, each.fingerprint) for each in expected)
+        for path in "vw":
+            for fingerprint in "fg":
+                for frame in range(3):
+                    hit = any((v.path, v.fingerprint, v.frame) == (path, fingerprint, frame) for v in expected)
+                    refused = quarantine.refusal(number, path, fingerprint, frame) is not None
+                    assert refused == (hit or counts[path, fingerprint] >= 2)
+
+
+def test_lines_read_well() -> None:
+    one, two = numbered(verdict("a/b.mp4", 40, reason="was ended by SIGSEGV"), clearing(TIME))
+    assert str(one) == f"snapshot 1 ({TIME}): a/b.mp4 from frame 40: was ended by SIGSEGV"
+    assert str(two) == f"snapshot 2 ({TIME}): cleared"
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def write(file: Path, *verdicts: Verdict) -> Quarantine:
+    """A process of its own that reads, and writes these."""
+    quarantine = read_quarantine(file)
+    for each in verdicts:
+        quarantine.extend(write_verdict(file, each, quarantine))
+    return quarantine
+
+
+def test_the_file_lies_beside_the_index(tmp_path: Path) -> None:
+    file = quarantine_path(Path("/corpus"), tmp_path)
+    assert file.parent == tmp_path
+    assert file.name.startswith("quarantine-")
+    assert file.suffix == ".jsonl"
+    assert file != quarantine_path(Path("/corpus2"), tmp_path)
+
+
+def test_no_file_is_an_empty_quarantine(tmp_path: Path) -> None:
+    assert read_quarantine(tmp_path / "none.jsonl").latest == 0
+    assert not (tmp_path / "none.jsonl").exists()
+
+
+@given(
+    st.lists(
+        st.builds(verdict, st.text(min_size=1), st.integers(0, 2**40), st.text(), st.text()) | st.just(clearing(TIME)),
+        max_size=5,
+    )
+)
+@settings(max_examples=40, deadline=None)
+def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, verdicts: list[Verdict]) -> None:
+    file = tmp_path_factory.mktemp("quarantine") / "new folder" / "q.jsonl"
+    assert write(file, *verdicts).lines == tuple(numbered(*verdicts)) == read_quarantine(file).lines
+    if verdicts:
+        lines = file.read_bytes().split(b"\n")
+        assert [json.loads(line) for line in lines[:-1]] == [asdict(each) for each in numbered(*verdicts)]
+        assert lines[-1] == b""
+
+
+@pytest.mark.parametrize("cut", range(1, 30))
+def test_a_last_line_that_was_cut_off_is_left_out_and_written_over(tmp_path: Path, cut: int) -> None:
+    file = tmp_path / "q.jsonl"
+    first, second = write(file, verdict("v.mp4"), verdict("w.mp4", reason="x" * 100)).lines
+    file.write_bytes(file.read_bytes()[:-cut])
+    assert read_quarantine(file).lines == (first,)
+    again = write(file, verdict("u.mp4"))
+    assert read_quarantine(file).lines == again.lines == (first, replace(verdict("u.mp4"), snapshot=2))
+    assert second not in again.lines
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"garbage",
+        b"\xff\xfe",
+        b"\0\0\0\0",
+        b"[]",
+        b"{}",
+        b"1",
+        b'{"snapshot": 2}',
+        b'{"snapshot": 2, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t", "more": 1}',
+        b'{"snapshot": 2, "path": "v", "fingerprint": "f", "frame": "0", "reason": "r", "time": "t"}',
+        b'{"snapshot": 2, "path": null, "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
+        b'{"snapshot": 3, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
+        b'{"snapshot": 1, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
+        b'{"snapshot": true, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
+    ],
+)
+def test_any_other_damaged_line_is_named_and_left_alone(tmp_path: Path, line: bytes) -> None:
+    file = tmp_path / "q.jsonl"
+    known = write(file, verdict())
+    damaged = file.read_bytes() + line + b"\n"
+    file.write_bytes(damaged)
+    with pytest.raises(CorpusError, match=r"q\.jsonl, line 2 is damaged .*; mend or delete it"):
+        read_quarantine(file)
+    with pytest.raises(CorpusError, match=r"line 2 is damaged"):
+        write_verdict(file, verdict(), known)
+    assert file.read_bytes() == damaged
+
+
+def test_what_is_no_file_can_neither_be_read_nor_written(tmp_path: Path) -> None:
+    with pytest.raises(CorpusError, match="cannot be read"):
+        read_quarantine(tmp_path)
+    with pytest.raises(OSError, match="directory"):
+        write_verdict(tmp_path, verdict(), Quarantine())
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="exists"):
+        write_verdict(tmp_path / "file" / "q.jsonl", verdict(), Quarantine())
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
+    """A limit on the size of files stands in for the disk; it needs a process of its own."""
+    file = tmp_path / "q.jsonl"
+    known = write(file, verdict())
+    before = file.read_bytes()
+    program = f"""
+import resource, signal
+from pathlib import Path
+from v2v_server.broker.quarantine import Verdict, read_quarantine, write_verdict
+file = Path({str(file)!r})
+known = read_quarantine(file)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before) + 20}, {len(before) + 20}))
+try:
+    write_verdict(file, Verdict(0, "w.mp4", "f", 0, "crash", "t"), known)
+except OSError as error:
+    print(error.errno)
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert int(said.stdout) in (errno.ENOSPC, errno.EFBIG)
+    assert file.read_bytes() == before
+    assert read_quarantine(file).lines == known.lines
+
+
+# --- several writers --------------------------------------------------------------------------------------------------
+
+
+def test_two_servers_and_a_clearing_share_one_numbering(tmp_path: Path) -> None:
+    file = tmp_path / "q.jsonl"
+    here, there = read_quarantine(file), read_quarantine(file)
+    here.extend(write_verdict(file, verdict("a.mp4"), here))
+    write(file, clearing(TIME))
+    written = write_verdict(file, verdict("b.mp4"), there)
+    # Whoever writes learns of everything that was written since it last looked, its own line last.
+    assert written == numbered(verdict("a.mp4"), clearing(TIME), verdict("b.mp4"))
+    there.extend(written)
+    here.extend(write_verdict(file, verdict("c.mp4"), here))
+    assert here.lines[:3] == there.lines
+    assert here.lines == read_quarantine(file).lines
+    assert [each.snapshot for each in here.lines] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("keep", [0, 1])
+def test_a_file_that_was_replaced_gives_no_number_twice(tmp_path: Path, keep: int) -> None:
+    file = tmp_path / "q.jsonl"
+    known = write(file, verdict("a.mp4"), verdict("b.mp4"))
+    file.unlink()
+    write(file, *[verdict("a.mp4")][:keep], verdict("other.mp4"))
+    before = file.read_bytes()
+    with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, and not the 2 known here"):
+        write_verdict(file, verdict("c.mp4"), known)
+    assert file.read_bytes() == before
+
+
+def test_nobody_writes_while_another_does(tmp_path: Path) -> None:
+    file = tmp_path / "q.jsonl"
+    write(file, verdict("a.mp4"))
+    done = threading.Event()
+
+    def write_another() -> None:
+        write(file, verdict("b.mp4"))
+        done.set()
+
+    with open(file, "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        writer = threading.Thread(target=write_another)
+        writer.start()
+        assert not done.wait(0.1)
+        assert read_quarantine(file).latest == 1
+    assert done.wait(60.0)
+    writer.join()
+    assert read_quarantine(file).latest == 2
+
+
+def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "q.jsonl"
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom v2v_server.broker.quarantine import *\n"
+        "file, name = Path(sys.argv[1]), sys.argv[2]\nknown = read_quarantine(file)\n"
+        "for frame in range(20):\n"
+        "    known.extend(write_verdict(file, Verdict(0, name, 'f', frame, 'crash', 't'), known))\n"
+    )
+    writers = [subprocess.Popen([sys.executable, "-c", program, str(file), name], env=os.environ) for name in "ab"]
+    assert [writer.wait(60.0) for writer in writers] == [0, 0]
+    lines = read_quarantine(file).lines
+    assert [each.snapshot for each in lines] == list(range(1, 41))
+    for name in "ab":
+        assert [each.frame for each in lines if each.path == name] == list(range(20))

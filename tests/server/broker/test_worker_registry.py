@@ -1,0 +1,265 @@
+"""The table of workers: who has room, who must be left alone, who hangs and who is gone."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from v2v_server.broker.blame import ALONE_AFTER, runs_alone
+from v2v_server.broker.leases import LeaseBook, Task
+from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
+
+DEADLINE = 60.0
+
+
+class Table:
+    """A book and the workers in it."""
+
+    def __init__(self, **credit: int) -> None:
+        self.book = LeaseBook(DEADLINE)
+        self.workers = Workers(self.book)
+        self.tasks = 0
+        for name, offered in credit.items():
+            self.workers.add(name.encode(), offered, 0.0)
+
+    def load(self, name: str, *, deaths: int = 0, session: bytes = b"c", now: float = 0.0) -> int:
+        self.tasks += 1
+        return self.book.grant(Task(session, 0, self.tasks, deaths=deaths), name.encode(), now)
+
+    def next(self, *, keep_one_empty: bool = False, other_than: bytes | None = None) -> bytes | None:
+        return self.workers.for_ordinary_task(keep_one_empty=keep_one_empty, other_than=other_than)
+
+
+def test_who_holds_least_is_next_until_nobody_has_room() -> None:
+    table = Table(a=2, b=1, c=2)
+    taken = []
+    while (name := table.next()) is not None:
+        taken.append(name.decode())
+        table.load(taken[-1])
+    assert taken == ["a", "b", "c", "a", "c"]
+
+
+def test_credit_is_at_least_one_and_limited() -> None:
+    table = Table(none=0, much=2**64 - 1)
+    for name, room in (("none", 1), ("much", MOST_WORKER_CREDIT)):
+        for _ in range(room):
+            assert name.encode() in (table.next(), table.next(other_than=b"none"), table.next(other_than=b"much"))
+            table.load(name)
+    assert table.next() is None
+
+
+def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
+    table = Table()
+    assert (len(table.workers), table.next(), table.workers.for_lone_task()) == (0, None, None)
+    table.workers.add(b"a", 1, 0.0)
+    assert (len(table.workers), b"a" in table.workers, table.workers.identities()) == (1, True, [b"a"])
+    table.workers.remove(b"a")
+    table.workers.remove(b"a")
+    assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)
+    assert not table.workers.heard(b"a", 0.0)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(
+                ("load", "load", "finish", "add", "remove", "load alone", "leave", "give up", "rest", "wake")
+            ),
+            st.integers(0, 3),
+            st.integers(0, 3),
+        ),
+        min_size=20,
+        max_size=100,
+    )
+)
+@settings(max_examples=300)
+def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int, int]]) -> None:
+    """The table looks only at workers whose load has changed: none is ever forgotten, nor kept in mind twice."""
+    table, out = Table(), []
+    for number in range(4):
+        table.workers.add(f"w{number}".encode(), 1 + number, 0.0)
+    for what, which, how in moves:
+        name, session = f"w{which}", b"cd"[how % 2 :][:1]
+        identity = name.encode()
+        if what == "add" and identity not in table.workers:
+            table.workers.add(identity, 1 + how, 0.0)
+        elif what == "remove":
+            table.workers.remove(identity)
+            table.book.lost(identity)
+        elif what in ("load", "load alone") and identity in table.workers and not lonely(table, identity):
+            out.append((table.load(name, deaths=ALONE_AFTER * (what == "load alone"), session=session), identity))
+        elif what == "finish" and out:
+            table.book.finished(*out.pop(which % len(out)), 0.0)
+        elif what == "leave":
+            table.book.forget_session(session)
+        elif what == "give up":
+            table.workers.hanging(DEADLINE * 10)
+        elif what == "rest":
+            table.workers.rest(identity, float(how))
+        elif what == "wake":
+            table.workers.wake(how + REST_SECONDS)
+        resting = table.workers._resting
+        expected = sorted(
+            (table.book.held_by(identity), identity)
+            for identity, worker in table.workers._workers.items()
+            if not worker.given_up
+            and identity not in resting
+            and table.book.held_by(identity) < worker.credit
+            and not lonely(table, identity)
+        )
+        assert table.workers._lightest(99) == expected
+        names = [identity for _, identity in expected]
+        assert table.workers.for_lone_task() == next((name for held, name in expected if not held), None)
+        for kept in (False, True):
+            assert table.next(keep_one_empty=kept) == next(iter(names[kept:]), None)
+            others = [name for name in names[kept:] if name != identity]
+            assert table.next(keep_one_empty=kept, other_than=identity) == next(iter(others), None)
+    assert len(table.workers._heap) <= 4 * 5
+
+
+def test_those_who_came_and_went_are_not_kept_in_mind() -> None:
+    """Behind some who are always there, and first in the order."""
+    table = Table(**{f"a{number}": 2 for number in range(3)})
+    for number in range(2000):
+        name = f"b{number}".encode()
+        table.workers.add(name, 2, 0.0)
+        assert table.next() == b"a0"
+        table.workers.remove(name)
+    assert table.next() == b"a0"
+    assert len(table.workers._heap) == len(table.workers._in_heap) < 100
+
+
+def lonely(table: Table, identity: bytes) -> bool:
+    return any(runs_alone(task) for task in table.book.tasks_of(identity))
+
+
+# --- tasks that run alone ---------------------------------------------------------------------------------------------
+
+
+def test_a_lone_task_needs_a_worker_that_holds_nothing() -> None:
+    table = Table(a=2, b=2)
+    numbers = [table.load(name) for name in ("a", "b")]
+    assert table.workers.for_lone_task() is None
+    # Not even a lease whose consumer is gone: the worker still has to get through it.
+    table.book.forget_session(b"c")
+    assert table.workers.for_lone_task() is None
+    table.book.finished(numbers[1], b"b", 1.0)
+    assert table.workers.for_lone_task() == b"b"
+
+
+def test_a_worker_at_a_lone_task_gets_nothing_else() -> None:
+    table = Table(a=8)
+    number = table.load("a", deaths=ALONE_AFTER)
+    assert (table.next(), table.workers.for_lone_task()) == (None, None)
+    table.book.finished(number, b"a", 1.0)
+    assert (table.next(), table.workers.for_lone_task()) == (b"a", b"a")
+    table.load("a", deaths=ALONE_AFTER - 1)
+    assert table.next() == b"a"
+
+
+def test_while_a_lone_task_waits_one_worker_works_itself_empty_and_the_others_go_on() -> None:
+    """Busy as they may be kept, whoever holds least is not refilled: it is empty in the end."""
+    table = Table(a=2, b=2)
+    held: dict[str, list[int]] = {name: [table.load(name), table.load(name)] for name in "ab"}
+    served = 0
+    for turn in range(20):
+        name = "ab"[turn % 2]
+        if held[name]:
+            table.book.finished(held[name].pop(0), name.encode(), 0.0)
+            served += 1
+        if table.workers.for_lone_task() is not None:
+            break
+        while (free := table.next(keep_one_empty=True)) is not None:
+            held[free.decode()].append(table.load(free.decode()))
+    assert table.workers.for_lone_task() is not None
+    assert served <= 4
+
+
+def test_a_single_worker_is_kept_for_the_lone_task() -> None:
+    table = Table(a=2)
+    number = table.load("a")
+    assert (table.next(keep_one_empty=False), table.next(keep_one_empty=True)) == (b"a", None)
+    table.book.finished(number, b"a", 0.0)
+    assert table.workers.for_lone_task() == b"a"
+
+
+# --- twins ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_twin_goes_to_somebody_else_with_room() -> None:
+    table = Table(a=2, b=2)
+    table.load("b")
+    assert table.next(other_than=b"a") == b"b"
+    assert table.next(other_than=b"b") == b"a"
+    # Nor does a twin take the worker that a lone task waits for.
+    assert table.next(other_than=b"b", keep_one_empty=True) is None
+    table.load("b")
+    assert table.next(other_than=b"a") is None
+
+
+def test_nobody_is_added_to_a_lone_task_as_a_twin() -> None:
+    table = Table(a=2, b=2)
+    table.load("b", deaths=ALONE_AFTER)
+    assert table.next(other_than=b"a") is None
+
+
+# --- those whose storage fails ----------------------------------------------------------------------------------------
+
+
+def test_who_rests_gets_nothing_until_it_wakes() -> None:
+    table = Table(a=2, b=2)
+    table.workers.rest(b"a", 5.0)
+    table.workers.rest(b"stranger", 5.0)
+    assert (table.next(), table.next(other_than=b"b"), table.workers.for_lone_task()) == (b"b", None, b"b")
+    table.workers.wake(5.0 + REST_SECONDS - 0.1)
+    assert table.next(other_than=b"b") is None
+    table.workers.wake(5.0 + REST_SECONDS)
+    assert table.next() == b"a"
+    # Another process of that name has not failed.
+    table.workers.rest(b"a", 20.0)
+    table.workers.remove(b"a")
+    table.workers.add(b"a", 2, 20.0)
+    assert table.next() == b"a"
+
+
+# --- the hopeless -----------------------------------------------------------------------------------------------------
+
+
+def test_a_hanging_worker_is_reported_once_and_gets_nothing_more() -> None:
+    table = Table(a=4, b=4)
+    table.load("a")
+    table.load("a")
+    table.load("b", now=10.0)
+    assert table.workers.hanging(DEADLINE) == []
+    assert table.workers.hanging(DEADLINE + 0.1) == [b"a"]
+    assert table.workers.hanging(DEADLINE + 0.2) == []
+    assert table.next(other_than=b"b") is None
+    assert table.workers.hanging(DEADLINE + 10.1) == [b"b"]
+    # It said hello again: another process, from the beginning.
+    table.workers.remove(b"a")
+    table.book.lost(b"a")
+    table.workers.add(b"a", 4, 100.0)
+    assert table.next() == b"a"
+    table.load("a", now=100.0)
+    assert table.workers.hanging(100.1 + DEADLINE) == [b"a"]
+
+
+def test_leases_of_somebody_who_never_said_hello_are_nobodys_fault() -> None:
+    table = Table(a=1)
+    table.load("stranger")
+    assert table.workers.hanging(1000.0) == []
+
+
+def test_the_silent_have_vanished_unless_they_are_at_work() -> None:
+    table = Table(a=1, b=1, c=1)
+    number = table.load("b")
+    assert table.workers.heard(b"c", 1.0)
+    assert table.workers.vanished(SILENCE_SECONDS) == []
+    assert table.workers.vanished(SILENCE_SECONDS + 0.5) == [b"a"]
+    assert table.workers.vanished(SILENCE_SECONDS + 0.6) == []
+    assert table.workers.vanished(SILENCE_SECONDS + 1.5) == [b"c"]
+    assert table.workers.for_lone_task() is None
+    table.book.finished(number, b"b", 40.0)
+    assert table.workers.heard(b"b", 40.0)
+    assert table.workers.vanished(40.0 + SILENCE_SECONDS) == []
+    assert table.workers.vanished(40.5 + SILENCE_SECONDS) == [b"b"]

@@ -1,0 +1,430 @@
+"""The catalogue: stable names, incremental probing, and files that misbehave."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pwd
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, truncated, write_clip
+from tests.server.catalogue.failing_storage import failing_opens
+from tests.server.video.lethal_reads import always_killed, killed_once, lethal, waiting
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_server.catalogue import catalogue as catalogue_module
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.refresh import index_path
+from v2v_server.catalogue.survey import survey
+from v2v_server.store.manifest import MANIFEST_NAME
+from v2v_server.video.fingerprint import check_fingerprint, fingerprint
+from v2v_server.video.rows import Rows
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("sample") / "clip.mp4", panned_luma(30), b_frames=2)
+
+
+@pytest.fixture
+def corpus(tmp_path: Path, sample: Path) -> Path:
+    for name in ("a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"):
+        target = tmp_path / "corpus" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(sample, target)
+    return tmp_path / "corpus"
+
+
+class Opener:
+    """Opens catalogues with one cache, closes them in the end, and counts the files probed."""
+
+    def __init__(self, cache: Path) -> None:
+        self.cache = cache
+        self.probed: list[int] = []
+        self.opened: list[Catalogue] = []
+
+    def __call__(self, source: Path, **more: object) -> Catalogue:
+        steps: list[tuple[int, int]] = []
+        settings = {"cache_dir": self.cache, "processes": 0, "progress": lambda *step: steps.append(step)} | more
+        catalogue = open_catalogue(source, **settings)  # type: ignore[arg-type]
+        assert [done for done, _ in steps] == list(range(1, len(steps) + 1))
+        assert {total for _, total in steps} <= {len(steps)}
+        self.probed.append(len(steps))
+        self.opened.append(catalogue)
+        return catalogue
+
+
+@pytest.fixture
+def opener(tmp_path: Path):  # type: ignore[no-untyped-def]
+    opener = Opener(tmp_path / "cache")
+    yield opener
+    for catalogue in opener.opened:
+        catalogue.close()
+
+
+def ids(catalogue: Catalogue) -> list[str]:
+    return [video.id for video in catalogue.videos]
+
+
+def test_a_folder(corpus: Path, opener: Opener) -> None:
+    (corpus / ".hidden.mp4").write_bytes(b"x")
+    (corpus / ".cache").mkdir()
+    shutil.copy(corpus / "a.mp4", corpus / ".cache" / "d.mp4")
+    (corpus / "notes.md").write_text("x")
+    (corpus / "sub" / "loop").symlink_to(corpus)
+    (corpus / "broken.mp4").symlink_to(corpus / "nowhere.mp4")
+    catalogue = opener(corpus)
+    assert ids(catalogue) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
+    assert [problem.id for problem in catalogue.problems] == ["broken.mp4"]
+    video = catalogue.videos[0]
+    assert (video.frames, video.width_px, video.height_px, video.codec) == (30, 64, 48, "h264")
+    assert video.frames_per_second == pytest.approx(25)
+    assert video.fingerprint == fingerprint(corpus / "a.mp4")
+    assert catalogue.path("sub/b.mp4") == (corpus / "sub/b.mp4").resolve()
+    np.testing.assert_array_equal(catalogue.frame_index("a.mp4").seconds(0, 30), np.arange(30) / 25)
+    assert catalogue.notes == ()
+
+
+def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> None:
+    (corpus / "circle.mp4").symlink_to(corpus / "circle.mp4")
+    catalogue = opener(corpus)
+    assert len(ids(catalogue)) == 3
+    assert [(problem.id, problem.reason) for problem in catalogue.problems] == [
+        ("circle.mp4", "cannot be looked at: Too many levels of symbolic links")
+    ]
+
+
+def denied_at(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Permission is denied to look at this path alone."""
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if os.fspath(path) == str(place):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(os, "stat", denied)
+
+
+def test_an_index_keeps_what_cannot_be_looked_at_today(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = opener(corpus)
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if "sub" in os.fspath(path):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", denied)
+        locked = opener(corpus)
+    assert ids(locked) == ["a.mp4"]
+    assert [problem.id for problem in locked.problems] == ["sub"]
+    assert locked.notes == ()
+    again = opener(corpus)
+    assert again.digest == first.digest
+    assert opener.probed == [3, 0, 0]
+
+
+@pytest.mark.parametrize("where", ["", MANIFEST_NAME])
+def test_a_corpus_that_cannot_be_looked_at_is_one_line(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    denied_at(corpus / where, monkeypatch)
+    with pytest.raises(CorpusError, match=rf"^{corpus}: cannot be looked at: Permission denied$"):
+        opener(corpus)
+
+
+def test_a_folder_that_may_be_listed_but_not_entered_keeps_nobody_out(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denied_at(corpus / "sub" / MANIFEST_NAME, monkeypatch)
+    assert len(opener(corpus).videos) == 3
+
+
+def test_storage_that_fails_for_a_moment_costs_nothing(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = failing_opens(monkeypatch, a=1)
+    assert ids(opener(corpus)) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
+    assert left == {"a": 0}
+
+
+def test_storage_that_fails_at_one_start_is_asked_again_at_the_next(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = opener(corpus, cache_dir=corpus.parent / "other").digest
+    left = failing_opens(monkeypatch, a=2)
+    first = opener(corpus)
+    assert [(problem.id, problem.reason) for problem in first.problems] == [
+        ("a.mp4", "cannot be opened: Input/output error")
+    ]
+    assert left == {"a": 0}
+    assert opener(corpus).digest == whole
+    assert opener.probed == [3, 3, 1]
+
+
+def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener) -> None:
+    first = opener(corpus)
+    again = opener(corpus)
+    assert again.digest == first.digest
+    assert again.videos == first.videos
+    write_clip(corpus / "a.mp4", panned_luma(12))
+    changed = opener(corpus)
+    (corpus / "sub" / "b.mp4").unlink()
+    shutil.copy(corpus / "a.mp4", corpus / "new.mp4")
+    moved = opener(corpus)
+    assert opener.probed == [3, 0, 1, 1]
+    assert [video.frames for video in changed.videos] == [12, 30, 30]
+    assert ids(moved) == ["a.mp4", "new.mp4", "sub/deep/c with space.MP4"]
+    assert len({first.digest, changed.digest, moved.digest}) == 3
+    with pytest.raises(VideoChanged, match="catalogued anew"):
+        first.frame_index("a.mp4")
+    with pytest.raises(CorpusError, match="no video of this catalogue"):
+        moved.frame_index("sub/b.mp4")
+
+
+def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    """On storage elsewhere a look takes a while too, and there may be a million files."""
+    notices: list[str] = []
+    opener(corpus)
+    write_clip(corpus / "a.mp4", panned_luma(12))
+    opener(corpus, notice=notices.append)
+    assert notices == [
+        *(f"looking for videos: {done} so far" for done in (1, 2, 3)),
+        *(f"looking at files: {done} of 3, 1 of them new or changed" for done in (1, 2, 3)),
+    ]
+    notices.clear()
+    listed = tmp_path / "list.txt"
+    listed.write_text("a.mp4\n")
+    opener(corpus, list_file=listed, notice=notices.append)
+    assert notices == [
+        "looking at the list's files: 1 of 1",
+        "looking at files: 1 of 1, 0 of them new or changed",
+        *(f"looking for files that are gone: {done} of 2 that this corpus does not name" for done in (1, 2)),
+    ]
+    assert opener.probed == [3, 1, 0]
+
+
+def test_the_digest_knows_rows_and_thresholds_but_not_the_place(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    plain = opener(corpus)
+    assert opener(corpus, rows=Rows.parse("top:0.54")).digest != plain.digest
+    shutil.copytree(corpus, tmp_path / "elsewhere")
+    assert opener(tmp_path / "elsewhere").digest == plain.digest
+    listed = tmp_path / "list.txt"
+    listed.write_text("".join(f"{id} 30 0.2 0.3\n" for id in ids(plain)))
+    assert opener(corpus, list_file=listed).digest != plain.digest
+
+
+def test_what_a_list_names_is_not_opened_unless_it_is_a_file(corpus: Path, opener: Opener) -> None:
+    """A named pipe would be waited for until somebody writes into it."""
+    os.mkfifo(corpus / "pipe.mp4")
+    (corpus / "endless.mp4").symlink_to("/dev/zero")
+    (corpus / "folder.mp4").mkdir()
+    listed = corpus / "list.txt"
+    listed.write_text("pipe.mp4\nendless.mp4\nfolder.mp4\na.mp4\ngone.mp4\n")
+    catalogue = opener(listed)
+    assert ids(catalogue) == ["a.mp4"]
+    reasons = {problem.id: problem.reason for problem in catalogue.problems}
+    assert reasons.pop("gone.mp4").startswith("cannot be read: No such file")
+    assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is no regular file")
+    listed.write_text("pipe.mp4\n")
+    with pytest.raises(CorpusError, match=r"no video found.*pipe\.mp4: is no regular file"):
+        opener(listed)
+
+
+def test_lists(corpus: Path, opener: Opener) -> None:
+    listed = corpus / "list.txt"
+    listed.write_text("sub/b.mp4 99 0.2 0.3\na.mp4\ngone.mp4 5\n")
+    by_source, by_option = opener(listed), opener(corpus, list_file=listed)
+    assert by_source.digest == by_option.digest
+    assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
+    assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
+    assert [problem.id for problem in by_source.problems] == ["gone.mp4"]
+    assert by_source.notes == ("1 videos are shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
+    # The part that the list leaves out stays in the index.
+    opener(corpus)
+    opener(listed)
+    assert opener.probed == [3, 1, 1, 1]
+
+
+def test_a_single_video(corpus: Path, opener: Opener) -> None:
+    catalogue = opener(corpus / "a.mp4")
+    assert (ids(catalogue), catalogue.root) == (["a.mp4"], corpus.resolve())
+
+
+def test_files_that_do_not_open(corpus: Path, opener: Opener, sample: Path) -> None:
+    (corpus / "empty.mp4").write_bytes(b"")
+    (corpus / "noise.avi").write_bytes(np.random.default_rng(0).bytes(5000))
+    truncated(sample, corpus / "no_moov.mp4", 0.5)
+    catalogue = opener(corpus)
+    assert len(catalogue.videos) == 3
+    reasons = {problem.id: problem.reason for problem in catalogue.problems}
+    assert set(reasons) == {"empty.mp4", "noise.avi", "no_moov.mp4"}
+    assert all("Invalid data" in reason for reason in reasons.values())
+    opener(corpus)
+    assert opener.probed == [6, 0]
+
+
+def test_nothing_to_serve(tmp_path: Path, opener: Opener) -> None:
+    with pytest.raises(CorpusError, match="there is no such folder"):
+        opener(tmp_path / "missing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CorpusError, match=r"no video found; looked for .*mp4"):
+        opener(tmp_path / "empty")
+    (tmp_path / "empty" / "bad.mp4").write_bytes(b"x")
+    with pytest.raises(CorpusError, match="none of 1 videos can be used"):
+        opener(tmp_path / "empty")
+    with pytest.raises(CorpusError, match="not a folder"):
+        opener(tmp_path / "empty" / "bad.mp4", list_file=tmp_path / "list.txt")
+
+
+@pytest.mark.parametrize("content", [b"this is no database at all" * 100, None])
+def test_an_index_that_cannot_be_used(corpus: Path, opener: Opener, content: bytes | None) -> None:
+    good = opener(corpus)
+    path = next(opener.cache.iterdir())
+    path.unlink()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    catalogue = opener(corpus)
+    assert catalogue.digest == good.digest
+    assert str(path) in catalogue.notes[0]
+    assert len(catalogue.frame_index("a.mp4")) == 30
+
+
+def test_a_full_disk(corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch) -> None:
+    connect = sqlite3.connect
+
+    def small(path: object, **more: object) -> sqlite3.Connection:
+        database = connect(path, **more)  # type: ignore[call-overload]
+        if path != ":memory:":
+            database.execute("PRAGMA max_page_count = 3")
+        return database  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(sqlite3, "connect", small)
+    for number in range(60):
+        shutil.copy(corpus / "a.mp4", corpus / f"{'long name ' * 15}{number}.mp4")
+    catalogue = opener(corpus, progress=None)
+    assert len(catalogue.videos) == 63
+    assert "full" in catalogue.notes[0]
+
+
+def test_an_index_of_another_version_is_made_anew(corpus: Path, opener: Opener) -> None:
+    opener(corpus).close()
+    path = next(opener.cache.iterdir())
+    database = sqlite3.connect(path)
+    database.execute("ALTER TABLE video RENAME COLUMN codec TO old")
+    database.execute("PRAGMA user_version = 999")
+    database.commit()
+    database.close()
+    assert opener(corpus).notes == ()
+    assert opener(corpus).notes == ()
+    assert opener.probed == [3, 3, 0]
+
+
+def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("V2V_CACHE_DIR", raising=False)
+    opener(corpus, cache_dir=None)
+    assert len(list((tmp_path / "xdg" / "v2v").iterdir())) == 1
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "chosen"))
+    opener(corpus, cache_dir=None)
+    assert len(list((tmp_path / "chosen").iterdir())) == 1
+
+
+def test_a_user_without_a_home_is_told_where_to_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("V2V_CACHE_DIR", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(user: int) -> None:
+        raise KeyError(user)
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    with pytest.raises(CorpusError, match=r"no home folder .* --cache-dir or V2V_CACHE_DIR"):
+        index_path(tmp_path, None)
+    assert index_path(tmp_path, tmp_path).parent == tmp_path
+
+
+def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
+    shutil.copy(corpus / "a.mp4", corpus / "lethal.mp4")
+    names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
+    records = {record.id: record for record in survey(corpus, names, 2, lethal)}
+    assert set(records) == set(names)
+    assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
+    assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
+    assert [records[id].frames for id in ("a.mp4", "sub/b.mp4")] == [30, 30]
+
+
+def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
+    names = ["a.mp4", "sub/b.mp4"]
+    assert {record.id: record.problem for record in survey(corpus, names, 2, killed_once)} == dict.fromkeys(names)
+    (record,) = survey(corpus, ["a.mp4"], 2, always_killed)
+    assert "from outside or for want of memory (signal SIGKILL)" in (record.problem or "")
+    assert record.size_bytes == -1  # which no file has: the next start tries again
+
+
+@pytest.mark.slow
+def test_a_file_that_is_waited_for_in_vain_costs_only_itself(corpus: Path) -> None:
+    names = ["a.mp4", "waiting.mp4", "sub/b.mp4"]
+    records = {record.id: record for record in survey(corpus, names, 2, waiting, longest_seconds=10.0)}
+    assert [id for id, record in records.items() if record.problem is not None] == ["waiting.mp4"]
+    assert records["waiting.mp4"].size_bytes == -1  # to be tried again
+    assert "ended after 10 s without a result; the next start" in str(records["waiting.mp4"].problem)
+
+
+def test_fingerprints(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    content = bytearray(np.random.default_rng(1).bytes(300_000))
+    seen = set()
+    for position in (None, 0, 65_535, 234_465, 299_999):
+        changed = bytearray(content)
+        if position is not None:
+            changed[position] ^= 1
+        path.write_bytes(changed)
+        seen.add(fingerprint(path))
+    assert len(seen) == 5
+    check_fingerprint(path, fingerprint(path))
+    path.write_bytes(content[:-1])
+    with pytest.raises(VideoChanged, match="299999-"):
+        check_fingerprint(path, max(seen))
+    path.unlink()
+    with pytest.raises(VideoError, match="cannot be read: No such file"):
+        check_fingerprint(path, max(seen))
+
+
+def test_a_small_index_is_handed_on_as_it_is_stored(tmp_path: Path) -> None:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        whole = catalogue.frame_index("a.mp4").to_bytes()
+        assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
+
+
+def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        first = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert catalogue.frame_index_bytes("a.mp4", 0, 20) is first
+        for start in range(1, 100):
+            expected = catalogue.frame_index("a.mp4").slice(start, 20).to_bytes()
+            assert catalogue.frame_index_bytes("a.mp4", start, 20) == expected
+        again = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert again == first
+        assert again is not first
+        with pytest.raises(UsageError, match="asked of an index"):
+            catalogue.frame_index_bytes("a.mp4", 110, 20)

@@ -1,0 +1,153 @@
+"""What a person reads: the summary, the live line, and the rates behind it."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
+from tests.server.peers import peers
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.counters import Counters, Rate
+from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_server.console.status import StatusLine, summary
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+
+
+def lines(catalogue: Catalogue, spec: StreamSpec = SMALL_SPEC) -> list[str]:
+    return summary(catalogue, spec, SequenceTable(catalogue.videos, catalogue.rows, spec))
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+# --- summary ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_corpus_without_trouble_is_one_line() -> None:
+    assert lines(corpus(video("a.mp4"), video("b.mp4", frames=9), rows="top:0.75")) == [
+        "2 videos in /corpus: 2 give 12 sequences of 5 frames (at most 10 a video), rows top:0.75"
+    ]
+
+
+def test_rejections_name_reason_and_remedy() -> None:
+    said = lines(corpus(video("a.mp4"), video("short.mp4", frames=4), video("small.mp4", height_px=5)))
+    assert said[0].startswith("3 videos in /corpus: 1 give 10 sequences")
+    assert said[1:] == [
+        "2 videos give none under the server's own recipe:",
+        "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1",
+        "  small.mp4: picture 16x5 after rows full, the crop is 8x8; "
+        "would admit it: resize_scale up to 1.6, or a smaller crop",
+        "  with --set voxels_per_clip=N (now the longest that fits is 1): 1 admits 1 of them",
+    ]
+
+
+def test_many_rejections_are_counted_and_a_length_of_clip_named_that_admits_them() -> None:
+    lengths = (15, 11, 11, 8, 8, 8, 6)  # SMALL spends two bins of one frame on a voxel grid
+    shorts: list[VideoEntry] = [video(f"s{number}.mp4", frames) for number, frames in enumerate(lengths)]
+    spec = replace(SMALL_SPEC, recipe=replace(SMALL, voxels_per_clip=10))
+    said = lines(corpus(*shorts, video("still.mp4", frames=1), video("good.mp4")), spec)
+    assert said[1] == "8 videos give none under the server's own recipe:"
+    assert said[-2] == "  ... and 3 more"
+    assert len(said) == 2 + 5 + 2
+    # The middle one of those seven has room for three voxel grids, and all of them for two.
+    assert said[-1] == "  with --set voxels_per_clip=N (now the longest that fits is 7): 3 admits 6, 2 admits 7 of them"
+
+
+def test_files_that_cannot_be_used_are_named() -> None:
+    problems = tuple(Problem(f"p{number}.mp4", "has no video track") for number in range(7))
+    named = NamedCorpus((video("a.mp4"),), Rows(), problems, Path("/elsewhere"))
+    said = lines(named)  # type: ignore[arg-type]
+    assert said[0].startswith("1 videos in /elsewhere: 1 give 10 sequences")
+    assert said[1:] == [
+        "7 files cannot be used at all:",
+        *(f"  p{number}.mp4: has no video track" for number in range(5)),
+        "  ... and 2 more",
+    ]
+
+
+# --- the live line ----------------------------------------------------------------------------------------------------
+
+
+def test_the_line_counts_what_happened() -> None:
+    at = peers()
+    out = io.StringIO()
+    line = StatusLine(out)
+    line.update(100.0, at.dispatcher, running=2)
+    at.join()
+    at.hello(batch_size=2)
+    at.want(0, 1, 2, 3)
+    at.finish()
+    at.finish()
+    line.update(105.0, at.dispatcher, running=2)
+    assert len(out.getvalue().splitlines()) == 1
+    line.update(110.0, at.dispatcher, running=2)
+    first, second = out.getvalue().splitlines()
+    assert first == "0.00 batches/s  0.0 samples/s  workers 0/2  consumers 0  queue 0  faults 0  total 0 samples"
+    assert second == "0.10 batches/s  0.2 samples/s  workers 1/2  consumers 1  queue 0  faults 0  total 2 samples"
+    line.close()
+    assert out.getvalue().endswith("samples\n")
+    assert "\r" not in out.getvalue()
+
+
+def test_workers_from_other_hosts_are_counted_too() -> None:
+    at = peers()
+    for number in range(3):
+        at.join(b"remote%d" % number)
+    out = io.StringIO()
+    StatusLine(out).update(0.0, at.dispatcher, running=1)
+    assert "workers 3/3" in out.getvalue()
+
+
+def test_a_terminal_shows_one_line_that_leaves_no_rest_of_the_one_before() -> None:
+    at = peers()
+    out = Terminal()
+    line = StatusLine(out)
+    at.dispatcher.counters.samples = 123456
+    line.update(0.0, at.dispatcher, running=0)
+    at.dispatcher.counters.samples = 7
+    line.update(0.4, at.dispatcher, running=0)
+    line.update(0.6, at.dispatcher, running=0)
+    _, long, short = out.getvalue().split("\r")
+    assert len(long) <= len(short)
+    assert short.rstrip().endswith("total 7 samples")
+    line.close()
+    assert out.getvalue().endswith("\n")
+
+
+def test_closing_before_anything_was_shown_prints_nothing() -> None:
+    out = Terminal()
+    StatusLine(out).close()
+    assert out.getvalue() == ""
+
+
+# --- metrics ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_rate_looks_back_over_its_window() -> None:
+    rate = Rate(window_seconds=5.0)
+    assert rate.update(10.0, 100.0) == 0.0
+    assert rate.update(10.0, 100.0) == 0.0
+    assert rate.update(12.0, 104.0) == 2.0
+    assert rate.update(20.0, 104.0) == 0.0
+    assert rate.update(21.0, 134.0) == pytest.approx(30.0)
+
+
+def test_a_steady_rate_is_exact_and_costs_no_memory() -> None:
+    rate = Rate(window_seconds=5.0)
+    for second in range(100):
+        measured = rate.update(float(second), 3.0 * second)
+    assert measured == pytest.approx(3.0)
+    assert len(rate._points) <= 7
+
+
+def test_faults_are_all_that_went_wrong() -> None:
+    counters = Counters(samples=9, refused_candidates=1, unavailable=2, workers_lost=4, malformed=8, late_results=16)
+    assert counters.faults == 15
+    assert replace(counters, returned_leases=5).faults == 15

@@ -1,0 +1,82 @@
+"""The truth of the flow benchmark is true, and its records are what its bars are read from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from v2v_bench.accuracy import flow as benchmark
+from v2v_bench.accuracy.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
+from v2v_server.flow.validity import consistent
+
+TEXTURES = {name: photograph(name) for name in ("coffee", "camera", "chelsea")}
+
+
+@pytest.fixture(scope="module")
+def made() -> list[Scene]:
+    return scenes(TEXTURES, 100, 160)
+
+
+def brought(picture: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """``picture`` sampled where the field leads."""
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]].astype(np.float32)
+    return cv2.remap(picture, x + field[..., 0], y + field[..., 1], cv2.INTER_CUBIC)
+
+
+def test_every_combination_is_there(made: list[Scene]) -> None:
+    assert len({scene.name for scene in made}) == len(made) == 3 * len(KINDS) * len(DEGRADATIONS)
+    assert [scene.name for scene in scenes(TEXTURES, 100, 160, every=7)] == [scene.name for scene in made[::7]]
+
+
+def test_following_the_flow_finds_the_same_picture(made: list[Scene]) -> None:
+    for scene in made:
+        seen = consistent(scene.forward, scene.backward) & ~scene.boundary
+        assert seen.mean() > 0.4, scene.name
+        for field, source, target in (
+            (scene.forward, scene.later, scene.earlier),
+            (scene.backward, scene.earlier, scene.later),
+        ):
+            gap = np.abs(brought(source, field).astype(float) - target)
+            seen = consistent(field, scene.backward if field is scene.forward else scene.forward) & ~scene.boundary
+            # Rounding, and where there is noise, that of both pictures.
+            assert gap[seen].mean() < (3.5 if scene.degradation == "noise" else 1.5), scene.name
+
+
+def test_only_layers_have_motion_boundaries(made: list[Scene]) -> None:
+    for scene in made:
+        assert scene.boundary.any() == (scene.kind == "layers")
+
+
+def test_no_motion_exceeds_what_was_drawn(made: list[Scene]) -> None:
+    for scene in made:
+        length = np.hypot(scene.forward[..., 0], scene.forward[..., 1])
+        assert 0 < length.max() < 16.5
+
+
+def test_the_benchmark_runs_and_its_bars_can_be_missed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "flow.json"
+    assert benchmark.main(["--methods", "zero,auto", "--every", "23", "--json", str(out)]) == 0
+    assert "margin 64" in capsys.readouterr().out
+    records = json.loads(out.read_text())
+    error = {(item["method"], item["context"], item["picture"]): item["error_mean_px"] for item in records}
+    assert len(records) == 10
+    assert error["auto", "whole", "180x596"] < 0.5 * error["zero", "whole", "180x596"]
+    bad = [{**item, "pan_zoom_error_median_px": 0.25} for item in records]
+    assert len(benchmark.missed_bars(bad, 0.0)) == 1
+    assert len(benchmark.missed_bars(records, 0.5)) == 1
+    parts = {"decode the crop": 0.1, "decode the crop and its margin": 0.12, "view and simulation": 0.1}
+    costs = [{"measure": "cost", "part": part, "cpu_seconds_per_sample": value} for part, value in parts.items()]
+    costs.append({"measure": "cost", "part": "flow 20 auto", "cpu_seconds_per_sample": 0.18})
+    assert benchmark.cost_ratio(costs, 20, "auto") == pytest.approx(2.0)
+    assert len(benchmark.missed_bars(costs, 0.0)) == 1
+
+
+def test_wrong_arguments(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert benchmark.main(["--methods", "dis"]) == 2
+    assert benchmark.main(["--every", "0"]) == 2
+    assert benchmark.main(["--videos", str(tmp_path / "none")]) == 2
+    assert "no such folder" in capsys.readouterr().err

@@ -1,0 +1,429 @@
+"""Preparing a corpus: what the files hold, what the manifest says, what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import closing
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from tests.clips import damaged, panned_luma, write_clip
+from v2v_bench.tradeoff.prepare import DECODERS, MOST_FRAMES, SETTINGS, main
+from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.commands.prepare import main as prepare_main
+from v2v_server.prepare.encode import CODECS, Encoding, encode_luma, limited_table
+from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare.report import Report
+from v2v_server.prepare.transcode import HIGHEST_PSNR_DB
+from v2v_server.store.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.luma import range_table
+from v2v_server.video.probe import probe
+from v2v_server.video.rows import Rows
+
+H264 = Encoding("h264", 18, 12)
+CORRUPT = "dir/corrupt.mp4"
+
+
+def psnr_db(a: npt.NDArray[np.uint8], b: npt.NDArray[np.uint8]) -> float:
+    return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
+
+
+def whole(path: Path) -> npt.NDArray[np.uint8]:
+    facts = probe(path)
+    return decode_luma(path, facts.index, 0, facts.frames).frames
+
+
+def run(
+    source: Path,
+    target: Path,
+    encoding: Encoding = H264,
+    rows: str = "full",
+    list_file: Path | None = None,
+    **more: object,
+) -> Report:
+    catalogue = open_catalogue(
+        source, list_file=list_file, rows=Rows.parse(rows), cache_dir=source.parent / "cache", processes=0
+    )
+    with closing(catalogue):
+        return prepare(catalogue, target, encoding, **({"processes": 0} | more))  # type: ignore[arg-type]
+
+
+def opened(folder: Path, rows: str | None = None, list_file: Path | None = None) -> Catalogue:
+    """A catalogue of a folder, closed: what it knows stays."""
+    parsed = None if rows is None else Rows.parse(rows)
+    catalogue = open_catalogue(folder, rows=parsed, list_file=list_file, cache_dir=folder.parent / "cache", processes=0)
+    catalogue.close()
+    return catalogue
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five clips of 64 px width: plain, odd size in AVI, rotated with varying rate, full range, and a damaged one."""
+    folder = tmp_path_factory.mktemp("corpus") / "source"
+    (folder / "dir").mkdir(parents=True)
+    write_clip(folder / "b.mp4", panned_luma(40, 50, 64), b_frames=2)
+    write_clip(
+        folder / "dir" / "odd.avi", panned_luma(33, 49, 63), codec="mjpeg", pixel_format="yuvj420p", full_range=True
+    )
+    stamps = (np.arange(30) * 33 + np.arange(30) % 4 * 3 + 500).tolist()
+    write_clip(folder / "a turned.mov", panned_luma(30, 64, 48), pts=stamps, rotation_degrees=90)
+    write_clip(folder / "dir" / "pc.mkv", panned_luma(25, 48, 64), full_range=True, pixel_format="yuvj420p")
+    write_clip(folder.parent / "whole.mp4", panned_luma(30), gop=30)
+    damaged(folder.parent / "whole.mp4", folder / CORRUPT, 12)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prepared(source: Path) -> tuple[Path, Report]:
+    target = source.parent / "prepared"
+    return target, run(source, target, rows="top:0.54")
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(p.relative_to(folder)): (p.stat().st_mtime_ns, p.stat().st_ino, p.read_bytes()) for p in files}
+
+
+def test_files_hold_the_rows_of_the_source(source: Path, prepared: tuple[Path, Report]) -> None:
+    target, report = prepared
+    assert [video.id for video in report.prepared] == ["a turned.mov", "b.mp4", "dir/odd.avi", "dir/pc.mkv"]
+    for video in report.prepared:
+        before, after = probe(source / video.id), probe(target / video.id)
+        rows = int(before.height_px * 0.54)
+        assert (after.codec, after.full_range, after.rotation_degrees) == ("h264", True, 0)
+        assert (after.frames, after.height_px, after.width_px) == (before.frames, rows, before.width_px)
+        np.testing.assert_array_equal(
+            after.index.seconds(0, after.frames), before.index.seconds(0, before.frames), strict=True
+        )
+        assert max(np.diff(after.index.keyframes, append=after.frames)) <= H264.gop
+        wanted = whole(source / video.id)[:, :rows]
+        achieved = psnr_db(whole(target / video.id), wanted)
+        assert achieved > 38
+        assert video.psnr_db == pytest.approx(achieved)
+        assert video.worst_psnr_db is not None
+        assert video.worst_psnr_db <= achieved
+
+
+def test_the_manifest(source: Path, prepared: tuple[Path, Report]) -> None:
+    target, report = prepared
+    manifest = read_manifest(target)
+    header = manifest.header
+    assert (header.rows, header.codec, header.quality, header.gop, header.videos) == ("top:0.54", "h264", 18, 12, 5)
+    assert header.source_digest == opened(source, "top:0.54").digest
+    assert manifest.videos == {video.id: video for video in report.videos}
+    for video in report.prepared:
+        assert video.source_fingerprint == fingerprint(source / video.id)
+        assert video.fingerprint == fingerprint(target / video.id)
+        assert (video.source_bytes, video.bytes) == (
+            (source / video.id).stat().st_size,
+            (target / video.id).stat().st_size,
+        )
+    assert report.prepared_bytes == sum(video.bytes for video in report.prepared)
+
+
+def test_a_corrupt_source_is_listed_and_the_others_go_on(prepared: tuple[Path, Report]) -> None:
+    target, report = prepared
+    (failed,) = report.failed
+    assert failed.id == CORRUPT
+    assert "frame" in str(failed.problem)
+    assert not report.complete
+    assert not (target / CORRUPT).exists()
+    assert not [path for path in target.rglob("*") if "partial" in path.name]
+
+
+def test_the_source_is_not_touched(source: Path, tmp_path: Path) -> None:
+    before = snapshot(source)
+    run(source, tmp_path / "again")
+    assert snapshot(source) == before
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_black_stays_black_and_white_white(codec: str, tmp_path: Path) -> None:
+    """In every codec, from a source of either range: grey is stretched once, neither twice nor never."""
+    shown = np.zeros((6, 48, 64), np.uint8)
+    shown[:, :, 16:32], shown[:, :, 32:48], shown[:, :, 48:] = 255, 128, 64
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "pc.mp4", shown, full_range=True, pixel_format="yuvj420p", options={"crf": "5"})
+    write_clip(tmp_path / "source" / "tv.mp4", limited_table()[shown], options={"crf": "5"})
+    report = run(tmp_path / "source", tmp_path / "out", Encoding(codec, 2, 3))
+    assert report.complete
+    for name in ("pc.mp4", "tv.mp4"):
+        bars = whole(tmp_path / "out" / name).reshape(6, 48, 4, 16)[..., 4:12].mean(axis=(0, 1, 3))
+        np.testing.assert_allclose(bars, (0, 255, 128, 64), atol=1)
+
+
+def test_limited_range_loses_nothing_of_a_limited_source() -> None:
+    shown = range_table(8, False)
+    np.testing.assert_array_equal(range_table(8, False)[limited_table()[shown]], shown)
+    grey = np.arange(256)
+    assert np.abs(range_table(8, False)[limited_table()].astype(int) - grey).max() == 1
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_odd_sizes_and_odd_time_stamps_in_every_codec(codec: str, tmp_path: Path) -> None:
+    luma = panned_luma(20, 35, 51)
+    pts = [1_000_003 + 1001 * n + n % 3 for n in range(20)]
+    encode_luma(
+        tmp_path / "clip.webm", luma, Encoding(codec, 2, 8), height=35, width=51, pts=pts, time_base=Fraction(1, 90_000)
+    )
+    index = probe(tmp_path / "clip.webm").index
+    assert (index.height_px, index.width_px, len(index)) == (35, 51, 20)
+    assert [Fraction(*index.time_base) * int(stamp) for stamp in index.pts] == [Fraction(p, 90_000) for p in pts]
+    assert psnr_db(decode_luma(tmp_path / "clip.webm", index, 0, 20).frames, luma) > 38
+    late = decode_luma(tmp_path / "clip.webm", index.slice(13, 4), 13, 4).frames
+    np.testing.assert_array_equal(late, decode_luma(tmp_path / "clip.webm", index, 0, 20).frames[13:17])
+
+
+def test_untimed_frames_get_the_average_rate(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "raw.h264", panned_luma(20), rate=50, b_frames=2)
+    assert not probe(tmp_path / "source" / "raw.h264").index.seekable
+    report = run(tmp_path / "source", tmp_path / "out")
+    assert report.complete
+    index = probe(tmp_path / "out" / "raw.h264").index
+    np.testing.assert_allclose(
+        np.diff(index.seconds(0, 20)), 1 / probe(tmp_path / "source" / "raw.h264").frames_per_second
+    )
+
+
+def test_a_lossless_result_has_the_stated_psnr(tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "flat.mp4", np.full((8, 48, 64), 126, np.uint8))
+    (video,) = run(tmp_path / "source", tmp_path / "out").videos
+    assert video.psnr_db == HIGHEST_PSNR_DB
+
+
+def test_the_floor(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "source").mkdir()
+    shutil.copy(source / "b.mp4", tmp_path / "source")
+    poor = run(tmp_path / "source", tmp_path / "out", Encoding("h264", 45, 12))
+    (video,) = poor.below_floor
+    assert video.psnr_db is not None
+    assert video.psnr_db < poor.floor_db
+    assert not poor.complete
+    again = run(tmp_path / "source", tmp_path / "out", Encoding("h264", 45, 12), floor_db=1.0)
+    assert (again.kept, again.complete) == (1, True)
+
+
+def test_one_ruined_frame_in_a_thousand_is_below_the_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lower quarter of grey, as a decoder leaves it."""
+
+    def ruining(path: Path, frames: Iterator[npt.NDArray[np.uint8]], *settings: object, **more: object) -> None:
+        def ruined() -> Iterator[npt.NDArray[np.uint8]]:
+            for number, frame in enumerate(frames):
+                if number == 700:
+                    frame = np.concatenate([frame[:36], np.full_like(frame[36:], 128)])
+                yield frame
+
+        encode_luma(path, ruined(), *settings, **more)  # type: ignore[arg-type]
+
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "long.mp4", np.tile(panned_luma(50, 48, 64), (20, 1, 1)))
+    monkeypatch.setattr("v2v_server.prepare.transcode.encode_luma", ruining)
+    report = run(tmp_path / "source", tmp_path / "out")
+    (video,) = report.below_floor
+    assert video.psnr_db is not None
+    assert video.psnr_db > 38  # the clip as a whole does not show it
+    assert video.worst_psnr_db is not None
+    assert 10 < video.worst_psnr_db < report.frame_floor_db == 30
+    assert not report.complete
+    assert run(tmp_path / "source", tmp_path / "out", frame_floor_db=10.0).complete
+    with pytest.raises(UsageError, match="frame floor nan"):
+        run(tmp_path / "source", tmp_path / "out", frame_floor_db=math.nan)
+
+
+@pytest.mark.parametrize("crash", [0, 2])
+def test_a_video_that_cannot_be_written_fails_alone(source: Path, tmp_path: Path, crash: int) -> None:
+    """Where the file should be, there is a folder."""
+    (tmp_path / "source").mkdir()
+    for name in ("x.mp4", "y.mp4"):
+        shutil.copy(source / "b.mp4", tmp_path / "source" / name)
+    run(tmp_path / "source", tmp_path / "out")
+    (tmp_path / "out" / "x.mp4").unlink()
+    (tmp_path / "out" / "x.mp4").mkdir()
+    (tmp_path / "out" / "x.mp4" / "in the way").touch()
+    report = run(tmp_path / "source", tmp_path / "out", processes=crash)
+    assert [video.id for video in report.failed] == ["x.mp4"]
+    assert [video.id for video in report.prepared] == ["y.mp4"]
+
+
+def test_a_source_that_is_waited_for_in_vain_fails_alone(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "source").mkdir()
+    for name in ("x.mp4", "y.mp4"):
+        shutil.copy(source / "b.mp4", tmp_path / "source" / name)
+    monkeypatch.setattr(
+        "v2v_server.prepare.prepare._deadline_seconds", lambda job: {"x.mp4": 0.1}.get(job.video.id, 60)
+    )
+    with closing(open_catalogue(tmp_path / "source", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        (tmp_path / "source" / "x.mp4").unlink()
+        os.mkfifo(tmp_path / "source" / "x.mp4")
+        report = prepare(catalogue, tmp_path / "out", H264, processes=1)
+    assert [(video.id, video.problem) for video in report.failed] == [
+        ("x.mp4", "hangs the transcoder: ended after 0 s without a result")
+    ]
+    assert [video.id for video in report.prepared] == ["y.mp4"]
+
+
+def test_rows_that_a_picture_has_not(source: Path, tmp_path: Path) -> None:
+    report = run(source, tmp_path / "out", rows="top:50px")
+    assert {video.id for video in report.failed} == {"a turned.mov", "dir/odd.avi", "dir/pc.mkv", CORRUPT}
+    assert "48 rows only" in str(next(video.problem for video in report.failed if video.id == "dir/pc.mkv"))
+
+
+def test_refused_places(source: Path, prepared: tuple[Path, Report], tmp_path: Path) -> None:
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    shutil.copy(source / "b.mp4", corpus)
+    for target in (corpus, corpus / "inside", tmp_path):
+        with pytest.raises(CorpusError, match="in one another"):
+            run(corpus, target)
+    (tmp_path / "alias").symlink_to(corpus)
+    with pytest.raises(CorpusError, match="in one another"):
+        run(corpus, tmp_path / "alias" / "inside")
+    assert sorted(path.name for path in corpus.rglob("*")) == ["b.mp4"]
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "b.mp4").write_bytes(b"precious")
+    with pytest.raises(CorpusError, match="no manifest"):
+        run(corpus, tmp_path / "foreign")
+    assert (tmp_path / "foreign" / "b.mp4").read_bytes() == b"precious"
+    with pytest.raises(CorpusError, match="prepared folder itself"):
+        run(prepared[0], tmp_path / "twice")
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "b.mp4").symlink_to(corpus / "b.mp4")
+    with pytest.raises(CorpusError, match="is a link into it"):
+        run(tmp_path / "linked", corpus)
+
+
+def test_one_video_may_be_prepared_in_its_own_folder(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    films = tmp_path / "films"
+    films.mkdir()
+    shutil.copy(source / "b.mp4", films)
+    shutil.copy(source / "b.mp4", films / "other.mp4")
+    more = ["--workers", "1", "--cache-dir", str(tmp_path / "cache")]
+    prepare_main([str(films / "b.mp4"), str(films / "prepared"), *more])
+    assert "1 of 1 videos prepared" in capsys.readouterr().out
+    assert [video.id for video in opened(films / "prepared").videos] == ["b.mp4"]
+    before = snapshot(films)
+    (films / "list.txt").write_text("b.mp4\n")
+    for place, target in ((films / "b.mp4", films), (films / "b.mp4", tmp_path), (films / "list.txt", films / "more")):
+        with pytest.raises(SystemExit):
+            prepare_main([str(place), str(target), *more])
+        assert "in one another" in capsys.readouterr().err
+    (films / "list.txt").unlink()
+    assert snapshot(films) == before
+    with pytest.raises(CorpusError, match="prepared is a prepared folder"):  # and the whole is no corpus unnoticed
+        opened(films)
+
+
+def test_the_table_has_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        prepare_main(["--help"])
+    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("options:")[0]))
+    table = (Path(__file__).parents[3] / "docs" / "prepare.md").read_text()
+    assert {flag for flag in flags if f"| `{flag}` |" not in table} == {"--debug"}
+
+
+def test_a_link_in_the_destination_is_not_followed(source: Path, tmp_path: Path) -> None:
+    shutil.copytree(source / "dir", tmp_path / "source" / "dir")
+    write_clip(tmp_path / "source" / f"{'n' * 250}.mp4", panned_luma(8))
+    (tmp_path / "source" / "b.mp4").write_bytes((source / "b.mp4").read_bytes())
+    run(tmp_path / "source", tmp_path / "out")
+    shutil.rmtree(tmp_path / "out" / "dir")
+    (tmp_path / "out" / "dir").symlink_to(tmp_path / "source" / "dir")
+    before = snapshot(tmp_path / "source")
+    report = run(tmp_path / "source", tmp_path / "out")
+    assert snapshot(tmp_path / "source") == before
+    assert {video.id for video in report.prepared} == {"b.mp4", f"{'n' * 250}.mp4"}
+
+
+def test_other_settings_need_another_folder(source: Path, prepared: tuple[Path, Report]) -> None:
+    for encoding, rows in ((Encoding("h264", 20, 12), "top:0.54"), (H264, "full")):
+        with pytest.raises(
+            CorpusError,
+            match=r"was prepared with .*which its 4 prepared videos are not; choose another folder, or delete",
+        ):
+            run(source, prepared[0], encoding, rows)
+
+
+@pytest.mark.parametrize(
+    ("codec", "quality", "gop"),
+    [("h265", 18, 12), ("h264", 0, 12), ("h264", 52, 12), ("mpeg4", 32, 12), ("mjpeg", 3, 0)],
+)
+def test_refused_settings(codec: str, quality: int, gop: int) -> None:
+    with pytest.raises(UsageError, match=r"codec|quality|gop"):
+        Encoding(codec, quality, gop)
+
+
+def test_an_encoder_that_refuses_is_named(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="cannot be encoded as h264"):
+        encode_luma(
+            tmp_path / "no" / "clip.mp4",
+            panned_luma(2),
+            H264,
+            height=48,
+            width=64,
+            pts=[0, 1],
+            time_base=Fraction(1, 25),
+        )
+
+
+def test_a_manifest_that_makes_no_sense(prepared: tuple[Path, Report], tmp_path: Path) -> None:
+    header, *lines = (prepared[0] / MANIFEST_NAME).read_text().splitlines()
+    video = json.loads(lines[0])
+    for text, complaint in (
+        ("", "no whole line"),
+        ("nonsense\n", "line 1"),
+        (json.dumps(json.loads(header) | {"version": 2}) + "\n", "version 2"),
+        (f"{header}\n{json.dumps(video | {'id': '../x.mp4'})}\n", "line 2.*leads out"),
+        (f"{header}\n{json.dumps(video | {'frames': 0})}\n", "0 frames"),
+        (f"{header}\n{json.dumps(video | {'colour': 1})}\n", "unknown fields colour"),
+    ):
+        (tmp_path / MANIFEST_NAME).write_text(text)
+        with pytest.raises(CorpusError, match=complaint):
+            read_manifest(tmp_path)
+    (tmp_path / MANIFEST_NAME).write_text(f"{header}\n{lines[0]}\n{lines[1][:20]}")
+    assert list(read_manifest(tmp_path).videos) == [video["id"]]
+
+
+def test_one_run_at_a_time(source: Path, tmp_path: Path) -> None:
+    import fcntl
+
+    (tmp_path / "out").mkdir()
+    with (tmp_path / "out" / ".v2v-prepare.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(CorpusError, match="another v2v-prepare"):
+            run(source, tmp_path / "out")
+    assert os.listdir(tmp_path / "out") == [".v2v-prepare.lock"]
+
+
+@pytest.mark.slow
+def test_the_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "clips").mkdir()
+    write_clip(tmp_path / "clips" / "short.mp4", panned_luma(20, 240, 160))
+    arguments = ["--videos", str(tmp_path / "clips"), "--seconds", "0", "--json", str(tmp_path / "r.json")]
+    assert main([*arguments]) == 2
+    assert "no clip of 401 frames" in capsys.readouterr().err
+    write_clip(tmp_path / "clips" / "long.mp4", panned_luma(MOST_FRAMES, 240, 160), gop=250)
+    assert main([*arguments, "--plot", str(tmp_path / "r.png")]) == 0
+    records = {record["name"]: record for record in json.loads((tmp_path / "r.json").read_text())}
+    assert len(records) == 1 + len(SETTINGS) + len(DECODERS)
+    assert records["source"]["speed_ratio"] == 1
+    assert records["h264 12"]["psnr_db"] > records["h264 20"]["psnr_db"] > 35
+    assert records["h264 12"]["size_ratio"] > records["h264 20"]["size_ratio"] > 0
+    assert (tmp_path / "r.png").stat().st_size > 10_000

@@ -1,0 +1,103 @@
+"""Jobs in processes of their own: crashes cost one job, and nothing is left running.
+
+What the processes import is this module, so it imports little.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from v2v_server.system.isolate import Died, run_isolated
+
+
+@pytest.fixture(autouse=True)
+def _no_process_left() -> Iterator[None]:
+    yield
+    assert not psutil.wait_procs(children(), timeout=10)[1]
+
+
+def children() -> list[psutil.Process]:
+    """Processes below this one, but for the tracker that multiprocessing keeps as long as its own process lives."""
+    below = psutil.Process().children(recursive=True)
+    return [process for process in below if "resource_tracker" not in " ".join(process.cmdline())]
+
+
+MASK_AT_IMPORT = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def square_or_die(number: int) -> int:
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if number == 5:
+        os._exit(7)
+    return number * number
+
+
+def test_a_crash_costs_one_job() -> None:
+    results = dict(run_isolated(square_or_die, range(9), processes=2))
+    assert results.pop(3) == Died(-signal.SIGSEGV)
+    assert results.pop(5) == Died(7)
+    assert results == {n: n * n for n in (0, 1, 2, 4, 6, 7, 8)}
+    assert dict(run_isolated(square_or_die, [1, 2], processes=0)) == {1: 1, 2: 4}
+    assert dict(run_isolated(square_or_die, [], processes=2)) == {}
+
+
+def square_or_wait(job: tuple[int, str]) -> int:
+    """Waits for somebody to write into the named pipe."""
+    number, pipe = job
+    if pipe:
+        Path(pipe).read_bytes()
+    return number * number
+
+
+def test_a_job_that_waits_for_ever_costs_itself(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    jobs = [(1, ""), (2, str(tmp_path / "pipe")), (3, ""), (4, "")]
+    allowed = {job: 1.0 if job[1] else 60.0 for job in jobs}
+    results = {job[0]: result for job, result in run_isolated(square_or_wait, jobs, 1, allowed.__getitem__)}
+    hung = results.pop(2)
+    assert hung == Died(-signal.SIGKILL, 1.0)
+    assert isinstance(hung, Died)
+    assert (hung.how, hung.from_outside) == ("ended after 1 s without a result", False)
+    assert results == {1: 1, 3: 9, 4: 16}
+
+
+def test_leaving_early_ends_the_processes() -> None:
+    results = run_isolated(square_or_die, range(3), processes=2)
+    next(results)
+    results.close()  # type: ignore[attr-defined]
+    assert not children()
+
+
+def test_how_a_process_died() -> None:
+    deaths = [Died(7), Died(-signal.SIGSEGV), Died(-signal.SIGKILL), Died(-signal.SIGTERM), Died(-40)]
+    assert [death.how for death in deaths] == [
+        "exit status 7", "signal SIGSEGV", "signal SIGKILL", "signal SIGTERM", "signal 40",
+    ]  # fmt: skip
+    assert [death.from_outside for death in deaths] == [False, False, True, True, False]
+
+
+def interrupts_let_through(job: None) -> tuple[bool, bool]:
+    """Whether Ctrl-C could have struck this process while it started, and whether it can now."""
+    return signal.SIGINT not in MASK_AT_IMPORT, signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+
+
+def test_an_interrupt_strikes_the_caller_only() -> None:
+    assert list(run_isolated(interrupts_let_through, [None, None, None], processes=2)) == [(None, (False, False))] * 3
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_a_process_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(process: object) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
+    with pytest.raises(BlockingIOError):
+        list(run_isolated(square_or_die, [1], processes=1))
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

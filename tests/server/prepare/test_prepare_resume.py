@@ -1,0 +1,390 @@
+"""Preparing again: after nothing, after changes, after kill -9 at any moment."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.clips import damaged, panned_luma, write_clip
+from tests.server.prepare.test_prepare import opened, psnr_db, run, whole
+from tests.server.prepare.test_prepare_isolate import children
+from tests.waiting import until
+from v2v_protocol.errors import CorpusError, VideoError
+from v2v_server.commands.prepare import main, summary
+from v2v_server.prepare.encode import Encoding
+from v2v_server.prepare.resume import refuse_overlap
+from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
+from v2v_server.store.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.probe import probe
+
+_KILLED_SECONDS = 60.0
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    (tmp_path / "source" / "sub").mkdir(parents=True)
+    for number in range(4):
+        write_clip(tmp_path / "source" / f"{number}.mp4", panned_luma(24, step=(1, number)))
+    write_clip(tmp_path / "source" / "sub" / "4.mp4", panned_luma(30))
+    return tmp_path / "source"
+
+
+@pytest.fixture(autouse=True)
+def _no_process_left() -> Iterator[None]:
+    yield
+    assert not psutil.wait_procs(children(), timeout=10)[1]
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.stat().st_ino for path in folder.rglob("*.mp4")}
+
+
+def test_a_second_run_keeps_everything(source: Path, tmp_path: Path) -> None:
+    first = run(source, tmp_path / "out")
+    before = inodes(tmp_path / "out")
+    second = run(source, tmp_path / "out")
+    assert (first.kept, second.kept) == (0, 5)
+    assert second.videos == first.videos
+    assert inodes(tmp_path / "out") == before
+
+
+def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
+    """Whether a list leaves the others out, or their folder is away that day."""
+    out = tmp_path / "out"
+    first = run(source, out)
+    before, digest = inodes(out), opened(out).digest
+    (tmp_path / "part.txt").write_text("1.mp4\nsub/4.mp4\n")
+    part = run(source, out, list_file=tmp_path / "part.txt")
+    assert (part.kept, part.aside, len(part.videos)) == (2, 3, 2)
+    served = opened(out)  # finished, and exactly what was asked for last
+    assert [video.id for video in served.videos] == ["1.mp4", "sub/4.mp4"]
+    assert "3 prepared videos are set aside" in served.notes[0]
+    assert "3 others that were prepared earlier are set aside" in summary(part, Encoding("h264", 18, 12), 0.0)[1]
+    (tmp_path / "other.txt").write_text("0.mp4\n1.mp4\n")
+    assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").problems[0].reason
+    (source / "sub").rename(tmp_path / "away")
+    away = run(source, out)
+    assert (away.kept, away.aside) == (4, 1)
+    (tmp_path / "away").rename(source / "sub")
+    whole_again = run(source, out)
+    assert (whole_again.kept, whole_again.aside) == (5, 0)
+    assert whole_again.videos == first.videos
+    assert inodes(out) == before
+    assert opened(out).digest == digest
+
+
+def test_another_corpus_is_not_taken_for_a_changed_source(source: Path, tmp_path: Path) -> None:
+    """Every video of the same name would be replaced, and every other set aside."""
+    out = tmp_path / "out"
+    run(source, out)
+    before = inodes(out)
+    other = tmp_path / "other"
+    other.mkdir()
+    write_clip(other / "0.mp4", panned_luma(24, step=(2, 3)))
+    with pytest.raises(CorpusError, match="folder called source, and none of its 5 videos is one of the 1 of other"):
+        run(other, out)
+    assert inodes(out) == before
+    assert len(opened(out).videos) == 5
+
+    # The same corpus under another name has something in common, and a source that keeps its name may change wholly.
+    renamed = source.rename(tmp_path / "renamed")
+    assert run(renamed, out).kept == 5
+    shutil.rmtree(renamed)
+    other.rename(renamed)
+    assert (run(renamed, out).kept, len(opened(out).videos)) == (0, 1)
+
+
+def test_finished_files_are_looked_at_together_and_told_of(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waiting for one disk after the other, in silence, would look hung where there are many."""
+    out = tmp_path / "out"
+    run(source, out)
+    inside, several = [], threading.Event()
+
+    def among_others(path: Path) -> str:
+        inside.append(path)
+        if len(inside) > 1:
+            several.set()
+        assert several.wait(1), "the files are read one after the other"
+        return fingerprint(path)
+
+    monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", among_others)
+    steps: list[tuple[int, int]] = []
+    assert run(source, out, progress=lambda *step: steps.append(step)).kept == 5
+    assert steps == [(0, 126), (24, 126), (48, 126), (72, 126), (96, 126), (126, 126)]
+
+
+def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    resolved: list[Path] = []
+    resolve = Path.resolve
+    monkeypatch.setattr(Path, "resolve", lambda path: (resolved.append(path), resolve(path))[1])
+    catalogue = opened(source)
+    resolved.clear()
+    refuse_overlap(catalogue, out)
+    assert resolved == [source, source / "sub"]
+    (source / "sub" / "5.mp4").symlink_to(out / "0.mp4")
+    with pytest.raises(CorpusError, match=r"sub/5\.mp4 of the source is a link into it"):
+        refuse_overlap(opened(source), out)
+    (source / "sub" / "5.mp4").unlink()
+    (source / "linked").symlink_to(out / "sub")
+    with pytest.raises(CorpusError, match=r"linked/4\.mp4 of the source is a link into it"):
+        refuse_overlap(opened(source), out)
+
+
+def test_a_prepared_file_that_cannot_be_read_is_not_given_up(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    manifest, before = (out / MANIFEST_NAME).read_bytes(), inodes(out)
+
+    def refuse(path: Path) -> str:
+        if path.name == "3.mp4":
+            raise VideoError(str(path), None, "cannot be read: Permission denied") from PermissionError(13, "denied")
+        return fingerprint(path)
+
+    monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", refuse)
+    with pytest.raises(CorpusError, match=r"3\.mp4 cannot be read: Permission denied, .* nothing was changed"):
+        run(source, out)
+    assert (out / MANIFEST_NAME).read_bytes() == manifest
+    assert inodes(out) == before
+
+
+class _Stop(BaseException):
+    pass
+
+
+def test_what_is_cut_off_forgets_nothing(source: Path, tmp_path: Path) -> None:
+    """Statistics are added to a finished folder, and the run ends after the first."""
+    out = tmp_path / "out"
+    first = run(source, out)
+    before = inodes(out)
+
+    def stop_after_one(done: int, total: int) -> None:
+        if done:
+            raise _Stop
+
+    with pytest.raises(_Stop):
+        run(source, out, scene=True, progress=stop_after_one)
+    records = read_manifest(out).videos
+    assert len(opened(out).videos) == 5
+    assert sum(bool(record.scene) for record in records.values()) == 1
+    assert [replace(record, scene="") for _, record in sorted(records.items())] == list(first.videos)
+    last = run(source, out, scene=True)
+    assert (last.kept, last.looked_at, last.complete) == (1, 4, True)
+    assert "4 were prepared earlier: only the statistics" in summary(last, Encoding("h264", 18, 12), 0.0)[1]
+    assert inodes(out) == before
+
+
+def test_a_finished_folder_with_a_failure_stays_finished(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when a run that tries the failed one again is cut off."""
+    out = tmp_path / "out"
+    write_clip(source / "1.mp4", panned_luma(24), gop=24)
+    damaged(source / "1.mp4", source / "0.mp4", 12)
+    assert [video.id for video in run(source, out).failed] == ["0.mp4"]
+    before = opened(out).digest
+
+    def stop(job: Transcoding) -> None:
+        raise _Stop
+
+    monkeypatch.setattr("v2v_server.prepare.prepare.transcode", stop)
+    with pytest.raises(_Stop):
+        run(source, out)
+    assert opened(out).digest == before
+
+
+def test_a_look_that_fails_costs_no_prepared_file(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    first = run(source, out)
+
+    def refuse(job: Transcoding) -> None:
+        raise VideoError(str(job.source), 3, "is damaged")
+
+    monkeypatch.setattr("v2v_server.prepare.prepare.look_again", refuse)
+    report = run(source, out, scene=True)
+    assert report.videos == first.videos == tuple(video for _, video in sorted(read_manifest(out).videos.items()))
+    assert [problem.reason for problem in report.not_looked_at] == ["frame 3: is damaged"] * 5
+    assert not report.complete
+
+
+def test_ctrl_c_says_that_the_same_command_goes_on(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("v2v_server.prepare.prepare.prepare", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"])
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
+
+
+def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([
+            str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1",
+            "--json", str(tmp_path),
+        ])  # fmt: skip
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert "videos prepared" in said.out
+    assert "cannot be written: Is a directory" in said.err
+
+
+def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    before = inodes(out)
+    write_clip(source / "0.mp4", panned_luma(18))  # the source changed
+    (out / "1.mp4").write_bytes(b"damaged")
+    (out / "2.mp4").unlink()
+    (source / "3.mp4").unlink()
+    write_clip(source / "new.mp4", panned_luma(20))
+    report = run(source, out)
+    assert report.kept == 1
+    assert [video.id for video in report.prepared] == ["0.mp4", "1.mp4", "2.mp4", "new.mp4", "sub/4.mp4"]
+    assert inodes(out)["sub/4.mp4"] == before["sub/4.mp4"]
+    assert [video.frames for video in opened(out).videos] == [18, 24, 24, 20, 30]  # and 3.mp4 is none of it
+
+
+def test_a_failed_one_is_tried_again(source: Path, tmp_path: Path) -> None:
+    sound = (source / "0.mp4").read_bytes()
+    broken = bytearray(sound)
+    middle = len(broken) // 2
+    broken[middle : middle + 400] = bytes(400)
+    (source / "0.mp4").write_bytes(broken)
+    assert [video.id for video in run(source, tmp_path / "out").failed] == ["0.mp4"]
+    assert [video.id for video in run(source, tmp_path / "out").failed] == ["0.mp4"]
+    (source / "0.mp4").write_bytes(sound)
+    report = run(source, tmp_path / "out")
+    assert (report.kept, report.complete) == (4, True)
+
+
+def test_several_processes_make_the_same_files(source: Path, tmp_path: Path) -> None:
+    settings = Encoding("mpeg4", 2, 12)  # whose encoder gives the same bytes every time
+    alone = run(source, tmp_path / "alone", settings)
+    steps: list[tuple[int, int]] = []
+    together = run(source, tmp_path / "together", settings, processes=2, progress=lambda *step: steps.append(step))
+    assert together.videos == alone.videos
+    assert steps[0] == (0, 126)
+    assert steps[-1] == (126, 126)
+    assert sorted(steps) == steps
+
+
+def _killed_in_the_middle(command: Sequence[str], cache: Path, out: Path, wanted: int) -> bool:
+    """Runs a command that is killed while it writes a file and so many new ones are done; whether it was."""
+    seen = set(inodes(out).values()) if out.exists() else set()
+
+    def due() -> bool:
+        there = list(out.rglob("*")) if out.exists() else []
+        fresh = {path.stat().st_ino for path in there if path.suffix == ".mp4"} - seen
+        return len(fresh) >= wanted and any(path.name.endswith(PARTIAL_SUFFIX) for path in there)
+
+    environment = os.environ | {"V2V_CACHE_DIR": str(cache)}
+    victim = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until(lambda: victim.poll() is not None or due())
+        below = psutil.Process(victim.pid).children(recursive=True) if victim.poll() is None else []
+    finally:
+        victim.kill()
+        victim.wait()
+    psutil.wait_procs(below, timeout=_KILLED_SECONDS)
+    return victim.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("turn", [0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in (1, 2, 3))])
+def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> None:
+    """Killed in the middle of a file, once a random number of others are done; again; and then finished."""
+    out, rng = tmp_path / "out", random.Random(turn)
+    command = [
+        sys.executable,
+        "-m",
+        "v2v_server.commands.prepare",
+        str(source),
+        str(out),
+        "--gop",
+        "12",
+        "--workers",
+        "2",
+    ]
+    for _ in range(1 + turn % 2):
+        if _killed_in_the_middle(command, tmp_path / "cache", out, rng.randrange(3)):
+            records = read_manifest(out).videos
+            assert all(fingerprint(out / id) == record.fingerprint for id, record in records.items())
+    last = run(source, out)
+    assert last.complete
+    assert not list(out.rglob(f"*{PARTIAL_SUFFIX}"))
+    # Whole and right, whoever made them; x264's very bytes may differ from run to run.
+    for video in last.videos:
+        assert fingerprint(out / video.id) == video.fingerprint
+        assert psnr_db(whole(out / video.id), whole(source / video.id)) == pytest.approx(video.psnr_db)
+        assert probe(out / video.id).frames == probe(source / video.id).frames
+
+
+def test_an_unfinished_line_counts_as_not_written(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    manifest = (out / MANIFEST_NAME).read_bytes()
+    (out / MANIFEST_NAME).write_bytes(manifest[:-25])
+    with pytest.raises(CorpusError, match="4 of 5 videos; run v2v-prepare again"):
+        opened(out)
+    assert run(source, out).kept == 4
+    assert len(opened(out).videos) == 5
+
+
+def test_command_line(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "cache"))
+    out = tmp_path / "out"
+    settings = ["--rows", "top:0.54", "--codec", "mpeg4", "--quality", "2", "--gop", "6", "--workers", "1"]
+    main([str(source), str(out), *settings, "--json", str(tmp_path / "report.json")])
+    told = capsys.readouterr().out
+    assert "5 of 5 videos prepared as mpeg4 quality 2 gop 6 (0 of them earlier)" in told
+    assert " MB -> " in told
+    assert (tmp_path / "report.json").read_text().count("psnr_db") == 10
+    (tmp_path / "list.txt").write_text("0.mp4 24 0.3 0.3\nsub/4.mp4\n")
+    main([str(source), str(tmp_path / "two"), "--list", str(tmp_path / "list.txt"), "--workers", "1"])
+    assert "2 of 2 videos prepared as h264" in capsys.readouterr().out
+    for arguments, status, message in (
+        ([str(source), str(out), *settings, "--floor", "99"], 1, "below the floor of 99 dB"),
+        ([str(source), str(source / "in")], 2, "in one another"),
+        ([str(source), str(out), "--quality", "99"], 2, "quality 99"),
+        ([str(source), str(out), "--workers", "0"], 2, "--workers 0"),
+        ([str(tmp_path / "none"), str(out)], 2, "no such folder"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == status
+        shown = capsys.readouterr()
+        assert message in shown.out + shown.err
+    shutil.copy(source / "0.mp4", source / "5.mp4")
+    (source / "6.mp4").write_bytes(b"no video")
+    with pytest.raises(SystemExit) as ended:
+        main([str(source), str(out), *settings])
+    assert ended.value.code == 1
+    shown = capsys.readouterr().out
+    assert "6 of 6 videos prepared" in shown
+    assert "1 cannot be used at all:\n  6.mp4: " in shown

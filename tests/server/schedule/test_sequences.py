@@ -1,0 +1,233 @@
+"""Sequences of videos, lookup by rank, rejections with a remedy that works, and the schedule's candidates."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.server.corpus import SMALL, SMALL_SPEC, video
+from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import VideoEntry
+from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+
+FULL = Rows()
+
+
+def table(*videos: VideoEntry, rows: Rows = FULL, spec: StreamSpec = SMALL_SPEC) -> SequenceTable:
+    return SequenceTable(videos, rows, spec)
+
+
+def listed(of: SequenceTable) -> list[tuple[str, int]]:
+    return [(of[rank].video.id, of[rank].start_frame) for rank in range(of.count)]
+
+
+def brute_force(videos: list[VideoEntry], spec: StreamSpec) -> list[tuple[str, int]]:
+    """The rule as the paper's code walks it: step through the video until a sequence no longer fits."""
+    found = []
+    for entry in videos:
+        start, number = 0, 0
+        while start + spec.recipe.frames_needed <= entry.frames and number < spec.max_sequences_per_video:
+            found.append((entry.id, start))
+            start, number = start + spec.recipe.frames_per_sequence, number + 1
+    return found
+
+
+# --- the rule ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frames", "starts"),
+    [
+        (200, []),
+        (201, [0]),
+        (400, [0]),
+        (401, [0, 200]),
+        (600, [0, 200]),
+        (2001, list(range(0, 2000, 200))),
+        (2201, list(range(0, 2000, 200))),
+        (100_000, list(range(0, 2000, 200))),
+    ],
+)
+def test_the_papers_rule(frames: int, starts: list[int]) -> None:
+    found = table(video("a", frames, 336, 596), spec=StreamSpec())
+    assert [start for _, start in listed(found)] == starts
+
+
+def test_the_papers_rule_on_a_list_of_lengths() -> None:
+    """On lengths like WebVid's the rule gives the released code's count, below the sum of floor(frames / 200)."""
+    lengths = [150 + 37 * number % 1900 for number in range(1000)] + [400, 600, 800]
+    found = table(
+        *(video(f"{number:04}", frames, 336, 596) for number, frames in enumerate(lengths)), spec=StreamSpec()
+    )
+    assert found.count == sum(min(10, (frames - 1) // 200) for frames in lengths)
+    assert found.count <= sum(frames // 200 for frames in lengths) - 3
+
+
+def test_eraft_sequences_are_one_voxel_longer() -> None:
+    spec = StreamSpec(recipe=preset("paper-eraft"))
+    assert listed(table(video("a", 205, 336, 596), spec=spec)) == []
+    assert listed(table(video("a", 411, 336, 596), spec=spec)) == [("a", 0), ("a", 205)]
+
+
+_lengths = st.lists(st.integers(1, 120), max_size=12)
+
+
+@given(_lengths, st.integers(1, 12), st.integers(1, 4), st.integers(0, 1))
+def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: int, lead: int) -> None:
+    recipe = SMALL.replace(voxels_per_clip=voxels, lead_voxels=lead)
+    spec = StreamSpec(recipe=recipe, max_sequences_per_video=most)
+    videos = [video(f"v{number}", frames) for number, frames in enumerate(lengths)]
+    found = table(*videos, spec=spec)
+    expected = brute_force(videos, spec)
+    assert listed(found) == expected
+    assert found.count == len(expected)
+    assert found.videos == len({name for name, _ in expected})
+    assert found.videos + len(found.rejections) == len(videos)
+    for name, start in expected:
+        entry = next(entry for entry in videos if entry.id == name)
+        assert start + recipe.frames_needed <= entry.frames
+
+
+@pytest.mark.parametrize("rank", [-1, 3, 2**48])
+def test_a_rank_outside_is_refused(rank: int) -> None:
+    found = table(video("a", 13))
+    assert found.count == 3
+    with pytest.raises(IndexError, match=f"sequence {rank} of 3"):
+        found[rank]
+
+
+def test_an_empty_corpus_has_no_sequence() -> None:
+    found = table()
+    assert (found.count, found.videos, found.rejections) == (0, 0, ())
+
+
+# --- rejections -------------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.integers(2, 60),
+    st.integers(1, 12),
+    st.integers(1, 4),
+    st.integers(1, 3),
+    st.integers(0, 1),
+)
+def test_the_remedy_for_a_short_video_admits_it(frames: int, voxels: int, bins: int, per_bin: int, lead: int) -> None:
+    changes: dict[str, Any] = {"voxels_per_clip": voxels, "bins": bins, "frames_per_bin": per_bin, "lead_voxels": lead}
+    recipe = SMALL.replace(**changes)
+    rejections = table(video("short", frames), spec=StreamSpec(recipe=recipe)).rejections
+    assert bool(rejections) == (frames < recipe.frames_needed)
+    if not rejections:
+        return
+    assert rejections[0].video == "short"
+    assert rejections[0].reason == f"{frames} frames, the recipe needs {recipe.frames_needed}"
+    if match := re.fullmatch(r"voxels_per_clip at most (\d+)", rejections[0].remedy):
+        most = int(match[1])
+        assert 1 <= most < voxels
+        assert table(video("short", frames), spec=StreamSpec(recipe=recipe.replace(voxels_per_clip=most))).count == 1
+        more = recipe.replace(voxels_per_clip=most + 1)
+        assert table(video("short", frames), spec=StreamSpec(recipe=more)).count == 0
+    else:
+        assert rejections[0].remedy == "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+        least = recipe.replace(voxels_per_clip=1, bins=1, frames_per_bin=1, lead_voxels=0)
+        assert table(video("short", frames), spec=StreamSpec(recipe=least)).count >= 1
+
+
+def test_one_frame_has_no_remedy() -> None:
+    (rejection,) = table(video("still", 1)).rejections
+    assert rejection.remedy == "none: a voxel grid needs two frames"
+
+
+@given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 300), st.integers(1, 300))
+def test_the_remedy_for_a_small_picture_admits_it(height: int, width: int, crop_height: int, crop_width: int) -> None:
+    recipe = SMALL.replace(crop_height_px=crop_height, crop_width_px=crop_width)
+    small = video("small", 100, height, width)
+    rejections = table(small, spec=StreamSpec(recipe=recipe)).rejections
+    assert bool(rejections) == (height < crop_height or width < crop_width)
+    if not rejections:
+        return
+    assert rejections[0].reason == (f"picture {width}x{height} after rows full, the crop is {crop_width}x{crop_height}")
+    match = re.fullmatch(r"resize_scale up to ([\d.]+), or a smaller crop", rejections[0].remedy)
+    if match is None:
+        # No scale that a recipe may have is large enough.
+        assert rejections[0].remedy == "a smaller crop"
+        assert max(crop_height / height, crop_width / width) > 100
+        return
+    scale = float(match[1])
+    assert table(small, spec=StreamSpec(recipe=recipe.replace(resize_scale=(1.0, scale)))).count > 0
+    assert scale <= max(crop_height / height, crop_width / width) + 0.002
+
+
+def test_rows_count() -> None:
+    """WebVid: the top 54 % of 336 rows, which the paper's crop of 128 fits."""
+    assert table(video("a", 201, 336, 596), rows=Rows.parse("top:0.54"), spec=StreamSpec()).count == 1
+    (rejection,) = table(video("a", 201, 336, 596), rows=Rows.parse("top:0.3"), spec=StreamSpec()).rejections
+    assert rejection.reason == "picture 596x100 after rows top:0.3, the crop is 128x128"
+
+
+def test_rows_that_one_picture_does_not_have_reject_only_that_video() -> None:
+    found = table(video("low", 100, height_px=10), video("tall", 5, height_px=20), rows=Rows.parse("top:12px"))
+    assert listed(found) == [("tall", 0)]
+    (rejection,) = found.rejections
+    assert rejection.video == "low"
+    assert "the picture has 10 rows only" in rejection.reason
+    (rejection,) = table(video("flat", 100, height_px=1), rows=Rows.parse("0.1:0.6")).rejections
+    assert "no row is left" in rejection.reason
+
+
+# --- the schedule -----------------------------------------------------------------------------------------------------
+
+
+def schedule(*lengths: int, shuffle: bool = True) -> Schedule:
+    return Schedule(table(*(video(f"v{number}", frames) for number, frames in enumerate(lengths))), shuffle=shuffle)
+
+
+def epoch_order(of: Schedule, seed: int, epoch: int, candidate: int = 0) -> list[tuple[str, int]]:
+    found = [of.candidate(seed, epoch, index, candidate) for index in range(of.count)]
+    return [(sequence.video.id, sequence.start_frame) for sequence in found]
+
+
+def test_an_epoch_holds_every_sequence_once() -> None:
+    of = schedule(30, 5, 45)
+    catalogue_order = epoch_order(schedule(30, 5, 45, shuffle=False), 0, 0)
+    assert len(set(catalogue_order)) == of.count == 7 + 1 + 10
+    orders = [epoch_order(of, seed, epoch) for seed in (0, 2**64 - 1) for epoch in (0, 2**32 - 1)]
+    assert all(sorted(order) == sorted(catalogue_order) for order in orders)
+    assert len(set(map(tuple, orders))) == 4
+
+
+def test_without_shuffle_every_epoch_is_in_catalogue_order() -> None:
+    of = schedule(30, 5, 45, shuffle=False)
+    assert epoch_order(of, 5, 0) == epoch_order(of, 6, 9) == sorted(epoch_order(of, 5, 0))
+
+
+def test_substitutes_are_fixed_and_leave_the_order_alone() -> None:
+    of = schedule(100, 100, 100, 100)
+    before = epoch_order(of, 1, 2)
+    substitutes = [epoch_order(of, 1, 2, candidate) for candidate in range(1, MOST_CANDIDATES)]
+    assert substitutes == [epoch_order(of, 1, 2, candidate) for candidate in range(1, MOST_CANDIDATES)]
+    assert len(set(map(tuple, substitutes))) == MOST_CANDIDATES - 1
+    assert epoch_order(of, 1, 2) == before
+    # Substitutes are spread over the corpus, not over the neighbourhood of the one they replace.
+    assert all(len({name for name, _ in order}) == 4 for order in substitutes)
+
+
+@pytest.mark.parametrize("candidate", [0, 1])
+def test_an_index_outside_the_epoch_is_refused(candidate: int) -> None:
+    of = schedule(5)
+    assert of.count == 1
+    assert of.candidate(0, 0, 0, candidate).video.id == "v0"
+    for index in (-1, 1):
+        with pytest.raises(IndexError, match=f"index {index} of an epoch of 1 samples"):
+            of.candidate(0, 0, index, candidate)
+
+
+def test_the_crop_at_its_full_size_fits_exactly() -> None:
+    recipe = Recipe(voxels_per_clip=1, bins=1, crop_height_px=16, crop_width_px=16)
+    assert table(video("a", 2), spec=StreamSpec(recipe=recipe)).count == 1

@@ -1,0 +1,197 @@
+"""What the callers of a simulation may rely on: shapes, seeds, refusals, noise per second, the log table."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Effects, SampleParams
+from v2v_server.simulation import simulate, simulate_clip, simulate_log
+from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.voxel import voxel_array
+
+FRAMES = (np.arange(11 * 6 * 7) * 37 % 256).astype(np.uint8).reshape(11, 6, 7)
+
+
+def test_shape_dtype_and_seed() -> None:
+    first = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=1)
+    assert first.voxels.shape == (2, 5, 6, 7)
+    assert first.voxels.dtype == np.int8
+    np.testing.assert_array_equal(first.voxels, simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=1).voxels)
+    assert (first.voxels != simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=2).voxels).any()
+
+
+def test_bins_of_several_steps_sum_the_steps() -> None:
+    fine = simulate(FRAMES, threshold_pos=0.1, noise_sigma=0.2, bins=1, dtype="int16").voxels
+    coarse = simulate(FRAMES, threshold_pos=0.1, noise_sigma=0.2, bins=1, frames_per_bin=5, dtype="int16").voxels
+    np.testing.assert_array_equal(coarse[:, 0], fine.reshape(2, 5, 6, 7).sum(1))
+
+
+def test_views_that_are_not_contiguous_are_simulated_as_they_look() -> None:
+    wide = np.repeat(FRAMES, 2, axis=2)[:, :, ::2]
+    np.testing.assert_array_equal(simulate(wide, threshold_pos=0.2).voxels, simulate(FRAMES, threshold_pos=0.2).voxels)
+
+
+def test_double_precision_differs_in_rounding_only() -> None:
+    single = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1).voxels.astype(int)
+    double = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, precision="float64").voxels.astype(int)
+    assert np.count_nonzero(single != double) <= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"threshold_pos": 0.0}, "threshold_pos"),
+        ({"threshold_pos": math.nan}, "threshold_pos"),
+        ({"threshold_neg": math.inf}, "threshold_neg"),
+        ({"noise_sigma": -0.1}, "noise_sigma"),
+        ({"noise_sigma": "much"}, "noise_sigma"),
+        ({"hot_pixel_count": 43}, "hot_pixel_count = 43.*42"),
+        ({"hot_pixel_sigma": math.nan}, "hot_pixel_sigma"),
+        ({"start_residual": 0.3}, "start_residual"),
+        ({"start_residual": math.nan}, "start_residual"),
+        ({"bins": 0}, "bins"),
+        ({"bins": 3}, r"11 frames.*k x 3 \+ 1"),
+        ({"frames_per_bin": 4}, r"k x 20 \+ 1"),
+        ({"gamma": 0.0}, "gamma"),
+        ({"log_eps": -1.0}, "log_eps"),
+        ({"seed": -1}, "seed"),
+        ({"dtype": "uint8"}, "int8, int16, float32"),
+        ({"precision": "float16"}, "float32, float64"),
+        ({"frames": FRAMES[0]}, "frames"),
+        ({"frames": FRAMES.astype(float)}, "uint8"),
+        ({"frames": FRAMES[:1]}, "1 frames"),
+        ({"frames": FRAMES[:, :0]}, "0 pixels"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(change: Any, message: Any) -> None:
+    arguments = {"frames": FRAMES, "threshold_pos": 0.2} | change
+    with pytest.raises(UsageError, match=message):
+        simulate(arguments.pop("frames"), **arguments)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_log_frames_that_are_not_finite_are_refused(bad: Any) -> None:
+    level = np.zeros((6, 2, 2))
+    level[3, 1, 1] = bad
+    with pytest.raises(UsageError, match="NaN or infinite"):
+        simulate_log(level, threshold_pos=0.2)
+    with pytest.raises(UsageError, match="floating point"):
+        simulate_log(FRAMES, threshold_pos=0.2)  # type: ignore[arg-type]
+
+
+RECIPE = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=7)
+PARAMS = SampleParams(0.2, 0.2, 0.1, 1, 1.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+
+
+def test_a_lead_voxel_is_one_more_in_front() -> None:
+    recipe = RECIPE.replace(voxels_per_clip=1, lead_voxels=1)
+    np.testing.assert_array_equal(
+        simulate_clip(FRAMES, PARAMS, recipe, "int8").voxels, simulate_clip(FRAMES, PARAMS, RECIPE, "int8").voxels
+    )
+
+
+def test_one_second_steps_equal_noise_per_frame() -> None:
+    per_frame = simulate_clip(FRAMES, PARAMS, RECIPE, "int8").voxels
+    per_second = simulate_clip(FRAMES, PARAMS, RECIPE.replace(noise_unit="second"), "int8", np.ones(10)).voxels
+    np.testing.assert_array_equal(per_frame, per_second)
+
+
+def test_noise_per_second_does_not_depend_on_the_frame_rate() -> None:
+    # A still scene for a second, in 10 and in 160 steps: the sum of the noise has the same spread.
+    still, totals = Recipe(bins=10, voxels_per_clip=1, noise_unit="second"), []
+    still = still.replace(noise_sigma=1.0, crop_height_px=64, crop_width_px=64)
+    params = SampleParams(0.01, 0.01, 1.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (5, 6, 7, 8))
+    for steps_per_bin in (1, 16):
+        recipe = still.replace(frames_per_bin=steps_per_bin)
+        frames = np.zeros((recipe.frames_needed, 64, 64), np.uint8)
+        durations = np.full(recipe.steps, 1.0 / recipe.steps)
+        totals.append(simulate_clip(frames, params, recipe, "float32", durations).voxels.sum((0, 1)) * 0.01)
+    for total in totals:
+        assert abs(total.std() - 1) < 4 / math.sqrt(2 * total.size)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": FRAMES[:10]}, "shows 11 frames"),
+        ({"frames": FRAMES.astype(np.int16)}, "uint8"),
+        ({"step_seconds": np.ones(10)}, "unwanted"),
+        ({"recipe": RECIPE.replace(noise_unit="second")}, "missing"),
+        ({"recipe": RECIPE.replace(noise_unit="second"), "step_seconds": np.ones(9)}, "10 positive"),
+        ({"recipe": RECIPE.replace(noise_unit="second"), "step_seconds": np.zeros(10)}, "10 positive"),
+        ({"voxel_dtype": "int64"}, "int64"),
+    ],
+)
+def test_a_clip_that_does_not_fit_its_draw_is_refused(change: Any, message: Any) -> None:
+    arguments = {"frames": FRAMES, "params": PARAMS, "recipe": RECIPE, "voxel_dtype": "int8"} | change
+    with pytest.raises(UsageError, match=message):
+        simulate_clip(**arguments)
+
+
+def test_log_table() -> None:
+    for gamma, eps in ((2.2, 1e-3), (1.0, 1e-6), (0.45, 1.0)):
+        expected = np.log(eps + (np.arange(256) / 255) ** gamma)
+        np.testing.assert_allclose(log_table_float64(gamma, eps), expected, rtol=1e-13, atol=1e-15)
+        table = log_table(gamma, eps)
+        np.testing.assert_array_equal(table, log_table_float64(gamma, eps).astype(np.float32))
+        assert (np.diff(table) > 0).all()
+        assert table is log_table(gamma, eps)
+        assert not table.flags.writeable
+    assert math.isclose(log_table(2.2, 1e-3)[255] - log_table(2.2, 1e-3)[0], 6.909, abs_tol=1e-3)
+
+
+def test_voxel_array() -> None:
+    assert voxel_array(2, 5, 3, 4, "int16").shape == (2, 5, 3, 4)
+    with pytest.raises(UsageError, match="uint8"):
+        voxel_array(1, 1, 1, 1, "uint8")
+
+
+WARM_UP_AND_COUNT = """
+import json
+from dataclasses import replace
+import numpy as np
+from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
+from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, warm_up, words
+
+def count():
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects, words)]
+
+warm_up()
+seen = [count()]
+for dtype in ("int8", "int16", "float32"):
+    simulate_clip(FRAMES, PARAMS, RECIPE, dtype)
+    simulate_clip(FRAMES, replace(PARAMS, noise_sigma=0.0, hot_pixel_count=0), RECIPE, dtype)
+seen.append(count())
+for effects in EFFECTS:
+    recipe = RECIPE.replace(leak_hz=(1.0, 1.0) if effects.need_seconds else 0.0)
+    seconds = np.linspace(0.01, 0.1, 10) if effects.need_seconds else None
+    for noise_sigma in (0.0, 0.1):
+        simulate_clip(FRAMES, replace(PARAMS, noise_sigma=noise_sigma, effects=effects), recipe, "int8", seconds)
+seen.append(count())
+print(json.dumps(seen))
+"""
+
+EFFECTS = [
+    Effects(threshold_mismatch_sigma=0.03),
+    Effects(shot_noise_hz=2.0),
+    Effects(leak_hz=0.1),
+    Effects(refractory_seconds=1e-3),
+    Effects(photoreceptor_hz=100.0),
+    Effects(dead_pixel_count=3),
+    Effects(0.03, 2.0, 0.1, 1e-3, 100.0, 3),
+]
+
+
+def test_after_warm_up_nothing_is_compiled() -> None:
+    command = [sys.executable, "-c", WARM_UP_AND_COUNT]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert json.loads(run.stdout) == [[3, 1, 1]] * 3

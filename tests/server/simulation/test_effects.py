@@ -1,0 +1,461 @@
+"""Effects beyond the paper's pixel: the kernel against its numpy definition (bit for bit), against the slow oracle, and
+each effect against what its equation says of a scene that can be solved on paper."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.server.simulation import effect_oracle, reference
+from tests.server.simulation.effect_oracle import Camera, Chance
+from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.test_pixel import moving_frames
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import LARGEST_NORMAL, Recipe, preset
+from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
+from v2v_server.simulation import effects as equations
+from v2v_server.simulation import noise, simulate, simulate_clip
+from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.voxel import rounding_tolerance
+
+GAMMA, LOG_EPS, FPS = 2.2, 1e-3, 25.0
+ALL = Effects(0.15, 20.0, 3.0, 0.005, 20.0, 2)
+
+
+def params_of(effects: Effects, seed: int = 0, **changes: Any) -> SampleParams:
+    plain = SampleParams(0.2, 0.25, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, noise_key_of_seed(seed), effects)
+    return dataclasses.replace(plain, **changes)
+
+
+def arguments_of(effects: Effects) -> dict[str, Any]:
+    return dataclasses.asdict(effects) | {"frames_per_second": FPS}
+
+
+def tolerance_of(effects: Effects) -> float:
+    smallest = 0.2 * max(1 - LARGEST_NORMAL * effects.threshold_mismatch_sigma, 0.25)
+    return rounding_tolerance(smallest, smallest)
+
+
+some_effects = st.builds(
+    Effects,
+    threshold_mismatch_sigma=st.sampled_from((0.0, 0.1, 0.9)),
+    shot_noise_hz=st.sampled_from((0.0, 3.0, 300.0)),
+    leak_hz=st.sampled_from((0.0, 0.1, 40.0)),
+    refractory_seconds=st.sampled_from((0.0, 1e-4, 0.01, 0.1)),
+    photoreceptor_hz=st.sampled_from((0.0, 1.0, 100.0)),
+    dead_pixel_count=st.integers(0, 1),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    effects=some_effects,
+    size=st.sampled_from([(1, 1), (6, 8), (1, 513), (31, 33)]),
+    noise_sigma=st.sampled_from([0.0, 0.1]),
+    hot_count=st.integers(0, 1),
+    precision=st.sampled_from(["float32", "float64"]),
+    seed=st.integers(0, 2**64 - 1),
+)
+def test_kernel_equals_its_numpy_definition(
+    effects: Effects, size: Any, noise_sigma: Any, hot_count: Any, precision: Any, seed: Any
+) -> None:
+    if not effects:
+        effects = dataclasses.replace(NO_EFFECTS, leak_hz=1.0)
+    steps, pixels = 12, size[0] * size[1]
+    frames = moving_frames(steps + 1, *size, seed=seed % 256)
+    got = simulate(
+        frames, threshold_pos=0.2, threshold_neg=0.25, noise_sigma=noise_sigma, hot_pixel_count=hot_count,
+        hot_pixel_sigma=2.0, bins=steps, seed=seed, dtype="float32", precision=precision, **arguments_of(effects),
+    ).voxels.reshape(steps, pixels)  # fmt: skip
+    real: Any = np.dtype(precision).type
+    params = params_of(effects, seed)
+    prepared = equations.prepare(params, (GAMMA, LOG_EPS), np.full(steps, 1 / FPS), pixels, real)
+    expected = reference.simulate_with_effects(
+        frames.reshape(steps + 1, pixels),
+        log_table(GAMMA, LOG_EPS) if real is np.float32 else log_table_float64(GAMMA, LOG_EPS),
+        prepared,
+        params.noise_key,
+        threshold_pos=0.2,
+        threshold_neg=0.25,
+        tolerance=tolerance_of(effects),
+        noise_sigma=noise_sigma,
+        hot_count=hot_count,
+        hot_sigma=2.0,
+    )
+    np.testing.assert_array_equal(got, expected.astype(np.float32))
+
+
+@settings(max_examples=60, deadline=None)
+@given(effects=some_effects, noise_sigma=st.sampled_from([0.0, 0.1]), seed=st.integers(0, 2**64 - 1))
+def test_kernel_equals_the_oracle(effects: Effects, noise_sigma: float, seed: int) -> None:
+    """Event by event in continuous time, with steps of three lengths."""
+    recipe = Recipe(voxels_per_clip=3, crop_height_px=6, crop_width_px=8, noise_unit="second")
+    steps, pixels, frames = recipe.steps, 48, moving_frames(recipe.steps + 1, 6, 8, seed % 256)
+    durations = np.array([0.02, 0.04, 0.1])[np.arange(steps) % 3]
+    params = params_of(effects or ALL, seed, noise_sigma=noise_sigma, hot_pixel_count=2, hot_pixel_sigma=3.0)
+    effects, key = params.effects, params.noise_key
+    change = noise.standard_normals(key, steps, pixels).astype(np.float64) * noise_sigma * np.sqrt(durations)[:, None]
+    position, normal = noise.hot_pixels(key, 2, pixels)
+    change[:, position] += 3.0 * normal.astype(np.float64) * durations[:, None]
+    shot = np.stack(noise.shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
+    chance = Chance(
+        noise.start_uniforms(key, pixels).astype(np.float64),
+        change,
+        np.stack(noise.mismatch_normals(key, pixels)).astype(np.float64),
+        shot,
+        noise.dead_pixels(key, effects.dead_pixel_count, pixels),
+    )
+    camera = Camera(
+        0.2, 0.25, tolerance_of(effects), effects.threshold_mismatch_sigma, effects.shot_noise_hz, effects.leak_hz,
+        effects.refractory_seconds, effects.photoreceptor_hz,
+    )  # fmt: skip
+    expected = effect_oracle.simulate(frames.reshape(-1, pixels), durations, GAMMA, LOG_EPS, camera, chance)
+    got = simulate_clip(frames, params, recipe, "float32", durations).voxels.reshape(steps, pixels)
+    # float32 against float64: an event that is due at the end of a step may fall into the next.
+    wrong = np.abs(got - expected)
+    assert np.count_nonzero(wrong) <= 4
+    assert wrong.max() <= 1
+
+
+# --- what each equation says ------------------------------------------------------------------------------------------
+
+
+def still(level: int, steps: int, height: int = 16, width: int = 16) -> np.ndarray:
+    return np.broadcast_to(np.uint8(level), (steps + 1, height, width))
+
+
+def light_of(level: int) -> float:
+    return (level / 255) ** GAMMA
+
+
+@pytest.mark.parametrize("mismatch", [0.0, 0.2])
+@pytest.mark.parametrize("refractory", [0.0, 0.001])
+def test_a_leak_of_one_hertz_fires_once_a_second_on_a_still_scene(mismatch: float, refractory: float) -> None:
+    got = simulate(
+        still(90, 5000), threshold_pos=0.2, bins=5000, dtype="float32", frames_per_second=FPS, leak_hz=1.0,
+        threshold_mismatch_sigma=mismatch, refractory_seconds=refractory,
+    ).voxels  # fmt: skip
+    per_pixel = got.sum((0, 1))
+    assert got.min() == 0
+    assert per_pixel.min() >= 190
+    assert per_pixel.max() <= 210
+    # The residual starts around 0 and ends half a threshold above it; a refractory period lengthens every interval.
+    assert per_pixel.mean() == pytest.approx(200 / (1 + refractory) - 0.5, abs=0.2)
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+@pytest.mark.parametrize("rate", [0.5, 40.0])
+def test_shot_noise_is_two_poisson_processes(level: int, rate: float) -> None:
+    """Their difference has mean 0 and as its variance the sum of both means; a step shows no sign of another."""
+    steps = 500
+    got = simulate(
+        still(level, steps, 40, 40), threshold_pos=0.2, bins=steps, dtype="float32", frames_per_second=FPS,
+        shot_noise_hz=rate, seed=level,
+    ).voxels.reshape(steps, -1).astype(float)  # fmt: skip
+    mean = rate / FPS * (1 - 0.75 * light_of(level))
+    n = got.size
+    assert abs(got.mean()) < 4 * math.sqrt(mean / n)
+    # Fourth moment of a difference of Poissons: mean + 3 mean^2.
+    assert abs((got**2).mean() - mean) < 4 * math.sqrt((mean + 2 * mean**2) / n)
+    assert abs((got[1:] * got[:-1]).mean()) < 4 * mean / math.sqrt(n)
+    assert abs((got[:, 1:] * got[:, :-1]).mean()) < 4 * mean / math.sqrt(n)
+
+
+def test_a_black_pixel_has_the_stated_rate_of_either_sign() -> None:
+    steps = 4000
+    got = simulate(
+        still(0, steps), threshold_pos=0.2, bins=steps, dtype="float32", frames_per_second=1000.0, shot_noise_hz=5.0
+    ).voxels
+    for sign in (1, -1):
+        events = np.count_nonzero(got == sign)
+        expected = 2.5 * steps / 1000 * 256
+        # Steps of a millisecond: the two signs almost never meet in one.
+        assert abs(events - expected) < 4 * math.sqrt(expected)
+
+
+def test_a_shot_event_clears_the_residual() -> None:
+    """A pixel 0.15 below its threshold of 0.2 fires at the change of 0.1 unless a shot event came before."""
+    steps = 2
+    frames = np.full((steps + 1, 100, 100), 200, np.uint8)
+    frames[2] = 209  # 0.097 log units
+    arguments: Any = {"threshold_pos": 0.2, "start_residual": 0.15, "bins": steps, "dtype": "float32"}
+    assert (simulate(frames, **arguments).voxels.sum((0, 1)) == 1).all()
+    got = simulate(frames, frames_per_second=FPS, shot_noise_hz=15.0, **arguments).voxels[0]
+    hit, later = got[0] != 0, got[1]
+    assert 0.2 < hit.mean() < 0.4
+    assert later[~hit].mean() - later[hit].mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_mismatch_spreads_the_thresholds_by_the_stated_sigma() -> None:
+    """From black to white and back: 6.9 log units, counted in thresholds of each pixel."""
+    frames = np.zeros((3, 100, 100), np.uint8)
+    frames[1] = 255
+    got = simulate(
+        frames, threshold_pos=0.01, threshold_neg=0.012, start_residual=0.0, bins=2, dtype="float32",
+        threshold_mismatch_sigma=0.1,
+    ).voxels[0]  # fmt: skip
+    height = float(log_table_float64(GAMMA, LOG_EPS)[255] - log_table_float64(GAMMA, LOG_EPS)[0])
+    shares = [height / got[0].ravel() / 0.01, -height / got[1].ravel() / 0.012]
+    for share in shares:
+        assert abs(share.mean() - 1) < 4 * 0.1 / 100 + 2e-3
+        assert abs(share.std() - 0.1) < 4 * 0.1 / math.sqrt(2 * share.size) + 1e-3
+    assert abs(np.corrcoef(*shares)[0, 1]) < 4 / 100
+    # The numbers themselves, to what a count resolves.
+    normals = noise.mismatch_normals(noise_key_of_seed(0), 10_000)
+    np.testing.assert_allclose(shares[0], 1 + 0.1 * normals[0], rtol=4e-3)
+    assert abs(np.corrcoef(shares[0][1:], shares[0][:-1])[0, 1]) < 4 / 100
+
+
+def test_no_threshold_falls_below_a_quarter() -> None:
+    frames = np.zeros((2, 100, 100), np.uint8)
+    frames[1] = 255
+    got = simulate(
+        frames, threshold_pos=0.1, start_residual=0.0, bins=1, dtype="float32", threshold_mismatch_sigma=1.0
+    ).voxels
+    assert got.max() == math.floor(6.909 / 0.025)
+
+
+@pytest.mark.parametrize("refractory", [1e-4, 1e-3, 0.01, 0.039])
+def test_the_refractory_period_stretches_the_time_between_events(refractory: float) -> None:
+    """Black to white in a step of 40 ms at constant speed: an event every c / slope + t."""
+    frames = np.zeros((2, 1, 1), np.uint8)
+    frames[1] = 255
+    table = log_table_float64(GAMMA, LOG_EPS)
+    slope = float(table[255] - table[0]) * FPS
+    got = simulate(
+        frames, threshold_pos=0.05, start_residual=0.0, bins=1, dtype="float32", frames_per_second=FPS,
+        refractory_seconds=refractory,
+    ).voxels  # fmt: skip
+    assert got.item() == 1 + math.floor((1 / FPS - 0.05 / slope) / (0.05 / slope + refractory))
+
+
+def test_no_step_holds_more_events_than_fit_beside_each_other() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (101, 10, 10)).astype(np.uint8)
+    got = simulate(
+        frames, threshold_pos=0.01, bins=100, dtype="float32", frames_per_second=FPS, refractory_seconds=0.015
+    ).voxels
+    assert np.abs(got).max() == 3  # at 0+, 15 and 30 ms of 40
+    long = simulate(
+        frames, threshold_pos=0.01, bins=100, dtype="float32", frames_per_second=FPS, refractory_seconds=0.1
+    ).voxels.reshape(100, -1)
+    fired = np.abs(long)
+    assert fired.max() == 1
+    # A tenth of a second is two and a half steps: of any two in a row, one fires at most; of four, about one does.
+    assert (fired[:-1] + fired[1:]).max() == 1
+    assert fired.sum() > 100 * 100 / 4
+
+
+def test_the_low_pass_answers_a_jump_as_it_should() -> None:
+    """Black to white within a step of T, then still: P lags by (e^(x T) - 1) / (x T) e^(-x t), x = 2 pi f."""
+    rate, cutoff, c, steps = 1000.0, 20.0, 0.002, 100
+    frames = np.zeros((steps + 1, 1, 1), np.uint8)
+    frames[1:] = 255
+    got = simulate(
+        frames, threshold_pos=c, start_residual=0.0, bins=steps, dtype="float32", frames_per_second=rate,
+        photoreceptor_hz=cutoff, precision="float64",
+    ).voxels.ravel()  # fmt: skip
+    x, time = 2 * math.pi * cutoff, np.arange(1, steps + 1) / rate
+    table = log_table_float64(GAMMA, LOG_EPS)
+    height = float(table[255] - table[0])
+    expected = height * (1 - (math.exp(x / rate) - 1) / (x / rate) * np.exp(-x * time))
+    assert np.abs(np.cumsum(got) * c - expected).max() < c
+    # After a time constant and half a step, 63 %.
+    assert np.interp(1 / x + 0.5 / rate, time, expected) / height == pytest.approx(1 - 1 / math.e, abs=1e-3)
+
+
+@pytest.mark.parametrize("hertz", [2.0, 10.0, 40.0])
+@pytest.mark.parametrize("level", [120, 240])
+def test_the_low_pass_damps_a_sinusoid_by_its_gain(hertz: float, level: int) -> None:
+    """1 / sqrt(1 + (h / f)^2) with f in proportion to the light."""
+    rate, cutoff, c, steps = 2000.0, 30.0, 0.001, 2000
+    time = np.arange(steps + 1) / rate
+    frames = np.rint(level + 12 * np.sin(2 * math.pi * hertz * time)).astype(np.uint8)
+    wave = np.exp(2j * math.pi * hertz * time[1:])
+
+    def amplitude(signal: np.ndarray) -> float:
+        later = slice(steps // 2, None)  # whole periods, the transient gone
+        return float(2 * abs((signal[later] * wave[later].conj()).mean()))
+
+    got = simulate(
+        frames[:, None, None], threshold_pos=c, bins=steps, dtype="float32", frames_per_second=rate,
+        photoreceptor_hz=cutoff, precision="float64",
+    ).voxels.ravel()  # fmt: skip
+    corner = cutoff * (light_of(level) + 20 / 255) / (1 + 20 / 255)
+    gain = amplitude(np.cumsum(got) * c) / amplitude(log_table_float64(GAMMA, LOG_EPS)[frames[1:]])
+    assert gain == pytest.approx(1 / math.sqrt(1 + (hertz / corner) ** 2), rel=0.03)
+
+
+def test_dead_pixels_are_dead_and_no_others() -> None:
+    frames = moving_frames(21, 40, 40)
+    plain = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20).voxels
+    got = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20, dead_pixel_count=100).voxels
+    position = noise.dead_pixels(noise_key_of_seed(0), 100, 1600)
+    assert len(set(position.tolist())) == 100
+    expected = plain.reshape(20, -1).copy()
+    expected[:, position] = 0
+    np.testing.assert_array_equal(got.reshape(20, -1), expected)
+
+
+def test_an_effect_that_can_do_nothing_leaves_every_bit_alone() -> None:
+    """The other kernel, without hot pixels, is the same arithmetic in the same order."""
+    frames = moving_frames(31, 33, 47)
+    for dtype in ("int8", "float32"):
+        plain = simulate(frames, threshold_pos=0.07, threshold_neg=0.1, noise_sigma=0.1, bins=3, dtype=dtype)
+        other = simulate(
+            frames, threshold_pos=0.07, threshold_neg=0.1, noise_sigma=0.1, bins=3, dtype=dtype,
+            frames_per_second=1e6, shot_noise_hz=1e-9,
+        )  # fmt: skip
+        np.testing.assert_array_equal(plain.voxels, other.voxels)
+        assert plain.saturated_bins == other.saturated_bins
+
+
+def test_noise_per_frame_stays_per_frame_where_an_effect_needs_seconds() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=16, crop_width_px=16, leak_hz=(1.0, 1.0))
+    params = params_of(dataclasses.replace(NO_EFFECTS, dead_pixel_count=1), noise_sigma=0.1)
+    frames = moving_frames(recipe.frames_needed, 16, 16)
+    clips = [simulate_clip(frames, params, recipe, "int8", np.full(recipe.steps, dt)).voxels for dt in (0.01, 0.5)]
+    np.testing.assert_array_equal(clips[0], clips[1])
+
+
+# --- what leaving one out costs ---------------------------------------------------------------------------------------
+
+
+def pan(steps: int, px_per_frame: float) -> np.ndarray:
+    """A smooth texture that glides by."""
+    row, column = np.mgrid[0:48, 0:48]
+    place = [column + px_per_frame * t for t in range(steps + 1)]
+    wave = [np.sin(x / 5.0) * np.cos(row / 7.0) + 0.4 * np.sin((x + row) / 3.0) for x in place]
+    return np.clip(127 + 85 * np.array(wave), 0, 255).astype(np.uint8)
+
+
+SCENES: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+    "threshold_mismatch_sigma": (pan(50, 1.0), {"threshold_mismatch_sigma": 0.15}),
+    "shot_noise_hz": (still(20, 50, 48, 48), {"shot_noise_hz": 5.0}),
+    "leak_hz": (still(128, 50, 48, 48), {"leak_hz": 0.1}),
+    "refractory_seconds": (pan(50, 4.0), {"refractory_seconds": 1e-3}),
+    "photoreceptor_hz": (pan(50, 2.0), {"photoreceptor_hz": 30.0}),
+    "dead_pixel_count": (pan(50, 1.0), {"dead_pixel_count": 231}),
+}
+TOLERANCE = 0.05
+
+
+def voxel_error(name: str) -> float:
+    """sum |without - with| / sum |with|, bins of 5 frames at 25 frames a second, c = 0.2."""
+    frames, effect = SCENES[name]
+    arguments: Any = {
+        "threshold_pos": 0.2,
+        "bins": 10,
+        "frames_per_bin": 5,
+        "dtype": "float32",
+        "frames_per_second": FPS,
+    }
+    true = simulate(frames, **arguments, **effect).voxels.astype(int)
+    return float(np.abs(simulate(frames, **arguments).voxels - true).sum() / np.abs(true).sum())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_leaving_an_effect_out_is_seen_on_its_scene(name: str) -> None:
+    """What docs/effects.md says of each: without it the voxels are wrong by more than 5 %."""
+    assert voxel_error(name) > TOLERANCE
+
+
+# --- tables, limits, refusals -----------------------------------------------------------------------------------------
+
+
+def test_the_exponential() -> None:
+    x = np.concatenate([-np.geomspace(1e-12, 699, 500), np.linspace(0, 7, 100)])
+    np.testing.assert_allclose(equations.exponential(x), np.exp(x), rtol=2e-15)
+
+
+def test_tables_against_their_equations() -> None:
+    light = equations.linear_light(GAMMA, LOG_EPS)
+    np.testing.assert_allclose(light, (np.arange(256) / 255) ** GAMMA, atol=1e-15)
+    means = equations.shot_means(1000.0, light, np.array([0.01, 0.1]))
+    np.testing.assert_allclose(means[:, [0, 255]], [[5.0, 1.25], [50.0, 12.5]])
+    table = equations.shot_table(means) / 2.0**32
+    for d, level in ((0, 0), (1, 255), (1, 0)):
+        for k in (0, 3, 12, 60):
+            below = sum(math.exp(-means[d, level]) * means[d, level] ** j / math.factorial(j) for j in range(k + 1))
+            expected = 1 - below if k < table.shape[1] else 0.0
+            assert table[d, min(k, table.shape[1] - 1), level] == pytest.approx(expected, abs=3e-10)
+    slow, fast = equations.low_pass_table(30.0, light, 0.02)
+    x = 2 * math.pi * 30.0 * 0.02
+    assert slow[255] == pytest.approx(1 - math.exp(-x))
+    assert fast[255] == pytest.approx(1 - (1 - math.exp(-x)) / x)
+    assert (np.diff(slow) > 0).all()
+
+
+FRAMES = moving_frames(11, 6, 7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"leak_hz": 1.0, "frames_per_second": None}, "frames_per_second is missing"),
+        ({"frames_per_second": 0.0}, "frames_per_second"),
+        ({"frames_per_second": math.nan}, "frames_per_second"),
+        ({"threshold_mismatch_sigma": 1.1}, "threshold_mismatch_sigma = 1.1: give a number from 0.0 to 1.0"),
+        ({"shot_noise_hz": -1.0}, "shot_noise_hz"),
+        ({"shot_noise_hz": 5e3}, r"100 events of a polarity in a step of 0.04 s; the limit is 64"),
+        ({"leak_hz": math.nan}, "leak_hz"),
+        ({"leak_hz": "much"}, "leak_hz"),
+        ({"refractory_seconds": math.inf}, "refractory_seconds"),
+        ({"photoreceptor_hz": 1e-3}, "photoreceptor_hz = 0.001: give 0 for no low-pass, or 0.01 or more"),
+        ({"dead_pixel_count": 43}, "dead_pixel_count = 43.* 42"),
+        ({"dead_pixel_count": 1.0}, "dead_pixel_count"),
+    ],
+)
+def test_bad_effects_are_refused_by_name(change: Any, message: Any) -> None:
+    with pytest.raises(UsageError, match=message):
+        simulate(FRAMES, threshold_pos=0.2, **({"frames_per_second": FPS} | change))
+
+
+def test_a_clip_with_a_timed_effect_needs_its_durations() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=7, leak_hz=(1.0, 1.0))
+    with pytest.raises(UsageError, match="missing: noise_unit is 'frame', and there is an effect in Hz"):
+        simulate_clip(FRAMES, params_of(ALL), recipe, "int8")
+    with pytest.raises(UsageError, match="unwanted: noise_unit is 'frame', and there is no effect in Hz"):
+        simulate_clip(FRAMES, params_of(NO_EFFECTS), recipe.replace(leak_hz=0.0), "int8", np.ones(10))
+
+
+def test_a_dead_pixel_needs_no_clock() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=7, dead_pixel_share=(1.0, 1.0))
+    params = params_of(dataclasses.replace(NO_EFFECTS, dead_pixel_count=42))
+    assert not simulate_clip(FRAMES, params, recipe, "int8").voxels.any()
+
+
+# --- the same bytes everywhere ----------------------------------------------------------------------------------------
+
+GOLDEN = {
+    "int8": "583de2e890b7da92ccc0262adf0f3b3f0f9190501a6ff6fae72a894314e346b8",
+    "float32": "34835d3548cd23d03591aed18d5bd11e3ab06e1723f2d8bce3a69410ef2e1a1b",
+}
+
+
+def digest(dtype: str) -> str:
+    """Digest of one fixed clip with every effect of ``davis346`` on."""
+    recipe = preset("davis346").replace(voxels_per_clip=6, frames_per_bin=2, crop_height_px=37, crop_width_px=45)
+    params = params_of(ALL, 9, noise_sigma=0.3, hot_pixel_count=9, hot_pixel_sigma=20.0, pauses=((11, 7), (40, 3)))
+    durations = np.array([0.033, 0.033, 0.034])[np.arange(recipe.steps) % 3]
+    voxels, saturated = simulate_clip(moving_frames(61, 37, 45), params, recipe, dtype, durations)
+    return hashlib.sha256(voxels.astype(voxels.dtype.newbyteorder("<")).tobytes() + str(saturated).encode()).hexdigest()
+
+
+@pytest.mark.parametrize("dtype", sorted(GOLDEN))
+def test_golden_voxels(dtype: Any) -> None:
+    assert digest(dtype) == GOLDEN[dtype]
+
+
+@pytest.mark.slow
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
+    code = "from tests.server.simulation.test_effects import digest; print(digest('float32'))"
+    assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["float32"]]

@@ -1,0 +1,192 @@
+"""The edges of what may be asked for: every row of ``v2v-bench extremes``, and the same for cameras drawn at random."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.server.simulation import oracle, reference
+from v2v_bench.accuracy import extremes
+from v2v_bench.accuracy.extreme_rows import Finding, Row, refused, rows, texture
+from v2v_bench.speed.balance import Camera, arithmetic, balance, imbalance, trace_of
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
+from v2v_protocol.sample import SampleParams
+from v2v_server.simulation import noise, simulate, simulate_clip
+from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.intensity import log_table_float64
+from v2v_server.simulation.precision import AUTO, LIMITS, choose, error_bound
+from v2v_server.simulation.voxel import rounding_tolerance
+
+
+@pytest.mark.parametrize("row", [row for row in rows() if not row.slow], ids=lambda row: row.name)
+def test_row(row: Row) -> None:
+    (record,) = extremes.measure([row])
+    assert record["passed"], record
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in rows() if row.slow], ids=lambda row: row.name)
+def test_slow_row(row: Row) -> None:
+    (record,) = extremes.measure([row])
+    assert record["passed"], record
+
+
+def test_a_refused_row_passes_by_the_stated_error_only() -> None:
+    def refuse() -> None:
+        raise RecipeError("value 7 is above the limit 5")
+
+    assert refused(RecipeError, (refuse, ("7", "5"))).measured == 0
+    assert refused(RecipeError, (refuse, ("7", "6"))).measured == 1
+    assert refused(RecipeError, (lambda: None, ())).measured == 1
+    assert refused(UsageError, (refuse, ("7", "5"))).measured == 1
+    with pytest.raises(ZeroDivisionError):
+        refused(UsageError, (lambda: 1 // 0, ()))
+
+
+def powers(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(math.log(low), math.log(high)).map(math.exp)
+
+
+cameras = st.builds(
+    Camera,
+    threshold_pos=powers(1e-6, 1e3),
+    threshold_neg=powers(1e-6, 1e3),
+    noise_sigma=st.one_of(st.just(0.0), powers(1e-6, 1e3)),
+    hot_pixel_count=st.integers(0, 48),
+    hot_pixel_sigma=st.one_of(st.just(0.0), powers(1e-3, 1e6)),
+    gamma=st.floats(0.3, 4.0),
+    log_eps=powers(1e-9, 1e-1),
+    seed=st.integers(0, 2**64 - 1),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(cameras, st.integers(1, 60))
+def test_events_account_for_every_change_of_any_camera(camera: Camera, steps: int) -> None:
+    found = balance(camera, texture(steps))
+    assert found.holds, found
+    # The bound is the promise of precision.py: half a threshold, whatever the camera.
+    assert found.bound <= min(camera.threshold_pos, camera.threshold_neg) / 2
+    assert found.fired <= found.events * 48
+
+
+def test_the_balance_sees_a_lost_event() -> None:
+    camera, frames = Camera(noise_sigma=0.1), texture(20)
+    seen = trace_of(camera, frames, np.float32)
+    assert imbalance(camera, frames, seen) < 1e-4
+    seen.counts[3, 5] -= 1
+    assert imbalance(camera, frames, seen) > 0.19
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.3, 1e-4])
+def test_the_trace_agrees_with_the_oracle(threshold: float) -> None:
+    camera, frames = Camera(threshold, 1.3 * threshold, 0.05, 7, 3.0), texture(30)
+    normals = noise.standard_normals(noise_key_of_seed(0), 30, 48).astype(np.float64) * camera.noise_sigma
+    position, hot = noise.hot_pixels(noise_key_of_seed(0), 7, 48)
+    normals[:, position] += hot.astype(np.float64) * camera.hot_pixel_sigma
+    expected = oracle.simulate(
+        oracle.log_intensity(frames.reshape(31, 48), camera.gamma, camera.log_eps),
+        normals,
+        noise.start_uniforms(noise_key_of_seed(0), 48).astype(np.float64),
+        threshold_pos=camera.threshold_pos,
+        threshold_neg=camera.threshold_neg,
+        tolerance=rounding_tolerance(camera.threshold_pos, camera.threshold_neg),
+    )
+    got = trace_of(camera, frames, np.float64)
+    np.testing.assert_array_equal(got.counts, expected.voxels)
+    np.testing.assert_allclose(got.residual_end, expected.residual_end, atol=1e-10)
+
+
+def test_the_arithmetic_follows_the_limits() -> None:
+    assert choose(AUTO, 2.0**20) is np.float32
+    assert choose(AUTO, np.nextafter(2.0**20, math.inf)) is np.float64
+    assert choose(AUTO, 2.0**49) is np.float64
+    assert choose("float64", 1.0) is np.float64
+    for asked, events in ((AUTO, 1e15), (AUTO, math.inf), (AUTO, math.nan), ("float64", 1e15), ("float32", 1.1e6)):
+        with pytest.raises(UsageError, match="counts at most"):
+            choose(asked, events)
+    for name, (real, limit) in LIMITS.items():
+        assert error_bound(real, limit, 0.3) == 0.15, name
+
+
+def test_no_normal_is_larger_than_the_limits_assume() -> None:
+    words = np.array([0, 1, 2**31, 2**31 + 1], np.uint32)
+    largest = max(float(np.abs(part).max()) for part in noise.box_muller(words, np.zeros(4, np.uint32)))
+    assert 6.55 < largest <= LARGEST_NORMAL
+
+
+def test_most_events_by_hand() -> None:
+    # 4 steps and the start, each the larger threshold and the range; noise of 6.56 deviations; and the level itself.
+    assert most_events(4, (-6.0, 1.0), (0.5, 0.25), 2.0) == (5 * (0.5 + 7.0) + 6.56 * 2.0 + 6.0) / 0.25
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_stays_in_float32(name: str) -> None:
+    assert choose(AUTO, PRESETS[name].most_events) is np.float32
+
+
+def test_a_recipe_is_bounded_by_its_worst_draw() -> None:
+    recipe = Recipe(hot_pixel_sigma=(0.0, 1e6), threshold=(0.1, 1.0), threshold_ratio=(0.5, 2.0))
+    assert recipe.smallest_and_largest_threshold == (0.05, 2.0)
+    ends = math.log(1e-3), math.log1p(1e-3)
+    assert recipe.most_events == most_events(200, ends, (0.05, 2.0), 200 * (0.1 + 1e6))
+    assert recipe.replace(hot_pixel_share=0.0).most_events == most_events(200, ends, (0.05, 2.0), 200 * 0.1)
+    scaled = recipe.replace(hot_pixel_share=0.0, noise_scales_with_threshold=True)
+    assert scaled.most_events == most_events(200, ends, (0.05, 2.0), 200 * 0.1 * 2.0)
+    assert choose(AUTO, recipe.most_events) is np.float64
+    assert recipe.most_events < LARGEST_EVENTS
+
+
+@pytest.mark.parametrize(("hot_sigma", "seconds", "real"), [
+    (3.0, None, "float32"), (1e6, None, "float64"), (3.0, 1e-3, "float32"), (3.0, 1e6, "float64"),
+])  # fmt: skip
+def test_a_clip_is_simulated_in_the_arithmetic_it_needs(hot_sigma: float, seconds: Any, real: Any) -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=8, noise_unit="second" if seconds else "frame")
+    key = (1, 2, 3, 4)
+    params = SampleParams(0.1, 0.125, 0.1, 5, hot_sigma, (), 1.0, 0, 0, False, 0.0, key)
+    frames, durations = texture(10), np.full(10, seconds or 1.0)
+    got = simulate_clip(frames, params, recipe, "float32", durations if seconds else None).voxels.reshape(10, 48)
+    level = log_table_float64(recipe.gamma, recipe.log_eps).astype(real)[frames.reshape(11, 48)]
+    expected, _ = reference.simulate(
+        level, key, threshold_pos=0.1, threshold_neg=0.125, noise_scale=0.1 * np.sqrt(durations), hot_count=5,
+        hot_sigma=hot_sigma, hot_scale=durations, frames_per_bin=1, dtype="float32",
+    )  # fmt: skip
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_a_drawn_clip_beyond_float64_is_refused() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=8, noise_unit="second")
+    listed = SampleParams(1e-20, 1e-20, 0.1, 5, 1.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+    with pytest.raises(UsageError, match=r"events; float64 counts at most 5\.629e\+14"):
+        simulate_clip(texture(10), listed, recipe, "int8", np.ones(10))
+    tiny = SampleParams(1e-40, 1e-40, 0.1, 5, 1.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+    with pytest.raises(UsageError, match="threshold_pos = 1e-40"):
+        simulate_clip(texture(10), tiny, recipe, "int8", np.ones(10))
+
+
+def test_float32_asked_for_by_name_is_kept_to_its_limit() -> None:
+    frames = texture(60)
+    assert arithmetic(Camera(1e-3, 1e-3), frames)[0] is np.float32
+    simulate(frames, threshold_pos=1e-3, bins=60, precision="float32")
+    with pytest.raises(UsageError, match=r"float32 counts at most 1\.049e\+06 .* precision='auto'"):
+        simulate(frames, threshold_pos=1e-4, bins=60, precision="float32")
+
+
+def test_the_command_reports_and_fails_by_its_status(tmp_path: Any, capsys: Any, monkeypatch: Any) -> None:
+    assert (
+        extremes.main(["--rows", "black", "--json", str(tmp_path / "e.json"), "--plot", str(tmp_path / "e.png")]) == 0
+    )
+    assert "black and white in turns" in (tmp_path / "e.json").read_text()
+    assert (tmp_path / "e.png").stat().st_size > 1000
+    assert extremes.main(["--rows", "no such row"]) == 2
+    assert "no row" in capsys.readouterr().err
+    bad = Row("bad", "counted", "things", lambda: Finding(2.0, 1.0))
+    monkeypatch.setattr(extremes, "rows", lambda: [bad])
+    assert extremes.main([]) == 1
+    assert "1 rows fail: bad" in capsys.readouterr().err

@@ -1,0 +1,83 @@
+"""Which compiled kernels a stream needs is known before its first sample."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from v2v_protocol.recipe import Recipe, preset
+from v2v_server.simulation.clip import _log_ends, _most_events
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.precision import AUTO, choose
+from v2v_server.simulation.variants import USUAL, Variant, variants
+
+LOAD_AND_COUNT = """
+import json
+from dataclasses import replace
+from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
+from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, warm_up
+from v2v_server.simulation.variants import USUAL, Variant, load
+
+def count():
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects)]
+
+warm_up()
+seen = [count()]
+for variant in USUAL:
+    load(variant)
+seen.append(count())
+load(Variant("int16", True, "float32"))
+load(Variant("int8", False, "float64"))
+seen.append(count())
+simulate_clip(FRAMES, replace(PARAMS, effects=EFFECTS[0]), RECIPE, "int16")
+simulate_clip(FRAMES, replace(PARAMS, threshold_pos=1e-5, threshold_neg=1e-5), RECIPE, "int8")
+seen.append(count())
+print(json.dumps(seen))
+"""
+
+
+def test_usual_ones_suffice_for_the_presets() -> None:
+    for name in ("paper", "clean", "davis346"):
+        assert variants(preset(name), "int8", 0.1) <= USUAL
+
+
+def test_effects_and_dtypes() -> None:
+    assert variants(Recipe(), "float32") == {Variant("float32", False, "float32")}
+    assert variants(preset("davis346"), "int16", 0.1) == {Variant("int16", True, "float32")}
+
+
+@pytest.mark.parametrize("step_seconds", [1 / 240, 1.0, 60.0])
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        Recipe(threshold=(1e-3, 2e-2)),
+        Recipe(threshold=(1e-3, 2e-2), threshold_source="video", threshold_mismatch_sigma=(0.0, 0.1)),
+        Recipe(threshold=(1e-3, 2e-2), threshold_source="video", noise_scales_with_threshold=True),
+        preset("davis346"),
+        preset("davis346").replace(threshold_source="video"),
+    ],
+)
+def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> None:
+    """Thresholds about those at which float32 no longer counts exactly."""
+    seconds = np.full(recipe.steps, step_seconds)
+    units = seconds if recipe.noise_unit == "second" else np.ones(recipe.steps)
+    for stated in (None, (1e-4, 1.0), (1e-3, 2e-2), (0.3, 50.0), (1e-6, 1e-6)):
+        known = variants(recipe, "int8", step_seconds, stated)
+        for index in range(20):
+            params = draw(
+                recipe, seed=1, epoch=0, index=index, picture_height_px=128, picture_width_px=128, video_id="a.mp4",
+                video_thresholds=stated,
+            )  # fmt: skip
+            real = choose(AUTO, _most_events(params, _log_ends(recipe.gamma, recipe.log_eps), units, seconds))
+            assert Variant("int8", bool(params.effects), real.__name__) in known
+
+
+@pytest.mark.slow
+def test_what_is_loaded_is_what_is_used() -> None:
+    command = [sys.executable, "-c", LOAD_AND_COUNT]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert json.loads(run.stdout) == [[3, 1], [3, 1], [4, 2], [4, 2]]

@@ -1,0 +1,152 @@
+"""What processes ask of the operating system. Each in a process of its own: these settings last."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.commands import prepare as prepare_cli
+from v2v_server.config import ServeConfig
+from v2v_server.serve import load_catalogue, serve
+from v2v_server.system import process
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
+
+
+def _in_a_process(code: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    return done.stdout.split()
+
+
+def _kernel() -> tuple[int, ...]:
+    return tuple(int(part) for part in platform.release().split("-")[0].split(".")[:2])
+
+
+def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = _in_a_process(
+        "import os\n"
+        "from v2v_server.system.process import usable_cores\n"
+        "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "print(usable_cores())\n"
+    )
+    assert said == ["1"]
+    monkeypatch.setattr(process, "_granted_cores", lambda: math.inf)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 9})
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    processes = []
+
+    def refuse(*_: object, **asked: object) -> None:
+        processes.append(asked["processes"])
+        raise CorpusError("seen enough")
+
+    monkeypatch.setattr("v2v_server.serve.open_catalogue", refuse)
+    monkeypatch.setattr("v2v_server.commands.prepare.open_catalogue", refuse)
+    with pytest.raises(CorpusError):
+        load_catalogue(ServeConfig(videos="videos", workers=16))
+    with pytest.raises(CorpusError):
+        load_catalogue(ServeConfig(videos="videos", workers=0))
+    with pytest.raises(SystemExit):
+        prepare_cli.main(["videos", "prepared"])
+    assert processes == [3, 3, 3]
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert process.usable_cores() == 64
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert process.usable_cores() == 1
+
+
+def test_a_container_is_given_processor_time_instead_of_cores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own, groups = tmp_path / "own", tmp_path / "groups"
+    (groups / "pods" / "mine").mkdir(parents=True)
+    assert process._granted_cores(groups, own) == math.inf
+    own.write_text("1:name=systemd:/\n")  # version 1
+    assert process._granted_cores(groups, own) == math.inf
+    own.write_text("0::/pods/mine\n")
+    assert process._granted_cores(groups, own) == math.inf
+    (groups / "pods" / "mine" / "cpu.max").write_text("max 100000\n")
+    assert process._granted_cores(groups, own) == math.inf
+    (groups / "pods" / "cpu.max").write_text("250000 100000\n")
+    assert process._granted_cores(groups, own) == 2.5
+    (groups / "pods" / "mine" / "cpu.max").write_text("50000 100000\n")
+    assert process._granted_cores(groups, own) == 0.5
+    own.write_text("0::/\n")  # as in a container's own namespace
+    (groups / "cpu.max").write_text("150000 100000\n")
+    assert process._granted_cores(groups, own) == 1.5
+    own.write_text("0::/../elsewhere\n")  # moved there from outside
+    assert process._granted_cores(groups, own) == 1.5
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
+    for granted, cores in ((0.5, 1), (1.5, 2), (4.0, 4), (100.0, 64), (math.inf, 64)):
+        monkeypatch.setattr(process, "_granted_cores", lambda granted=granted: granted)
+        assert process.usable_cores() == cores
+
+
+def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = _in_a_process(
+        "import resource\n"
+        "from v2v_server.system.process import open_many_files\n"
+        "hard = min(resource.getrlimit(resource.RLIMIT_NOFILE)[1], 5000)\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (64, hard))\n"
+        "open_many_files()\n"
+        "print(hard, *resource.getrlimit(resource.RLIMIT_NOFILE))\n"
+    )
+    assert len(said) == 3
+    assert len(set(said)) == 1
+    done: list[str] = []
+
+    def load(config: ServeConfig) -> Catalogue:
+        raise CorpusError("seen enough")
+
+    monkeypatch.setattr("v2v_server.serve.keep_freed_memory", lambda: done.append("memory"))
+    monkeypatch.setattr("v2v_server.serve.open_many_files", lambda: done.append("files"))
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", load)
+    with pytest.raises(CorpusError):
+        serve(ServeConfig(videos="videos"))
+    assert done == ["memory", "files"]
+
+
+def test_long_turns_leave_niceness_and_policy_alone() -> None:
+    said = _in_a_process(
+        "import os\n"
+        "from v2v_server.system.process import take_long_turns\n"
+        "before = os.nice(5)\n"  # added to that of whoever runs the tests
+        "print(take_long_turns(), 0 < os.nice(0) == before, os.sched_getscheduler(0) == os.SCHED_OTHER)\n"
+    )
+    assert said[1:] == ["True", "True"]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the call's number is that of x86-64")
+@pytest.mark.skipif(_kernel() < (6, 12), reason="the kernel grants long turns from 6.12 on")
+def test_the_kernel_grants_the_long_turns() -> None:
+    said = _in_a_process(
+        "import ctypes, struct\n"
+        "from v2v_server.system.process import take_long_turns\n"
+        "def turn_ns():\n"
+        "    attributes = ctypes.create_string_buffer(48)\n"
+        "    assert ctypes.CDLL(None).syscall(315, 0, attributes, 48, 0) == 0\n"
+        "    return struct.unpack('=IIQiIQQQ', attributes.raw)[5]\n"
+        "before = turn_ns()\n"
+        "print(take_long_turns(), before < 10**8, turn_ns())\n"
+    )
+    assert said == ["True", "True", "100000000"]
+
+
+def test_who_was_put_to_run_when_nobody_else_does_keeps_to_that() -> None:
+    said = _in_a_process(
+        "import os\n"
+        "from v2v_server.system.process import take_long_turns\n"
+        "os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))\n"
+        "print(take_long_turns(), os.sched_getscheduler(0) == os.SCHED_IDLE)\n"
+    )
+    assert said == ["False", "True"]
+
+
+def test_a_machine_whose_calls_are_not_known_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "riscv64")
+    assert not process.take_long_turns()

@@ -1,0 +1,39 @@
+"""Readers that die over a file. The processes that call them import this module, so it imports little."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+from v2v_server.catalogue.index_file import Record
+from v2v_server.catalogue.survey import examine
+
+
+def lethal(root: str, id: str) -> Record:
+    """Dies over files of that name, as over a bug of the decoder."""
+    if "lethal" in id:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return examine(root, id)
+
+
+def killed_once(root: str, id: str) -> Record:
+    """Is killed from outside over each file, the first time."""
+    mark = Path(root, f"{id}.killed")
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return examine(root, id)
+
+
+def always_killed(root: str, id: str) -> Record:
+    """Is killed from outside over every file."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return examine(root, id)
+
+
+def waiting(root: str, id: str) -> Record:
+    """Waits for ever over files of that name, as over storage that does not answer."""
+    if "waiting" in id:
+        signal.pause()
+    return examine(root, id)

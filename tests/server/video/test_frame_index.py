@@ -1,0 +1,145 @@
+"""FrameIndex: slices, times, and bytes that come from strangers."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_server.video.frame_index import MOST_TILES, NO_TIMESTAMP, FrameIndex, Tile, unseekable
+
+steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=60)
+
+
+@st.composite
+def indices(draw: st.DrawFn) -> FrameIndex:
+    pts = np.cumsum(np.array(draw(steps), np.int64)) - draw(st.integers(0, 2**41))
+    first = draw(st.integers(0, 1000))
+    keys = np.array(sorted(draw(st.sets(st.integers(first, first + len(pts) - 1)))), np.int64)
+    dts = np.array([draw(st.sampled_from([NO_TIMESTAMP, -5, 0, 2**50])) for _ in keys], np.int64)
+    base = (draw(st.integers(1, 2**32 - 1)), draw(st.integers(1, 2**32 - 1)))
+    edges = sorted(draw(st.sets(st.integers(1, 60_000), min_size=2, max_size=MOST_TILES) | st.just(set())))
+    tiles = tuple(Tile(left, right - left) for left, right in itertools.pairwise([0, *edges]))
+    return FrameIndex(first, pts, keys, dts, base, 336, edges[-1] if edges else 596, seekable=True, tiles=tiles)
+
+
+def assert_equal(one: FrameIndex, other: FrameIndex) -> None:
+    for name in ("first", "time_base", "height_px", "width_px", "seekable", "tiles"):
+        assert getattr(one, name) == getattr(other, name)
+    for name in ("pts", "keyframes", "keyframe_dts"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+@given(indices())
+def test_bytes_round_trip(index: FrameIndex) -> None:
+    assert_equal(FrameIndex.from_bytes(index.to_bytes()), index)
+
+
+def test_unseekable_round_trip() -> None:
+    index = unseekable(10_000, (1, 25), 48, 64)
+    assert len(index.to_bytes()) < 64
+    assert_equal(FrameIndex.from_bytes(index.to_bytes()), index)
+
+
+def test_a_constant_rate_costs_next_to_nothing() -> None:
+    index = FrameIndex(0, np.arange(200) * 1001, np.array([0]), np.array([-2002]), (1, 30000), 336, 596, seekable=True)
+    assert len(index.to_bytes()) < 100
+
+
+@given(indices(), st.data())
+def test_slice_keeps_the_range_and_its_keyframe(index: FrameIndex, data: st.DataObject) -> None:
+    start = data.draw(st.integers(index.first, index.end - 1))
+    count = data.draw(st.integers(1, index.end - start))
+    part = index.slice(start, count)
+    before = [key for key in index.keyframes if key <= start]
+    assert part.first == (before[-1] if before else index.first)
+    assert part.end == start + count
+    np.testing.assert_array_equal(part.seconds(start, count), index.seconds(start, count))
+    np.testing.assert_array_equal(part.keyframes, [key for key in index.keyframes if part.first <= key < start + count])
+    assert_equal(part.slice(start, count), part)
+
+
+@given(indices())
+def test_seconds(index: FrameIndex) -> None:
+    numerator, denominator = index.time_base
+    wanted = [int(pts) * numerator / denominator for pts in index.pts]
+    np.testing.assert_allclose(index.seconds(index.first, len(index)), wanted, rtol=1e-14)
+
+
+def test_seconds_unknown() -> None:
+    assert np.isnan(unseekable(5, (1, 25), 48, 64).seconds(1, 3)).all()
+
+
+@pytest.mark.parametrize(("start", "count"), [(0, 1), (3, 8), (3, 0), (10, 1)])
+def test_ranges_outside(start: int, count: int) -> None:
+    index = FrameIndex(3, np.arange(7), np.array([3]), np.array([0]), (1, 25), 48, 64, seekable=True)
+    with pytest.raises(UsageError, match=r"holds 3 \.\. 9"):
+        index.slice(start, count)
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_refused(data: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        FrameIndex.from_bytes(data)
+
+
+@given(indices(), st.data())
+def test_tampered_bytes_are_refused_or_valid(index: FrameIndex, data: st.DataObject) -> None:
+    encoded = bytearray(index.to_bytes())
+    at = data.draw(st.integers(0, len(encoded) - 1))
+    encoded[at] ^= data.draw(st.integers(1, 255))
+    try:
+        got = FrameIndex.from_bytes(bytes(encoded))
+    except ProtocolError:
+        return
+    assert got.seekable is False or bool(np.all(np.diff(got.pts) > 0))
+
+
+def test_a_compression_bomb_is_refused() -> None:
+    head = FrameIndex(0, np.arange(7), np.array([0]), np.array([0]), (1, 25), 48, 64, seekable=True).to_bytes()[:33]
+    with pytest.raises(ProtocolError, match="its header promises 72"):
+        FrameIndex.from_bytes(head + zlib.compress(bytes(10_000_000)))
+
+
+def test_too_many_frames_are_refused() -> None:
+    with pytest.raises(ProtocolError, match="limit 100"):
+        FrameIndex.from_bytes(unseekable(101, (1, 25), 48, 64).to_bytes(), most_frames=100)
+
+
+def test_disorder_is_refused() -> None:
+    index = FrameIndex(0, np.array([0, 2, 1]), np.array([0]), np.array([0]), (1, 25), 48, 64, seekable=True)
+    with pytest.raises(ProtocolError, match="do not increase"):
+        FrameIndex.from_bytes(index.to_bytes())
+
+
+@pytest.mark.parametrize(
+    ("tiles", "message"),
+    [
+        ([(0, 64), (64, 33)], "columns 0 .. 64, 64 .. 97 do not make up a picture of 96 px"),
+        ([(0, 64), (65, 31)], "do not make up"),  # a gap
+        ([(1, 63), (64, 32)], "do not make up"),  # the first column
+        ([(0, 96), (10, 86)], "do not make up"),  # one inside the other
+        ([(0, 32), (0, 96)], "do not make up"),
+        ([(0, 96), (96, 0)], "do not make up"),
+        ([(0, 96)], "1 tiles"),
+        ([(at, 1) for at in range(96)], "96 tiles"),
+    ],
+)
+def test_tiles_that_cannot_be_are_refused(tiles: list[tuple[int, int]], message: str) -> None:
+    pts, none = np.arange(7), np.empty(0, np.int64)
+    index = FrameIndex(0, pts, none, none, (1, 25), 48, 96, seekable=True, tiles=tuple(Tile(*tile) for tile in tiles))
+    with pytest.raises(ProtocolError, match=message):
+        FrameIndex.from_bytes(index.to_bytes())
+
+
+def test_tiles_that_end_early_are_refused() -> None:
+    tiles = (Tile(0, 64), Tile(48, 48))
+    index = FrameIndex(0, np.arange(7), np.array([0]), np.array([0]), (1, 25), 48, 96, seekable=True, tiles=tiles)
+    assert FrameIndex.from_bytes(index.to_bytes()).tiles == tiles
+    with pytest.raises(ProtocolError, match="2 tiles in 8 bytes"):
+        FrameIndex.from_bytes(index.to_bytes()[:41])

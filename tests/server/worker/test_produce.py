@@ -1,0 +1,167 @@
+"""From a lease to a sample: what may be wrong with a lease that a sound server sent."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.server.corpus import SMALL_SPEC
+from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.messages import Lease
+from v2v_server.broker.jobs import describe
+from v2v_server.broker.leases import Task
+from v2v_server.broker.quarantine import Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.commands.cli import simulate
+from v2v_server.offline.remake import remake
+from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.worker import decode_cache as clips
+from v2v_server.worker.produce import Decoded, decode_for, make_sample
+
+CHANGED = ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")
+"""Fields of the small recipe that are not the paper's."""
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
+    write_clip(tmp_path / "a.mp4", panned_luma(30, 16, 24), gop=12)
+    with closing(open_catalogue(tmp_path, processes=0)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def lease(catalogue: Catalogue) -> Lease:
+    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
+    return describe(
+        Task(b"", 0, 2),
+        number=1,
+        sequence=schedule.candidate(0, 0, 2, 0),
+        quarantine=0,
+        catalogue=catalogue,
+        spec=SMALL_SPEC,
+        seed=0,
+        arrays=("voxels", "frames"),
+        deadline_seconds=60.0,
+    )
+
+
+def test_a_whole_index_and_its_slice_make_the_same_sample(catalogue: Catalogue, lease: Lease) -> None:
+    index = catalogue.frame_index("a.mp4")
+    assert lease.frame_index == index.to_bytes()
+    needed = SMALL_SPEC.recipe.frames_needed
+    cut = dataclasses.replace(lease, frame_index=index.slice(lease.start_frame, needed).to_bytes())
+    whole, part = (make_sample(each, decode_for(each, each.indices, catalogue.root)[0]) for each in (lease, cut))
+    assert whole.provenance == part.provenance
+    assert all(np.array_equal(array, part.arrays[name]) for name, array in whole.arrays.items())
+
+
+class TestASecondAttempt:
+    """What a file does, it does again; storage may fail for a moment."""
+
+    @pytest.fixture
+    def failures(self, monkeypatch: pytest.MonkeyPatch) -> list[VideoError]:
+        """What the next attempts to decode end in."""
+        left: list[VideoError] = []
+
+        def decode(*arguments: Any) -> tuple[Decoded, ...]:
+            if left:
+                raise left.pop(0)
+            return decode_for(*arguments)
+
+        monkeypatch.setattr(clips, "decode_for", decode)
+        return left
+
+    def test_makes_the_sample(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
+        failures.append(VideoError("a.mp4", 3, "does not decode"))
+        decoded, _ = clips.Clips(catalogue.root).take(lease)
+        expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+        assert np.array_equal(make_sample(lease, decoded).arrays["voxels"], expected.arrays["voxels"])
+
+    def test_has_the_last_word(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
+        failures += [VideoError("a.mp4", 3, "first"), VideoError("a.mp4", 3, "second")]
+        with pytest.raises(VideoError, match="second"):
+            clips.Clips(catalogue.root).take(lease)
+
+    def test_finds_a_file_that_was_replaced_meanwhile(
+        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
+    ) -> None:
+        (catalogue.root / "a.mp4").write_bytes(b"another")
+        failures.append(VideoError("a.mp4", 3, "does not decode"))
+        with pytest.raises(VideoChanged):
+            clips.Clips(catalogue.root).take(lease)
+
+    def test_is_not_made_where_the_file_is_missing(
+        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
+    ) -> None:
+        """The server looks whether it is there."""
+        failures += [VideoUnreadable("a.mp4", None, "cannot be read"), VideoError("a.mp4", 3, "asked again")]
+        with pytest.raises(VideoUnreadable):
+            clips.Clips(catalogue.root).take(lease)
+
+
+def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Catalogue, lease: Lease) -> None:
+    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    with closing(open_catalogue(catalogue.root, processes=0)) as both:
+        (catalogue.root / "a.mp4").unlink()
+        ended = set()
+        for index in range(4):
+            try:
+                ended.add(remake(both, SMALL_SPEC, seed=0, epoch=0, index=index).provenance.video)
+            except VideoUnreadable as error:
+                ended.add(f"no {error.video}")
+        assert ended == {"b.mp4", "no a.mp4"}
+
+
+def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalogue, tmp_path: Path) -> None:
+    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    cache = str(tmp_path / "cache")
+
+    def made(*flags: str) -> str:
+        recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
+        out = tmp_path / "sample.npz"
+        simulate([str(catalogue.root), f"--out={out}", f"--cache-dir={cache}", "--index=2", *recipe, *flags])
+        with np.load(out) as content:
+            video: str = json.loads(str(content["provenance"]))["video"]
+        return video
+
+    first = made()
+    mark = fingerprint(catalogue.root / first)
+    file = quarantine_path(catalogue.root, cache)
+    for frame in (0, 10):  # two verdicts refuse the file
+        write_verdict(file, Verdict(0, first, mark, frame, "crash", "t"), read_quarantine(file))
+    assert (made(), made("--quarantine=2")) == (first, {"a.mp4": "b.mp4", "b.mp4": "a.mp4"}[first])
+    with pytest.raises(SystemExit):
+        made("--quarantine=3")
+
+
+@pytest.mark.parametrize("damage", ["garbage", "cut short", "too few frames"])
+def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease, damage: str) -> None:
+    """The server hands a small one on unopened."""
+    index = catalogue.frame_index("a.mp4")
+    damaged = {
+        "garbage": b"no index",
+        "cut short": index.to_bytes()[:-3],
+        "too few frames": index.slice(0, lease.start_frame + 1).to_bytes(),
+    }[damage]
+    with pytest.raises(VideoError, match=r"^a\.mp4.*: the server's index of it is damaged: "):
+        decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.root)
+
+
+@pytest.mark.parametrize("file", ["sample", "sample.npz", "sample.mp4"])
+def test_a_sample_lies_where_it_is_said_to(
+    file: str, catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
+    simulate([str(catalogue.root / "a.mp4"), f"--out={tmp_path / file}", f"--cache-dir={tmp_path}", *recipe])
+    with np.load(capsys.readouterr().out.split("written to ")[1].strip()) as content:
+        assert sorted(content) == ["frames", "provenance", "voxels"]

@@ -1,0 +1,193 @@
+"""From statistics to decisions: which sequences there are, and which flow each voxel gets."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import VideoEntry
+from v2v_server.catalogue.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+from v2v_server.worker.scene_choice import MOVING, plan_flow
+
+RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
+AUTO = StreamSpec(recipe=RECIPE, scene="auto")
+OFF = StreamSpec(recipe=RECIPE)
+SIZE_PX = 128
+"""Of the square picture: a crop at a multiple of 32 px is one tile."""
+
+
+def scene(motion_px: float, change: float, *, dark: float = 0.0, segments: int = 4) -> Scene:
+    values = np.zeros((segments, COLUMNS))
+    values[:, MOTION], values[:, CHANGE], values[:, CONTRAST], values[:, DARK] = motion_px, change, 20.0, dark
+    return Scene.of(16 * segments, (), values)
+
+
+def params(**changes: Any) -> SampleParams:
+    values: dict[str, Any] = {
+        "threshold_pos": 0.5, "threshold_neg": 0.5, "noise_sigma": 0.0, "hot_pixel_count": 0, "hot_pixel_sigma": 0.0,
+        "pauses": (), "scale": 1.0, "crop_top_px": 0, "crop_left_px": 0, "flip": False, "contrast": 0.0,
+        "noise_key": (0, 0, 0, 0),
+    }  # fmt: skip
+    return SampleParams(**(values | changes))
+
+
+def methods(what: Scene, start: int = 0, spec: StreamSpec = AUTO, **changes: Any) -> tuple[str, ...]:
+    return plan_flow(what, start, params(**changes), spec, SIZE_PX, SIZE_PX).methods
+
+
+def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:
+    # A voxel spans five frames: 0.09 px a frame are less than half a pixel, 0.11 more.
+    assert methods(scene(0.0, 1.1)) == ("zero",) * 4
+    assert methods(scene(0.09, 3.0)) == ("dis-ultrafast",) * 4
+    assert methods(scene(0.11, 3.0)) == (MOVING,) * 4
+    # 1.1 grey levels over four frames are nothing in daylight, and motion in the dark.
+    assert methods(scene(0.09, 1.1, dark=0.95)) == ("dis-ultrafast",) * 4
+    assert methods(scene(0.11, 0.1, dark=0.95)) == ("zero",) * 4
+
+
+def test_change_and_motion_grow_with_the_time_between_two_frames() -> None:
+    long = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frames_per_bin=2), scene="auto")
+    assert methods(scene(0.0, 1.1), spec=long) == ("dis-ultrafast",) * 2
+    assert methods(scene(0.09, 3.0), spec=long) == (MOVING,) * 2
+    strided = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frame_stride=2), scene="auto")
+    assert methods(scene(0.09, 3.0), spec=strided) == (MOVING,) * 2
+
+
+def test_enlarged_pictures_move_more() -> None:
+    assert methods(scene(0.09, 3.0), scale=1.3) == (MOVING,) * 4
+
+
+def test_a_pause_takes_its_part_of_the_motion_away() -> None:
+    # Voxel 0 is one long pause; voxel 1 advances by three frames only: 3 x 0.11 < 0.5.
+    assert methods(scene(0.11, 3.0), pauses=((1, 7),)) == ("zero", "dis-ultrafast", MOVING, MOVING)
+
+
+def test_only_the_segments_between_the_frames_count() -> None:
+    values = scene(0.0, 0.0).segments.copy()
+    values[1, MOTION], values[1, CHANGE] = 640, 640  # frames 16 .. 31
+    what = Scene(0, 64, (), values)
+    # Frames 0 5 10 15 20: the last voxel reaches into the segment that moves, half of what it touches.
+    assert methods(what) == ("zero", "zero", "zero", MOVING)
+    assert methods(what, start=32) == ("zero",) * 4
+    assert methods(what, start=12) == (MOVING,) * 4
+
+
+@pytest.mark.parametrize("tile", range(TILES**2))
+def test_only_the_tiles_that_the_crop_touches_count(tile: int) -> None:
+    still = scene(0.0, 0.0).segments.copy()
+    still[:, tile], still[:, TILES**2 + tile] = 640, 640
+    what = Scene(0, 64, (), still)
+    for other in range(TILES**2):
+        row, column = divmod(other, TILES)
+        found = methods(what, crop_top_px=32 * row, crop_left_px=32 * column)
+        assert found == ((MOVING,) * 4 if other == tile else ("zero",) * 4)
+        doubled = methods(what, crop_top_px=64 * row, crop_left_px=64 * column, scale=2.0)
+        assert (set(doubled) == {"zero"}) == (other != tile)
+
+
+def test_a_clip_that_moves_in_parts_is_left_to_the_look_at_each_pair() -> None:
+    values = scene(0.01, 3.0).segments.copy()
+    values[:, 0] = 640
+    assert methods(Scene(0, 64, (), values), crop_top_px=16, crop_left_px=16) == ("auto",) * 4
+
+
+def test_what_was_not_looked_at_is_left_to_the_look_at_each_pair() -> None:
+    assert methods(Scene.unknown()) == ("auto",) * 4
+    # Frames 0 .. 15 are known: the voxel that ends at frame 20 is not.
+    assert methods(scene(0.0, 0.0, segments=1)) == ("zero", "zero", "zero", "auto")
+    unknown = scene(0.0, 3.0).segments.copy()
+    unknown[:, MOTION] = 65535
+    assert methods(Scene(0, 64, (), unknown)) == (MOVING,) * 4
+
+
+def test_lead_voxels_have_no_flow() -> None:
+    lead = StreamSpec(recipe=RECIPE.replace(lead_voxels=1), scene="auto")
+    values = scene(0.0, 0.0).segments.copy()
+    values[0, MOTION], values[0, CHANGE] = 640, 640
+    assert methods(Scene(0, 64, (), values), spec=lead, start=11) == ("zero",) * 4
+
+
+def test_reasons_state_the_figures() -> None:
+    values = np.zeros((4, COLUMNS))
+    values[:, MOTION], values[:, CHANGE], values[:, DARK], values[:, NOISE] = 2.0, 40.0, 0.95, 1.5
+    plan = plan_flow(Scene.of(64, (), values), 0, params(pauses=((1, 5),)), AUTO, SIZE_PX, SIZE_PX)
+    assert plan.reason == (
+        f"moving; flow none 1, {MOVING} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, noise "
+        "1.50 grey levels; dark 95.0% (a dark scene), clipped 0.0%"
+    )
+    assert "not looked at" in plan_flow(Scene.unknown(), 0, params(), AUTO, SIZE_PX, SIZE_PX).reason
+
+
+def test_a_method_that_was_asked_for_is_obeyed() -> None:
+    asked = StreamSpec(recipe=RECIPE, scene="auto", flow_method="dis-medium")
+    plan = plan_flow(scene(0.0, 0.0), 0, params(), asked, SIZE_PX, SIZE_PX)
+    assert plan.methods == ()
+    assert not plan.still
+    assert plan.reason.startswith("still; flow dis-medium as asked; ")
+
+
+# --- sequences --------------------------------------------------------------------------------------------------------
+
+
+def video(name: str, frames: int, *runs: tuple[int, int]) -> VideoEntry:
+    return VideoEntry(name, "f", frames, 64, 64, 25.0, "h264", runs=runs or ((0, frames),))
+
+
+def starts(table: SequenceTable) -> list[tuple[str, int]]:
+    return [(table[rank].video.id, table[rank].start_frame) for rank in range(table.count)]
+
+
+def test_sequences_are_moved_past_cuts_or_left_out() -> None:
+    # 21 frames a sequence, 20 apart.
+    videos = (
+        video("a", 61), video("b", 61, (0, 30), (30, 61)), video("c", 61, (0, 20), (20, 40), (40, 60)),
+        video("d", 61, (45, 61)), video("e", 100, (10, 52), (60, 100)),
+    )  # fmt: skip
+    table = SequenceTable(videos, Rows(), AUTO)
+    assert starts(table) == [("a", 0), ("a", 20), ("a", 40), ("b", 0), ("b", 30), ("e", 10), ("e", 30), ("e", 60)]
+    assert [(item.video, item.voxels_per_clip) for item in table.rejections] == [("c", 3), ("d", 3)]
+    assert table.rejections[0].remedy == "voxels_per_clip at most 3, or scene off"
+    # Of b two are not where they were, of c and d three each, of e (0, 20, 40, 60) three.
+    assert table.spoilt == 11
+    assert starts(SequenceTable(videos, Rows(), OFF))[3:6] == [("b", 0), ("b", 20), ("b", 40)]
+
+
+@given(st.integers(21, 300), st.integers(1, 12))
+def test_without_cuts_there_are_the_same_sequences(frames: int, most: int) -> None:
+    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
+    plain = StreamSpec(recipe=RECIPE, max_sequences_per_video=most)
+    videos = (video("a", frames), video("b", 40))
+    table = SequenceTable(videos, Rows(), spec)
+    assert starts(table) == starts(SequenceTable(videos, Rows(), plain))
+    assert table.spoilt == 0
+
+
+@given(st.lists(st.integers(1, 299), unique=True, max_size=12), st.integers(1, 12))
+def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
+    bounds = [0, *sorted(cuts), 300]
+    runs = tuple(pairwise(bounds))
+    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
+    table = SequenceTable((video("a", 300, *runs), video("z", 21)), Rows(), spec)
+    found = [start for name, start in starts(table) if name == "a"]
+    assert len(found) <= most
+    for start in found:
+        assert not any(start < cut < start + 21 for cut in cuts)
+    assert all(later - earlier >= 20 for earlier, later in pairwise(found))
+
+
+def test_a_catalogue_without_statistics_says_what_to_do() -> None:
+    plain = VideoEntry("a", "f", 61, 64, 64, 25.0, "h264")
+    with pytest.raises(UsageError, match="--scene auto"):
+        SequenceTable((plain,), Rows(), AUTO)
+    assert SequenceTable((plain,), Rows(), OFF).count == 3

@@ -1,0 +1,172 @@
+"""One process compiles, the others wait; and every way in which that may fail ends in each compiling for itself."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.waiting import until
+from v2v_server.worker import warm_up as module
+from v2v_server.worker.warm_up import one_compiles, warm_up_in_turn
+
+KEY = "key"
+
+
+def is_held(folder: Path) -> bool:
+    """Whether somebody has the lock."""
+    with (folder / f"{KEY}.lock").open("ab") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def has_ended(process: psutil.Process) -> bool:
+    """Gone, or waiting for whoever has adopted it to notice."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def test_the_first_holds_the_lock_and_after_it_nobody_does(tmp_path: Path) -> None:
+    with one_compiles(tmp_path, KEY) as is_first:
+        assert is_first
+        assert is_held(tmp_path)
+    assert not is_held(tmp_path)
+    with one_compiles(tmp_path, KEY) as is_first:
+        assert not is_first
+        assert not is_held(tmp_path)
+
+
+def test_the_second_waits_and_then_holds_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    order: list[Any] = []
+    waits = threading.Event()
+    monkeypatch.setattr(module.time, "sleep", lambda seconds: waits.set())
+
+    def second() -> None:
+        with one_compiles(tmp_path, KEY) as is_first:
+            order.append((is_first, is_held(tmp_path)))
+
+    thread = threading.Thread(target=second)
+    with one_compiles(tmp_path, KEY):
+        thread.start()
+        assert waits.wait(60.0)
+        order.append("the first is done")
+    thread.join(60.0)
+    assert order == ["the first is done", (False, False)]
+
+
+def test_one_that_fails_leaves_the_work_to_the_next(tmp_path: Path) -> None:
+    with pytest.raises(MemoryError), one_compiles(tmp_path, KEY):
+        raise MemoryError
+    assert not is_held(tmp_path)
+    with one_compiles(tmp_path, KEY) as is_first:
+        assert is_first
+
+
+def test_one_that_is_killed_leaves_the_work_to_the_next(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom v2v_server.worker.warm_up import one_compiles\n"
+        f"with one_compiles(Path(sys.argv[1]), {KEY!r}):\n    print('in', flush=True)\n    time.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        try:
+            assert holder.stdout.readline() == "in\n"
+            assert is_held(tmp_path)
+        finally:
+            holder.kill()
+    with one_compiles(tmp_path, KEY) as is_first:
+        assert is_first
+        assert is_held(tmp_path)
+
+
+def test_one_that_does_not_get_on_is_not_waited_for_for_ever(tmp_path: Path) -> None:
+    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, KEY, longest_wait_seconds=0.0) as is_first:
+        assert is_first
+
+
+def test_what_is_compiled_for_another_processor_is_not_waited_for(tmp_path: Path) -> None:
+    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, "another") as is_first:
+        assert is_first
+
+
+def test_without_locks_all_compile_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def flock(*_: Any) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(module.fcntl, "flock", flock)
+    with one_compiles(tmp_path, KEY) as one, one_compiles(tmp_path, KEY) as other:
+        assert one
+        assert other
+
+
+def test_without_a_folder_all_compile_at_once(tmp_path: Path) -> None:
+    absent = tmp_path / "absent"
+    with one_compiles(absent, KEY) as one, one_compiles(absent, KEY) as other:
+        assert one
+        assert other
+    assert not absent.exists()
+
+
+def test_once_all_is_there_it_is_only_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or compiled here, where the cache has been emptied around the mark: no process waits for another."""
+    warm_up_in_turn()
+    calls = []
+    monkeypatch.setattr(module, "load_kernels", lambda: calls.append("compiled or loaded"))
+    monkeypatch.setattr(module.subprocess, "run", lambda *_, **__: calls.append("compiled apart"))
+    warm_up_in_turn()
+    assert calls == ["compiled or loaded"]
+
+
+@pytest.mark.slow
+def test_no_worker_compiles_and_none_becomes_large(tmp_path: Path) -> None:
+    code = (
+        "import psutil\n"
+        "from v2v_server.simulation.clip import simulate_pixels, simulate_pixels_with_effects, words\n"
+        "from v2v_server.worker.warm_up import warm_up_in_turn\n"
+        "warm_up_in_turn()\n"
+        "from v2v_server.video.full_range import to_full_range\n"
+        "kernels = simulate_pixels, simulate_pixels_with_effects, words, to_full_range\n"
+        "print(*(sum(kernel.stats.cache_hits.values()) for kernel in kernels))\n"
+        "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
+        "print(psutil.Process().memory_info().rss)\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    start = [sys.executable, "-c", code]
+    both = [subprocess.Popen(start, stdout=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
+    try:
+        for process in both:
+            hits, misses, rss_bytes = process.communicate(timeout=240)[0].splitlines()
+            assert hits.split() == ["3", "1", "1", "1"]
+            assert misses.split() == ["0", "0", "0", "0"]
+            assert int(rss_bytes) < 250e6
+    finally:
+        for process in both:
+            process.kill()
+            process.wait()
+    assert len(list(tmp_path.rglob("*.complete"))) == 1
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends a child with its parent")
+def test_the_compiler_dies_with_its_worker(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    start = [sys.executable, "-c", "from v2v_server.worker.warm_up import warm_up_in_turn; warm_up_in_turn()"]
+    with subprocess.Popen(start, env=environment) as worker:
+        seen: list[psutil.Process] = []
+        try:
+            until(lambda: seen.extend(psutil.Process(worker.pid).children()) or seen)
+        finally:
+            worker.kill()
+    until(lambda: all(map(has_ended, seen)))

@@ -1,0 +1,466 @@
+"""Weights of others (safe unpickling, names, strictness) and our own checkpoints (atomic, complete, plain)."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import os
+import pickle
+import random
+import resource
+from collections import OrderedDict, defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from trainer.models import E2VID, FireNet
+from trainer.run.checkpoint import Checkpoint, capture_rng, load_checkpoint, restore_rng, save_checkpoint
+from trainer.unpickle import Placeholder, read_torch_file
+from trainer.weights import e2vid_options, load_into, load_weights
+from v2v_protocol.errors import UsageError
+
+CPU = torch.device("cpu")
+
+
+class ConfigParser:
+    """Stands for the class of that name in published checkpoints, which a reader does not have."""
+
+    def __init__(self, unet_kwargs: dict[str, Any]) -> None:
+        self._config = {"name": "run", "arch": {"type": "FlowNet", "args": {"unet_kwargs": unet_kwargs}}}
+        self.loggers = defaultdict(list, {"a": [1, 2]})
+
+
+class MakesFolder:
+    """A pickle that makes a folder when it is read by a trusting reader."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.folder),)
+
+
+class CallsGetattr:
+    """A pickle that asks for an attribute, the first link of many exploits."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return getattr, ("text", "upper")
+
+
+def small(seed: int = 0) -> E2VID:
+    torch.manual_seed(seed)
+    return E2VID(base_channels=2, encoders=2)
+
+
+def same(first: dict[str, Tensor], second: dict[str, Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+# reading without trust
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_nothing_in_a_file_is_executed(tmp_path: Path, zipped: bool) -> None:
+    model, marker = small(), tmp_path / "marker"
+    content = {"state_dict": model.state_dict(), "config": MakesFolder(marker)}
+    torch.save(content, tmp_path / "trap.pth", _use_new_zipfile_serialization=zipped)
+    state, _ = load_weights(tmp_path / "trap.pth")
+    assert same(state, model.state_dict())
+    assert not marker.exists()
+    with pytest.raises(FileNotFoundError):
+        marker.rmdir()
+    torch.load(tmp_path / "trap.pth", weights_only=False)
+    assert marker.is_dir(), "the trap does not work, so the test shows nothing"
+
+
+def test_calls_in_a_pickle_become_placeholders(tmp_path: Path) -> None:
+    torch.save({"state_dict": {"a": torch.ones(2)}, "x": CallsGetattr()}, tmp_path / "chain.pth")
+    assert isinstance(read_torch_file(tmp_path / "chain.pth")["x"], Placeholder)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_whole_objects_beside_the_weights_do_no_harm(tmp_path: Path, zipped: bool) -> None:
+    """As event_cnn_minimal and V2V save: optimiser and scheduler as objects, a ConfigParser."""
+    model = small()
+    optimizer = torch.optim.Adam(model.parameters(), amsgrad=True)
+    model.forward_sequence(torch.ones(1, 1, 5, 16, 16)).mean().backward()
+    optimizer.step()
+    content = {
+        "arch": "FlowNet",
+        "epoch": 3,
+        "state_dict": model.state_dict(),
+        "optimizer": optimizer,
+        "lr_scheduler": torch.optim.lr_scheduler.StepLR(optimizer, 1),
+        "monitor_best": np.float64(0.5),
+        "config": ConfigParser({"num_bins": 5, "norm": "none", "kernel_size": 5, "list": [1]}),
+    }
+    torch.save(content, tmp_path / "whole.pth", _use_new_zipfile_serialization=zipped)
+    state, report = load_weights(tmp_path / "whole.pth")
+    assert same(state, model.state_dict())
+    assert report.settings == {"num_bins": 5, "norm": "none", "kernel_size": 5}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not a PyTorch file"),
+        (b"PK\x03\x04 and no more", "not a PyTorch file"),
+        (pickle.dumps({"state_dict": 1}), "not a PyTorch file"),
+        (random.Random(0).randbytes(100), "not a PyTorch file"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "file.pth"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match=message):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_damaged_files_give_one_kind_of_error(tmp_path: Path, zipped: bool) -> None:
+    """Bytes overwritten anywhere: weights of the right names and shapes, or a UsageError."""
+    path, rng = tmp_path / "file.pth", np.random.default_rng(0)
+    weights = {"state_dict": {"a": torch.ones(2, 3)}, "config": ConfigParser({"num_bins": 5})}
+    torch.save(weights, path, _use_new_zipfile_serialization=zipped)
+    whole, refused = path.read_bytes(), 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole), rng.integers(1, 4)):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            load_weights(path)
+        except UsageError:
+            refused += 1
+    assert refused > 20
+
+
+def test_absent_files_and_files_without_weights_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no file"):
+        load_weights(tmp_path / "absent.pth")
+    torch.save({"epoch": 1, "losses": [1.0]}, tmp_path / "losses.pth")
+    with pytest.raises(UsageError, match="holds epoch, losses"):
+        load_weights(tmp_path / "losses.pth")
+    torch.save({"state_dict": small().state_dict()}, tmp_path / "plain.pth")
+    with pytest.raises(UsageError, match="under 'ema'"):
+        load_weights(tmp_path / "plain.pth", ema=True)
+
+
+# names
+
+
+@pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "module._orig_mod.", "_orig_mod.module."])
+@pytest.mark.parametrize("container", ["bare", "state_dict", "model"])
+def test_wrappers_leave_no_trace(tmp_path: Path, prefix: str, container: str) -> None:
+    model = small()
+    wrapped = OrderedDict((prefix + name, tensor) for name, tensor in model.state_dict().items())
+    torch.save(wrapped if container == "bare" else {container: wrapped, "epoch": 1}, tmp_path / "wrapped.pth")
+    other = small(seed=1)
+    assert not same(other.state_dict(), model.state_dict())
+    report = load_into(other, tmp_path / "wrapped.pth")
+    assert same(other.state_dict(), model.state_dict())
+    assert set(report.used) == set(model.state_dict())
+    assert report.renamed == ({name: name.removeprefix(prefix) for name in wrapped} if prefix else {})
+
+
+def test_e2vid_plus_gives_its_image_channel(tmp_path: Path) -> None:
+    model = small()
+    state = {name.replace("unetrecurrent.", "unetflow."): tensor for name, tensor in model.state_dict().items()}
+    for kind in ("weight", "bias"):
+        image = state[f"unetflow.pred.conv2d.{kind}"]
+        state[f"unetflow.pred.conv2d.{kind}"] = torch.cat([image, image + 1, image + 2])
+    torch.save({"state_dict": state, "config": ConfigParser({"num_bins": 5})}, tmp_path / "plus.pth")
+    other = small(seed=1)
+    report = load_into(other, tmp_path / "plus.pth")
+    assert same(other.state_dict(), model.state_dict())
+    assert report.cut == ("unetrecurrent.pred.conv2d.weight", "unetrecurrent.pred.conv2d.bias")
+    assert len(report.renamed) == len(state)
+    assert "(in the file unetflow.head.conv2d.weight)" in str(report)
+    assert "channel 0 only" in str(report)
+
+
+def test_firenet_plus_names(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = FireNet()
+    names = {
+        "net.head.conv.conv2d": "head.conv2d",
+        "net.head.recurrent_block.": "G1.",
+        "net.resblocks.0.conv.": "R1.",
+        "net.resblocks.0.recurrent_block.": "G2.",
+        "net.resblocks.1.": "R2.",
+        "net.pred.conv2d": "pred.conv2d",
+    }
+    state = {}
+    for name, tensor in model.state_dict().items():
+        (long,) = [long for long in names if name.startswith(long)]
+        state[name.replace(long, names[long])] = tensor
+    torch.save(state, tmp_path / "plus.pth")
+    other = FireNet()
+    load_into(other, tmp_path / "plus.pth")
+    assert same(other.state_dict(), model.state_dict())
+
+
+def test_a_misfit_is_refused_whole_and_reported(tmp_path: Path) -> None:
+    model = small()
+    state = dict(model.state_dict())
+    del state["unetrecurrent.head.conv2d.bias"]
+    state["unetrecurrent.extra"] = torch.zeros(1)
+    state["unetrecurrent.pred.conv2d.bias"] = torch.zeros(2)
+    torch.save(state, tmp_path / "misfit.pth")
+    other = small(seed=1)
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(UsageError) as caught:
+        load_into(other, tmp_path / "misfit.pth")
+    assert same(other.state_dict(), before)
+    for line in (
+        "missing   unetrecurrent.head.conv2d.bias",
+        "unused    unetrecurrent.extra",
+        "misshaped unetrecurrent.pred.conv2d.bias",
+    ):
+        assert line in str(caught.value)
+
+
+def test_two_networks_in_one_file_are_refused(tmp_path: Path) -> None:
+    torch.save({"a.weight": torch.zeros(1), "module.a.weight": torch.ones(1)}, tmp_path / "two.pth")
+    with pytest.raises(UsageError, match="same name"):
+        load_weights(tmp_path / "two.pth")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"bins": 3, "base_channels": 4, "encoders": 1, "residual_blocks": 1},
+        {"norm": "batch", "upsampling": "transposed", "final_activation": "sigmoid", "normalize_voxels": True},
+    ],
+)
+def test_the_variant_of_e2vid_is_read_from_its_file(tmp_path: Path, options: dict[str, Any]) -> None:
+    options = {"base_channels": 2, "encoders": 2, **options}
+    model = E2VID(**options)
+    content: dict[str, Any] = {"arch": "E2VIDRecurrent", "state_dict": model.state_dict()}
+    if "final_activation" in options:
+        content["model"] = {"num_bins": 5, "skip_type": "sum", "recurrent_block_type": "convlstm", "norm": "BN"}
+    torch.save(content, tmp_path / "e2vid.pth.tar")
+    state, report = load_weights(tmp_path / "e2vid.pth.tar")
+    found = e2vid_options(state, report.settings)
+    assert found == {
+        "bins": 5,
+        "residual_blocks": 2,
+        "norm": "none",
+        "upsampling": "bilinear",
+        "final_activation": "none",
+        "normalize_voxels": False,
+        **options,
+    }
+    load_into(E2VID(**found), tmp_path / "e2vid.pth.tar")
+
+
+def test_variants_that_are_not_built_are_refused() -> None:
+    with pytest.raises(UsageError, match="not weights of an E2VID"):
+        e2vid_options(FireNet().state_dict(), {})
+    with pytest.raises(UsageError, match="skip_type = 'concat'"):
+        e2vid_options(small().state_dict(), {"skip_type": "concat"})
+
+
+def test_published_firenet_report(published: Path) -> None:
+    _, report = load_weights(published / "firenet_evreal.pth")
+    assert report.renamed == {}
+    assert report.settings["num_bins"] == 5
+    assert report.settings["recurrent_block_type"] == "convgru"
+
+
+# our own checkpoints
+
+
+class Run:
+    """A training run in small: noise from the global generator, a stream position, a scheduler."""
+
+    def __init__(self) -> None:
+        self.model = small()
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-2, amsgrad=True)
+        self.scheduler = torch.optim.lr_scheduler.ExponentialLR(self.optimizer, 0.9)
+        self.position = 0
+
+    def train(self, steps: int) -> list[float]:
+        losses = []
+        for _ in range(steps):
+            voxels = (torch.rand(1, 2, 5, 16, 16) + self.position).sin()
+            loss = (self.model.forward_sequence(voxels) - 0.5).square().mean()
+            self.optimizer.zero_grad()
+            loss.backward()
+            self.optimizer.step()
+            self.scheduler.step()
+            self.position += 1
+            losses.append(loss.item())
+        return losses
+
+    def checkpoint(self) -> Checkpoint:
+        return Checkpoint(
+            step=self.position,
+            epoch=1,
+            model=self.model.state_dict(),
+            optimizer=self.optimizer.state_dict(),
+            scheduler=self.scheduler.state_dict(),
+            ema=None,
+            rng=capture_rng(CPU),
+            stream={
+                "version": 1,
+                "stream": {"spec": {"seed": 2**64 - 1}, "list": ["a", 0.5, None]},
+                "at": self.position,
+            },
+            config={"batch_size": 12, "network": {"name": "e2vid"}},
+        )
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        self.model.load_state_dict(checkpoint.model)
+        self.optimizer.load_state_dict(dict(checkpoint.optimizer))
+        assert checkpoint.scheduler is not None
+        assert checkpoint.stream is not None
+        self.scheduler.load_state_dict(dict(checkpoint.scheduler))
+        self.position = checkpoint.stream["at"]
+        restore_rng(checkpoint.rng, CPU)
+
+
+def test_a_resumed_run_has_the_losses_of_the_uninterrupted_one(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "last.pt"
+    run = Run()
+    run.train(3)
+    save_checkpoint(path, run.checkpoint())
+    expected = run.train(4)
+    resumed = Run()
+    resumed.train(1)
+    resumed.restore(load_checkpoint(path))
+    assert resumed.train(4) == expected
+    assert same(resumed.model.state_dict(), run.model.state_dict())
+
+
+def test_a_checkpoint_comes_back_whole_and_needs_no_code(tmp_path: Path) -> None:
+    run = Run()
+    run.train(1)
+    ema = {name: tensor + 1 for name, tensor in run.model.state_dict().items()}
+    written = dataclasses.replace(run.checkpoint(), ema=ema)
+    save_checkpoint(tmp_path / "a.pt", written)
+    assert isinstance(torch.load(tmp_path / "a.pt", weights_only=True), dict)
+    read = load_checkpoint(tmp_path / "a.pt")
+    assert (read.step, read.epoch, read.stream, read.config) == (1, 1, written.stream, written.config)
+    assert same(dict(read.model), dict(written.model))
+    assert read.ema is not None
+    assert same(dict(read.ema), ema)
+    other = small(seed=1)
+    load_into(other, tmp_path / "a.pt")
+    assert same(other.state_dict(), run.model.state_dict())
+    load_into(other, tmp_path / "a.pt", ema=True)
+    assert same(other.state_dict(), ema)
+
+
+@pytest.mark.parametrize("fails", ["fsync", "write"])
+def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
+    path = tmp_path / "last.pt"
+    run = Run()
+    save_checkpoint(path, run.checkpoint())
+    old = path.read_bytes()
+    run.train(1)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(*((os, "fsync", full) if fails == "fsync" else (torch, "save", full)))
+    with pytest.raises(OSError, match="No space"):
+        save_checkpoint(path, run.checkpoint())
+    assert path.read_bytes() == old
+    assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
+
+
+def test_what_the_disk_says_is_what_is_raised(tmp_path: Path) -> None:
+    """Not what PyTorch's writer makes of it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    large = dataclasses.replace(Run().checkpoint(), ema={"weight": torch.zeros(60_000)})
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        with pytest.raises(OSError, match="File too large"):
+            save_checkpoint(tmp_path / "last.pt", large)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_data_are_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    fsync, replace = os.fsync, Path.replace
+
+    def spy_fsync(descriptor: int) -> None:
+        calls.append("folder" if Path(f"/proc/self/fd/{descriptor}").is_dir() else "file")
+        fsync(descriptor)
+
+    def spy_replace(self: Path, target: Path) -> Path:
+        calls.append("replace")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", spy_fsync)
+    monkeypatch.setattr(Path, "replace", spy_replace)
+    save_checkpoint(tmp_path / "last.pt", Run().checkpoint())
+    assert calls == ["file", "replace", "folder"]
+
+
+def test_what_needs_code_to_be_read_is_refused_before_writing(tmp_path: Path) -> None:
+    checkpoint = dataclasses.replace(Run().checkpoint(), config={"sizes": [1, {"seed": np.int64(3)}]})
+    with pytest.raises(UsageError, match=r"config\['sizes'\]\[1\]\['seed'\] is a int64"):
+        save_checkpoint(tmp_path / "a.pt", checkpoint)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    with pytest.raises(UsageError, match="no file"):
+        load_checkpoint(path)
+    torch.save({"state_dict": small().state_dict()}, path)
+    with pytest.raises(UsageError, match="for weights alone use load_weights"):
+        load_checkpoint(path)
+    save_checkpoint(path, Run().checkpoint())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UsageError, match="or damaged"):
+        load_checkpoint(path)
+    torch.save(torch.load(_written(path, whole), weights_only=True) | {"format": 99}, path)
+    with pytest.raises(UsageError, match="format 99, this release reads 1"):
+        load_checkpoint(path)
+
+
+def _written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def test_random_states_of_another_number_of_gpus_are_no_hindrance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each rank has one GPU, and the CPU has none; a list of all of them is of an earlier release."""
+    generators = [torch.tensor([number], dtype=torch.uint8) for number in range(4)]
+    monkeypatch.setattr("torch.cuda.get_rng_state", lambda device: generators[device.index])
+    restored = []
+    monkeypatch.setattr("torch.cuda.set_rng_state", lambda state, device: restored.append((state, device)))
+    second = torch.device("cuda", 1)
+    one, every = capture_rng(second), capture_rng(CPU) | {"cuda": generators}
+    assert one["cuda"] == [generators[1]]
+    assert capture_rng(CPU)["cuda"] == []
+    expected = torch.rand(3)
+    for state in (one, every):
+        restore_rng(state, CPU)
+        assert torch.equal(torch.rand(3), expected)
+    assert restored == []
+    for state, device in ((one, second), (one, torch.device("cuda", 3)), (every, second), (every, CPU)):
+        restore_rng(state, device)
+    assert restored == [(generators[1], second), (generators[1], torch.device("cuda", 3)), (generators[1], second)]
+    restore_rng(every, torch.device("cuda", 7))
+    restore_rng(capture_rng(CPU), second)
+    assert restored[3:] == [(generators[0], torch.device("cuda", 7))]
+
+
+def test_the_generator_goes_on_where_it_was() -> None:
+    state = capture_rng(CPU)
+    expected = torch.rand(3)
+    torch.rand(5)
+    restore_rng(state, CPU)
+    assert torch.equal(torch.rand(3), expected)

@@ -1,0 +1,176 @@
+"""LPIPS v0.1: distance of two pictures in the features of an ImageNet network (Zhang et al., CVPR 2018).
+
+Features of both pictures are taken after several ReLUs, divided by their length over the channels, subtracted and
+squared; a trained non-negative weight per channel makes one number of them, averaged over the picture and added over
+the layers:
+
+    d(a, b) = sum_l mean_(h,w) sum_c w_lc (a_l / (|a_l| + 1e-10) - b_l / (|b_l| + 1e-10))_c^2
+
+Nothing is downloaded: the weights of the network and of the heads are files that the caller has. V2V trains with VGG16
+and evaluates with AlexNet.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from trainer.losses.backbones import BACKBONES
+from trainer.weights import read_tensors
+from v2v_protocol.errors import UsageError
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+"""Mean and standard deviation of ImageNet for pictures in -1 .. 1: red, green, blue."""
+
+HEADS_FROM = "the wheel of the lpips package (https://pypi.org/project/lpips/), lpips/weights/v0.1/{net}.pth"
+
+LENGTH_FLOOR = 1e-10
+SMALLEST_SQUARE = 1e-30
+
+
+def unit_length(features: Tensor) -> Tensor:
+    """Features divided by their length over the channels, as LPIPS defines it; zero stays zero.
+
+    The published |f| = sqrt(sum f^2) has an infinite derivative where all channels are 0, and infinity times the 0 of
+    the squares is NaN: one such position, common after a ReLU, spoils the whole gradient. SMALLEST_SQUARE under the
+    root makes that derivative finite. It is too small to show in any value: beside LENGTH_FLOOR its root is 1e-5 of
+    the divisor at most.
+    """
+    length = (features.square().sum(dim=1, keepdim=True) + SMALLEST_SQUARE).sqrt()
+    return features / (length + LENGTH_FLOOR)
+
+
+def _layer_distance(first: Tensor, second: Tensor, head: Tensor) -> Tensor:
+    """[N, C, H, W] features of both pictures and [C] weights -> [N]."""
+    difference = unit_length(first.to(head.dtype)) - unit_length(second.to(head.dtype))
+    return (difference.square() * head[:, None, None]).sum(dim=1).mean(dim=(1, 2))
+
+
+class LPIPS(nn.Module):
+    """The metric, frozen: no parameter of it is ever trained, and gradients reach only the prediction.
+
+    Args:
+        net: "vgg", "alex" or "squeeze".
+
+    The weights are whatever the layers start with; use :meth:`from_files`.
+
+    Raises:
+        UsageError: another network.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, net: str) -> None:
+        super().__init__()
+        if net not in BACKBONES:
+            raise UsageError(f"LPIPS network {net!r}: give one of {', '.join(BACKBONES)}")
+        self.net = net
+        self.backbone = BACKBONES[net]
+        self.features = nn.ModuleList(self.backbone.layers())
+        for layer, channels in enumerate(self.backbone.channels):
+            self.register_buffer(f"head{layer}", torch.zeros(channels))
+        self.register_buffer("shift", torch.tensor(SHIFT).view(3, 1, 1))
+        self.register_buffer("scale", torch.tensor(SCALE).view(3, 1, 1))
+        self.requires_grad_(False)
+
+    @classmethod
+    def from_files(cls, net: str, backbone: str | Path, heads: str | Path) -> LPIPS:
+        """The metric with its published weights.
+
+        Args:
+            net: "vgg", "alex" or "squeeze".
+            backbone: torchvision's state dict of that network, whole (the classifier is left out) or ``features`` only.
+            heads: the state dict ``lin0.model.1.weight`` ... of LPIPS v0.1.
+
+        Raises:
+            UsageError: a file is missing or is not what it should be; the message says where to get the right one.
+        """
+        metric = cls(net)
+        origin = metric.backbone.weights_from
+        given = {
+            name.removeprefix("features."): tensor
+            for name, tensor in _read(backbone, f"{net} network", origin).items()
+            if not name.startswith("classifier.")
+        }
+        _require(given, metric.features.state_dict(), backbone, origin)
+        metric.features.load_state_dict(given)
+        origin = HEADS_FROM.format(net=net)
+        given = _read(heads, f"heads for {net}", origin)
+        names = {f"lin{layer}.model.1.weight": f"head{layer}" for layer in range(len(metric.backbone.channels))}
+        wanted = {name: metric.get_buffer(own)[None, :, None, None] for name, own in names.items()}
+        _require(given, wanted, heads, origin)
+        for name, own in names.items():
+            metric.get_buffer(own).copy_(given[name].flatten())
+        return metric
+
+    def _taps(self, pictures: Tensor) -> list[Tensor]:
+        x = (2 * pictures - 1 - self.shift) / self.scale  # one channel becomes three
+        taps = []
+        for position, layer in enumerate(self.features):
+            x = layer(x)
+            if position in self.backbone.taps:
+                taps.append(x)
+        return taps
+
+    def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Distance of each picture to its target.
+
+        Args:
+            prediction: [..., C, H, W] in 0 .. 1 (not enforced), C = 1 (grey, repeated) or 3; any number of leading
+                dimensions: [B, T, 1, H, W] is one pass over B*T pictures.
+            target: same shape; gets no gradient.
+
+        Returns:
+            [...], one distance per picture. Under autocast the features are half precision, their comparison is not.
+
+        Raises:
+            UsageError: shapes differ, or pictures too small for the network.
+        """
+        leading, (channels, height, width) = prediction.shape[:-3], prediction.shape[-3:]
+        if prediction.shape != target.shape or channels not in (1, 3):
+            raise UsageError(
+                f"LPIPS of {list(prediction.shape)} and {list(target.shape)}: give equal shapes [..., 1 or 3, H, W]"
+            )
+        smallest = self.backbone.smallest_px
+        if min(height, width) < smallest:
+            raise UsageError(f"LPIPS({self.net}) of {height} x {width} pictures: give at least {smallest} x {smallest}")
+        with torch.no_grad():
+            target_taps = self._taps(target.reshape(-1, channels, height, width))
+        taps = self._taps(prediction.reshape(-1, channels, height, width))
+        with torch.autocast(prediction.device.type, enabled=False):
+            distance = torch.zeros((), dtype=self.shift.dtype, device=prediction.device)
+            for layer, (first, second) in enumerate(zip(taps, target_taps, strict=True)):
+                # Recomputed in the backward pass: what it would save is several times the features themselves.
+                distance = distance + checkpoint(
+                    _layer_distance,
+                    first,
+                    second,
+                    self.get_buffer(f"head{layer}"),
+                    use_reentrant=False,
+                    preserve_rng_state=False,
+                )
+        return distance.reshape(leading)
+
+
+def _read(path: str | Path, what: str, origin: str) -> dict[str, Tensor]:
+    if not Path(path).is_file():
+        raise UsageError(f"LPIPS {what}: no file {path}. Nothing is downloaded; get it from {origin}")
+    return read_tensors(path)
+
+
+def _require(given: dict[str, Tensor], wanted: dict[str, Tensor], path: str | Path, origin: str) -> None:
+    wrong = sorted(
+        name
+        for name in given.keys() | wanted.keys()
+        if name not in given or name not in wanted or given[name].shape != wanted[name].shape
+    )
+    if wrong:
+        raise UsageError(
+            f"{path}: {len(wrong)} of {len(wanted)} LPIPS weights are missing, unknown or of another shape, first "
+            f"{wrong[0]}. Get the file from {origin}"
+        )

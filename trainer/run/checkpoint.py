@@ -1,0 +1,123 @@
+"""Checkpoints of a training run: everything that decides its next losses, and nothing that needs code to be read.
+
+A checkpoint holds tensors and plain values only, so it loads with ``weights_only=True``: state dicts of the network,
+the optimiser and the scheduler (never the objects), the state of the random generators, the position in the stream
+after the last batch that was trained on (``Batch.resume_state``), the counters and the configuration.
+
+Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from trainer.run.replacing import replacing
+from trainer.unpickle import read_torch_file
+from v2v_protocol.errors import UsageError
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One moment of a training run, between two steps.
+
+    Attributes:
+        step: optimiser steps taken so far, over all epochs.
+        epoch: the epoch that the next batch belongs to.
+        model: state dict of the network itself (unwrapped: not of DistributedDataParallel).
+        optimizer: its state dict.
+        scheduler: its state dict, or None without one.
+        ema: state dict of the averaged network, or None without one.
+        rng: of :func:`capture_rng`.
+        stream: ``resume_state`` of the last batch trained on; None before the first.
+        config: the run's configuration as plain values.
+    """
+
+    step: int
+    epoch: int
+    model: Mapping[str, Tensor]
+    optimizer: Mapping[str, Any]
+    scheduler: Mapping[str, Any] | None
+    ema: Mapping[str, Tensor] | None
+    rng: Mapping[str, Any]
+    stream: Mapping[str, Any] | None
+    config: Mapping[str, Any]
+
+
+def capture_rng(device: torch.device) -> dict[str, Any]:
+    """State of PyTorch's generators on the CPU and, where ``device`` is a GPU, on that one: "cuda" lists it."""
+    cuda = [torch.cuda.get_rng_state(device)] if device.type == "cuda" else []
+    return {"torch": torch.get_rng_state(), "cuda": cuda}
+
+
+def restore_rng(state: Mapping[str, Any], device: torch.device) -> None:
+    """Set the generators back to what :func:`capture_rng` saw, as far as ``device`` has them.
+
+    Earlier releases listed all GPUs that the process saw, by their number.
+    """
+    torch.set_rng_state(state["torch"])
+    cuda = state["cuda"]
+    if cuda and device.type == "cuda":
+        index = device.index or 0
+        torch.cuda.set_rng_state(cuda[index if index < len(cuda) else 0], device)
+
+
+def _plain(value: Any, place: str) -> Any:
+    """``value`` with every mapping as a dict, checked to be readable without code.
+
+    Raises:
+        UsageError: something else than a tensor or a plain value, and where it is.
+    """
+    if isinstance(value, Mapping):
+        return {key: _plain(item, f"{place}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        items = [_plain(item, f"{place}[{index}]") for index, item in enumerate(value)]
+        return tuple(items) if isinstance(value, tuple) else items
+    if value is None or type(value) in (str, int, float, bool, bytes) or isinstance(value, Tensor):
+        return value
+    raise UsageError(f"checkpoint {place} is a {type(value).__name__}: only tensors and plain values are kept")
+
+
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint, replacing ``path`` only once all of it is on the disk.
+
+    Raises:
+        UsageError: a part of it is neither tensor nor plain.
+        OSError: the disk refused; ``path`` is as it was.
+    """
+    path = Path(path)
+    content = {"format": FORMAT}
+    for item in dataclasses.fields(checkpoint):
+        content[item.name] = _plain(getattr(checkpoint, item.name), item.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:
+            # PyTorch closes its archive on the way out of the disk's error, and complains that bytes are missing.
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read what :func:`save_checkpoint` wrote, with all tensors on the CPU.
+
+    Raises:
+        UsageError: no such file, damaged, not a checkpoint of a training run, or of a newer release.
+    """
+    content = read_torch_file(path, plain=True)
+    names = [item.name for item in dataclasses.fields(Checkpoint)]
+    if not isinstance(content, dict) or not {"format", *names} <= content.keys():
+        raise UsageError(f"{path} is no checkpoint of a training run (for weights alone use load_weights)")
+    if content["format"] != FORMAT:
+        raise UsageError(f"{path} has checkpoint format {content['format']}, this release reads {FORMAT}")
+    return Checkpoint(**{name: content[name] for name in names})

@@ -1,0 +1,223 @@
+"""What a run says of itself: a progress bar, ``metrics.jsonl``, TensorBoard scalars, pictures and videos."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from trainer.config import TrainConfig
+from trainer.run.distributed import Ranks
+from trainer.run.preview import contact_sheet, write_png, write_video
+from trainer.run.replacing import replacing
+from v2v_client import V2VStreamDataset
+from v2v_protocol.errors import UsageError
+
+METRICS = "metrics.jsonl"
+
+
+class Meter:
+    """Means over the steps since the last reading, summed up on the device: only :meth:`read` waits for it."""
+
+    def __init__(self, ranks: Ranks) -> None:
+        self._ranks = ranks
+        self._names: tuple[str, ...] = ()
+        self._sum: Tensor | None = None
+        self._steps = 0
+        self._began = time.perf_counter()
+        self._waited = 0.0
+
+    def add(self, values: Mapping[str, Tensor]) -> None:
+        """The scalars of one step; the same names each time."""
+        self._names = tuple(values)
+        stacked = torch.stack([value.detach().float() for value in values.values()])
+        self._sum = stacked if self._sum is None else self._sum + stacked
+        self._steps += 1
+
+    def read(self, wait_seconds: float) -> dict[str, float]:
+        """Means over steps and ranks, and the speed; then starts anew.
+
+        Args:
+            wait_seconds: time spent waiting for data since the run began.
+
+        Returns:
+            the scalars by name; ``steps_per_second``; ``data_wait_seconds`` and ``compute_seconds`` per step.
+        """
+        if self._sum is None:
+            return {}
+        means = self._ranks.mean(self._sum / self._steps).tolist()
+        now = time.perf_counter()
+        seconds, waited = now - self._began, wait_seconds - self._waited
+        record = dict(zip(self._names, means, strict=True)) | {
+            "steps_per_second": self._steps / seconds,
+            "data_wait_seconds": waited / self._steps,
+            "compute_seconds": (seconds - waited) / self._steps,
+        }
+        self._sum, self._steps, self._began, self._waited = None, 0, now, wait_seconds
+        return record
+
+
+class Reporter:
+    """Says it, on the first rank; the others are silent.
+
+    Args:
+        out: folder of the run.
+        speaks: this is the first rank.
+        step: where the run goes on; what an earlier one wrote of later steps is dropped.
+
+    Raises:
+        UsageError: what an earlier one wrote is damaged, and not merely torn at its end.
+    """
+
+    def __init__(self, out: Path, *, speaks: bool, step: int = 0) -> None:
+        self._out = out
+        self._console = Console(highlight=False, quiet=not speaks)
+        self._board: SummaryWriter | None = None
+        self._first = self._step = step
+        self._planned = False
+        self._total: int | None = None
+        self._seconds = 0.0
+        self._began = time.perf_counter()
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+            disable=not speaks or not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("training", total=None, note="", completed=step)
+        if speaks:
+            out.mkdir(parents=True, exist_ok=True)
+            _drop_after(out / METRICS, step)
+            self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1)
+
+    def __enter__(self) -> Reporter:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+        if self._board is not None:
+            self._board.close()
+
+    def advance(self, step: int, dataset: V2VStreamDataset, config: TrainConfig) -> None:
+        """One more step was queued; the first one tells how many there will be."""
+        self._step = step
+        if not self._planned:
+            self._planned, self._seconds, self._total = True, config.run.seconds, _planned_steps(dataset, config)
+        self._bar.update(self._task, completed=step, total=self._total)
+
+    def metrics(self, step: int, epoch: int, learning_rate: float, values: Mapping[str, float]) -> None:
+        """A reading of the meter.
+
+        Raises:
+            UsageError: it cannot be written down.
+        """
+        if self._board is None:
+            return
+        record: dict[str, Any] = {"step": step, "epoch": epoch, "learning_rate": learning_rate, **values}
+        try:
+            with (self._out / METRICS).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:
+            raise UsageError(f"{self._out / METRICS}: {error.strerror}") from error
+        for name, value in record.items():
+            if name != "step":
+                self._board.add_scalar(f"{_GROUPS.get(name, 'loss')}/{name}", value, step)
+        note = self._note(values)
+        self._bar.update(self._task, note=note)
+        if self._bar.disable:
+            self._console.print(
+                f"step {step}{f'/{self._total}' if self._total else ''}  {note}", markup=False, soft_wrap=True
+            )
+
+    def preview(self, step: int, films: list[Any]) -> None:
+        """Films of :func:`trainer.run.preview.side_by_side`, one per sample, equally large."""
+        if self._board is None:
+            return
+        name = f"step-{step:07d}"
+        for number, film in enumerate(films):
+            sheet = contact_sheet(film)
+            write_png(self._out / "previews" / f"{name}-{number}.png", sheet)
+            write_video(self._out / "previews" / f"{name}-{number}.mp4", film)
+            self._board.add_image(f"preview/{number}", sheet, step, dataformats="HWC")
+        self._board.flush()
+
+    def _note(self, values: Mapping[str, float]) -> str:
+        wait, compute = values["data_wait_seconds"], values["compute_seconds"]
+        spent = time.perf_counter() - self._began
+        left = self._seconds - spent if self._seconds else math.inf
+        if self._total:
+            left = min(left, (self._total - self._step) * spent / max(1, self._step - self._first))
+        return (
+            f"loss {values['total']:.4f}  {values['steps_per_second']:.2f} it/s  "
+            f"data wait {wait / (wait + compute):.0%}  ETA {_clock(max(0.0, left))}"
+        )
+
+
+_GROUPS = {
+    **dict.fromkeys(("steps_per_second", "data_wait_seconds", "compute_seconds"), "speed"),
+    **dict.fromkeys(("epoch", "learning_rate", "gradient_norm"), "optimizer"),
+}
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The records of a ``metrics.jsonl``.
+
+    A last line that has no end is left out: it is still being written, or whoever wrote it was killed.
+
+    Raises:
+        UsageError: another line is no record; the message says which.
+    """
+    *lines, torn = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    records = [_record(line) for line in [*lines, torn]]
+    if records[-1] is None:
+        del records[-1]
+    for number, record in enumerate(records, start=1):
+        if record is None:
+            raise UsageError(f"{path}, line {number}, is no record of a run: take the line out, or the file away")
+    return [record for record in records if record is not None]
+
+
+def _record(line: str) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and "step" in record else None
+
+
+def _planned_steps(dataset: V2VStreamDataset, config: TrainConfig) -> int | None:
+    """Steps from the beginning of the run to its end; None where only the clock ends it."""
+    if config.run.seconds and not config.run.steps:
+        return None
+    sequences = 0 if dataset.stream is None else dataset.stream.sequences
+    steps = config.run.epochs * (sequences // (dataset.world_size * config.stream.batch_size))
+    return min(steps, config.run.steps or steps)
+
+
+def _drop_after(path: Path, step: int) -> None:
+    """A run that goes on from an earlier checkpoint repeats the steps after it."""
+    if path.exists():
+        kept = [json.dumps(record) + "\n" for record in read_metrics(path) if record["step"] <= step]
+        with replacing(path) as file:
+            file.write("".join(kept).encode())
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

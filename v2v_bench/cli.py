@@ -1,0 +1,101 @@
+"""``v2v-bench NAME ...``: one command for everything that measures.
+
+A benchmark is a module of this package with a ``main``; it is imported only when asked for, so that one benchmark does
+not need the packages of another. ``v2v-bench NAME --help`` shows its flags. Exit status: 0 success, 1 a stated bar of
+the benchmark missed, 2 wrong usage or input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import signal
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from v2v_protocol.errors import V2VError
+
+INTERRUPTED = 128 + signal.SIGINT
+_LINE_WIDTH = 104
+_HERE = Path(__file__).parent
+
+BENCHMARKS = {
+    "throughput": "speed.throughput",
+    "kernel": "speed.kernel",
+    "transport": "speed.transport",
+    "scaling": "speed.scaling",
+    "gpu_feed": "speed.gpu_feed",
+    "released": "speed.released",
+    "tradeoff": "tradeoff.tradeoff",
+    "training_trade": "tradeoff.training_trade",
+    "prepare": "tradeoff.prepare",
+    "flow": "accuracy.flow",
+    "physics": "accuracy.physics",
+    "extremes": "accuracy.extremes",
+    "scene": "accuracy.scene",
+    "chaos": "chaos.chaos",
+    "chaos_check": "chaos.check",
+    "soak": "chaos.soak",
+    "fuzz": "fuzz.fuzz",
+    "limits": "limits",
+    "corpus": "corpus",
+}
+"""Module of each benchmark, below this package."""
+
+
+def names() -> dict[str, str]:
+    """What can be run: name and beginning of its docstring, read from the source without importing anything."""
+    found = {}
+    for name, module in BENCHMARKS.items():
+        tree = ast.parse(_HERE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+        paragraph = (ast.get_docstring(tree) or "").split("\n\n")[0]
+        found[name] = textwrap.shorten(paragraph, _LINE_WIDTH, placeholder=" ...")
+    return found
+
+
+def usage() -> str:
+    """The list of benchmarks."""
+    lines = [f"  {name:14s} {line}" for name, line in names().items()]
+    return "\n".join(["usage: v2v-bench NAME [flags]     v2v-bench NAME --help", "", *lines])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return 0
+    if name not in BENCHMARKS:
+        print(f"v2v-bench: no benchmark {name!r}; known: {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    # Each main reads the command line itself, the way it does as a module of its own.
+    before, sys.argv = sys.argv, [f"v2v-bench {name}", *rest]
+    try:
+        with _ended_by_sigterm():
+            status = importlib.import_module(f"v2v_bench.{BENCHMARKS[name]}").main()
+    except (V2VError, OSError) as error:  # of a result that was printed and cannot be written, say
+        print(f"v2v-bench {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"v2v-bench {name}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        sys.argv = before
+    return int(status)
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """A SIGTERM ends a benchmark as an exception does, so that everything that was started is ended too."""
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

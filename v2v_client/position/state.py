@@ -1,0 +1,211 @@
+"""What a consumer saves: which stream, and how far it came. Pure.
+
+A state is a plain dict, so that a trainer's checkpoint can hold it. It pins everything that makes a sample's bytes;
+a server that would give others is refused before the first batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
+from v2v_protocol.messages import Welcome
+from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
+from v2v_protocol.spec import StreamSpec
+
+STATE_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """The server's half of every sample's identity.
+
+    Attributes:
+        spec: the resolved spec as plain values.
+        spec_digest, catalogue_digest, numerics_version: see :class:`v2v_protocol.sample.SampleId`.
+        sequences: N, samples of an epoch.
+    """
+
+    spec: Mapping[str, Any]
+    spec_digest: str
+    catalogue_digest: str
+    numerics_version: int
+    sequences: int
+
+    @classmethod
+    def of(cls, welcome: Welcome) -> Stream:
+        """
+        Raises:
+            ProtocolError: the spec is none, or the digest is not its own.
+        """
+        try:
+            digest = StreamSpec.from_dict(welcome.spec).digest
+        except (UsageError, TypeError, ValueError) as error:
+            raise ProtocolError(f"the server's resolved spec is not one: {error}") from error
+        if digest != welcome.spec_digest:
+            raise ProtocolError(
+                f"the server names its resolved spec {welcome.spec_digest}, but it is {digest}: client and server are "
+                "of different releases"
+            )
+        return cls(
+            spec=welcome.spec,
+            spec_digest=welcome.spec_digest,
+            catalogue_digest=welcome.catalogue_digest,
+            numerics_version=welcome.numerics_version,
+            sequences=welcome.sequences,
+        )
+
+    @property
+    def resolved(self) -> StreamSpec:
+        """The spec."""
+        return StreamSpec.from_dict(self.spec)
+
+    def require_same(self, other: Stream, *, ours: str, theirs: str) -> None:
+        """
+        Args:
+            other: the stream that is offered.
+            ours, theirs: words for the two sides.
+
+        Raises:
+            StateMismatch: they would give other samples; the message names what differs, on both sides.
+        """
+        remedies = {
+            "spec_digest": "ask for the recipe and options that were saved",
+            "catalogue_digest": "serve the folder of videos as it was (added, removed or changed files alter it)",
+            "numerics_version": "serve with the release that the state was saved with",
+            "sequences": "serve the folder of videos as it was",
+        }
+        for name, remedy in remedies.items():
+            mine, offered = getattr(self, name), getattr(other, name)
+            if mine != offered:
+                changed = differences(self.spec, other.spec) if name == "spec_digest" else ""
+                raise StateMismatch(f"{name}: {ours} has {mine}, {theirs} has {offered}{changed}; {remedy}")
+
+
+def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+    """The fields in which two resolved specs differ, as text: `` (recipe.gamma: 2.2 / 1.8)``."""
+
+    def flat(spec: Mapping[str, Any]) -> dict[str, Any]:
+        recipe = spec.get("recipe", {})
+        named = {f"recipe.{key}": value for key, value in recipe.items()} if isinstance(recipe, Mapping) else {}
+        return named | {key: value for key, value in spec.items() if key != "recipe"}
+
+    left, right = flat(ours), flat(theirs)
+    found = [
+        f"{key}: {left.get(key)} / {right.get(key)}"
+        for key in sorted(left.keys() | right.keys())
+        if left.get(key) != right.get(key)
+    ]
+    return f" ({', '.join(found[:5])}{', ...' if len(found) > 5 else ''})" if found else ""
+
+
+@dataclass(frozen=True, slots=True)
+class LoaderShare:
+    """How far one loader worker came, when a stateful loader saves each of them.
+
+    Attributes:
+        worker, workers: which of how many.
+        batch_size: of its batches.
+        batches: batches it delivered since the position in the state.
+    """
+
+    worker: int
+    workers: int
+    batch_size: int
+    batches: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResumeState:
+    """Where a rank stands.
+
+    Attributes:
+        stream: what the samples are made of; None before the first connection.
+        seed, epoch: of the samples to come.
+        origin, position, world_size: see :mod:`v2v_client.position.world`.
+        share: None for the state of a rank, which any number of loader workers can take up.
+        quarantine: number of the quarantine snapshot to go on under; None for the server's newest.
+    """
+
+    stream: Stream | None
+    seed: int
+    epoch: int
+    origin: int
+    position: int
+    world_size: int
+    share: LoaderShare | None = None
+    quarantine: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(Stream)}
+        return {
+            "version": STATE_VERSION,
+            **pinned,
+            "seed": self.seed,
+            "epoch": self.epoch,
+            "origin": self.origin,
+            "position": self.position,
+            "world_size": self.world_size,
+            "quarantine": self.quarantine,
+            "loader_worker": None if self.share is None else dataclasses.asdict(self.share),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> ResumeState:
+        """
+        Raises:
+            UsageError: not a state of this release.
+        """
+        if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
+            version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
+            raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
+        known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
+        known |= {field.name for field in dataclasses.fields(Stream)}
+        if values.keys() != known:
+            raise UsageError(f"not a state of V2VStreamDataset: keys {sorted(values)}, expected {sorted(known)}")
+        share, quarantine = values["loader_worker"], values["quarantine"]
+        return cls(
+            stream=_stream(values),
+            seed=_whole(values, "seed", 0, LARGEST_SEED),
+            epoch=_whole(values, "epoch", 0, LARGEST_EPOCH),
+            origin=_whole(values, "origin", 0, LARGEST_INDEX),
+            position=_whole(values, "position", 0, LARGEST_INDEX),
+            world_size=_whole(values, "world_size", 1, LARGEST_INDEX),
+            share=None if share is None else _share(share),
+            quarantine=None if quarantine is None else _whole(values, "quarantine", 0, LARGEST_INDEX),
+        )
+
+
+def _stream(values: Mapping[str, Any]) -> Stream | None:
+    if values["spec"] is None:
+        return None
+    if not isinstance(values["spec"], Mapping):
+        raise UsageError("state: spec is no mapping")
+    for name in ("spec_digest", "catalogue_digest"):
+        if not isinstance(values[name], str):
+            raise UsageError(f"state: {name} = {values[name]!r} is no text")
+    return Stream(
+        spec=values["spec"],
+        spec_digest=values["spec_digest"],
+        catalogue_digest=values["catalogue_digest"],
+        numerics_version=_whole(values, "numerics_version", 0, LARGEST_INDEX),
+        sequences=_whole(values, "sequences", 0, LARGEST_INDEX),
+    )
+
+
+def _share(values: Any) -> LoaderShare:
+    names = [field.name for field in dataclasses.fields(LoaderShare)]
+    if not isinstance(values, Mapping) or sorted(values) != sorted(names):
+        raise UsageError(f"state: loader_worker = {values!r:.200}, expected {', '.join(names)}")
+    return LoaderShare(**{name: _whole(values, name, 0, LARGEST_INDEX) for name in names})
+
+
+def _whole(values: Mapping[str, Any], name: str, low: int, high: int) -> int:
+    value = values[name]
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise UsageError(f"state: {name} = {value!r}, expected a whole number from {low} to {high}")
+    return value

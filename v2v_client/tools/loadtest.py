@@ -1,0 +1,322 @@
+"""``v2v-loadtest``: how fast a server feeds one trainer, and whether anything is lost or comes twice.
+
+It starts servers of its own with each number of workers (``--videos``), or measures a running one (``--connect``).
+The first ``--warmup-batches`` are received and checked, but not timed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import psutil
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from v2v_client.batch import Batch
+from v2v_client.command import run_command
+from v2v_client.dataset import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_client.tools.schedule_check import ScheduleCheck
+from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
+from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.spec import SPEED_PRESETS
+
+_RSS_EVERY_SECONDS = 0.5
+
+_COLUMNS = (
+    ("workers", "workers", "{}"),
+    ("batches_per_second", "batch/s", "{:.2f}"),
+    ("samples_per_second", "sample/s", "{:.1f}"),
+    ("p50_ms", "p50 ms", "{:.1f}"),
+    ("p99_ms", "p99 ms", "{:.1f}"),
+    ("cpu_seconds_per_batch", "CPU s/batch", "{:.3f}"),
+    ("bytes_per_second", "MB/s", "{:.1f}"),
+    ("client_stall_fraction", "stalled", "{:.0%}"),
+    ("accelerator_utilisation", "accel.", "{:.0%}"),
+    ("peak_rss_bytes", "RSS MB", "{:.0f}"),
+    ("lost", "lost", "{}"),
+    ("duplicated", "twice", "{}"),
+)
+
+
+@dataclass(slots=True)
+class Measurement:
+    """What one run consumed, after warm-up."""
+
+    waits: list[float] = field(default_factory=list)
+    samples: int = 0
+    bytes: int = 0
+    decodes: int = 0
+    worker_cpu_seconds: float = 0.0
+    compute_seconds: float = 0.0
+
+    def add(self, batch: Batch, wait_seconds: float, compute_seconds: float) -> None:
+        self.waits.append(wait_seconds)
+        self.samples += len(batch)
+        self.bytes += batch.nbytes
+        self.decodes += batch.decodes
+        self.worker_cpu_seconds += batch.cpu_seconds
+        self.compute_seconds += compute_seconds
+
+
+class Usage:
+    """Processor time and memory of this process and, when it is ours, of the server's processes."""
+
+    def __init__(self, server: LocalServer | None) -> None:
+        self._server = server
+        self._self = psutil.Process()
+        self._sampled = -_RSS_EVERY_SECONDS
+        self.peak_rss_bytes = 0
+
+    def cpu_seconds(self) -> float:
+        mine = self._self.cpu_times()
+        theirs = 0.0 if self._server is None else sum(self._server.cpu_seconds().values())
+        return mine.user + mine.system + theirs
+
+    def sample(self, now: float) -> None:
+        """Notes the memory in use, not more often than it changes."""
+        if now - self._sampled < _RSS_EVERY_SECONDS:
+            return
+        self._sampled = now
+        theirs = 0 if self._server is None else sum(self._server.rss_bytes().values())
+        self.peak_rss_bytes = max(self.peak_rss_bytes, self._self.memory_info().rss + theirs)
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The smallest value that at least ``share`` of the values do not exceed (nearest rank)."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+
+
+def measure(
+    dataset: V2VStreamDataset,
+    *,
+    address: str,
+    workers: int | None,
+    server: LocalServer | None,
+    batch_size: int,
+    seconds: float,
+    warmup_batches: int,
+    trainer_seconds: float,
+) -> tuple[dict[str, Any], ScheduleCheck]:
+    """Consumes the dataset for ``seconds`` after warm-up, over as many epochs as that takes.
+
+    Returns:
+        one flat record, and what the schedule says of the samples that came.
+    """
+    first_epoch = dataset.epoch
+    usage = Usage(server)
+    check: ScheduleCheck | None = None
+    measured = Measurement()
+    received = epochs = 0
+    batches = iter(dataset)
+    began = ended = time.perf_counter()
+    cpu_began = usage.cpu_seconds()
+    while not measured.waits or ended - began < seconds:
+        asked = time.perf_counter()
+        batch = next(batches, None)
+        if batch is None:
+            epochs += 1
+            batches = iter(dataset)
+            batch = next(batches)
+        wait = time.perf_counter() - asked
+        if check is None:
+            stream = dataset.stream
+            check = ScheduleCheck(0 if stream is None else stream.sequences, batch_size, first_epoch)
+        check.observe(batch.epoch, batch.indices)
+        received += 1
+        if trainer_seconds:
+            time.sleep(trainer_seconds)  # stands for an accelerator at work: the processor is free meanwhile
+        ended = time.perf_counter()
+        if received <= warmup_batches:
+            began, cpu_began = ended, usage.cpu_seconds()
+            continue
+        usage.sample(ended)
+        measured.add(batch, wait, trainer_seconds)
+    cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
+    elapsed = ended - began
+    count = len(measured.waits)
+    if check is None:
+        raise UsageError(f"seconds = {seconds}: nothing was measured")
+    record = {
+        "workers": workers,
+        "batches_per_second": count / elapsed,
+        "samples_per_second": measured.samples / elapsed,
+        "p50_ms": 1e3 * percentile(measured.waits, 0.5),
+        "p99_ms": 1e3 * percentile(measured.waits, 0.99),
+        "cpu_seconds_per_batch": cpu / count,
+        "bytes_per_second": measured.bytes / elapsed,
+        "client_stall_fraction": sum(measured.waits) / elapsed,
+        "peak_rss_bytes": usage.peak_rss_bytes,
+        "samples_per_decode": measured.samples / max(measured.decodes, 1),
+        "lost": check.lost,
+        "duplicated": check.duplicated,
+        "foreign": check.foreign,
+        "out_of_order": check.out_of_order,
+        "accelerator_utilisation": measured.compute_seconds / elapsed if trainer_seconds else None,
+        "batches": count,
+        "seconds": elapsed,
+        "warmup_batches": warmup_batches,
+        "batch_size": batch_size,
+        "epochs": epochs,
+        "address": address,
+    }
+    return record, check
+
+
+def table(records: Sequence[dict[str, Any]]) -> Table:
+    """The records as a person reads them."""
+    shown = Table(box=None, pad_edge=False)
+    for _, title, _ in _COLUMNS:
+        shown.add_column(title, justify="right", no_wrap=True)
+    for record in records:
+        values = {**record, "bytes_per_second": record["bytes_per_second"] / 1e6}
+        values["peak_rss_bytes"] = record["peak_rss_bytes"] / 1e6
+        shown.add_row(*("-" if values[key] is None else form.format(values[key]) for key, _, form in _COLUMNS))
+    return shown
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="v2v-loadtest",
+        description=(__doc__ or "").split("\n\n")[0],
+        epilog="Exit status: 0 each sample came once and in order, 1 not so, 2 wrong usage or no server.",
+    )
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--videos", metavar="DIR", help="start servers of our own on these videos")
+    source.add_argument("--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port")
+    parser.add_argument(
+        "--workers", type=_counts, metavar="N,N", help="with --videos: server workers, one run each (default 1,2)"
+    )
+    parser.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
+    parser.add_argument("--batch-size", type=int, default=12, metavar="N")
+    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="to measure, after warm-up, per run")
+    parser.add_argument("--warmup-batches", type=int, default=4, metavar="N", help="received first, not timed")
+    parser.add_argument(
+        "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulates a training step of this length"
+    )
+    parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    parser.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
+    parser.add_argument("--samples-per-decode", type=int, metavar="K", help="default: the preset's")
+    parser.add_argument("--recipe", metavar="PRESET", help="default: the server's")
+    parser.add_argument(
+        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="changes a recipe field"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--timeout-seconds", type=float, default=60.0, metavar="S", help="silence that means a lost server"
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the records there")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
+
+
+def _counts(text: str) -> list[int]:
+    counts = [int(part) for part in text.split(",")]
+    if min(counts) < 1:
+        raise ValueError
+    return counts
+
+
+def recipe_of(preset: str | None, changes: Sequence[str]) -> str | dict[str, Any] | None:
+    """The recipe that ``--recipe`` and ``--set`` ask for.
+
+    Raises:
+        UsageError: a change that is not KEY=VALUE with a YAML value.
+    """
+    if not changes:
+        return preset
+    recipe: dict[str, Any] = {} if preset is None else {"preset": preset}
+    for change in changes:
+        key, equals, text = change.partition("=")
+        try:
+            value = yaml.safe_load(text)
+        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
+            raise UsageError(f"--set {change}: the value is not YAML") from error
+        if not equals or not key or value is None:
+            raise UsageError(f"--set {change}: give KEY=VALUE, for example --set threshold='[0.1, 0.5]'")
+        recipe[key] = value
+    return recipe
+
+
+def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
+    return V2VStreamDataset(
+        address,
+        batch_size=arguments.batch_size,
+        arrays=tuple(arguments.arrays.split(",")),
+        preset=arguments.preset,
+        samples_per_decode=arguments.samples_per_decode,
+        recipe=recipe_of(arguments.recipe, arguments.changes),
+        seed=arguments.seed,
+        rank=0,
+        world_size=1,
+        timeout_seconds=arguments.timeout_seconds,
+    )
+
+
+def _server_flags(arguments: argparse.Namespace) -> list[str]:
+    # A server looks at its own recipe to say which videos are long enough, so it is given ours.
+    settings = {"--rows": arguments.rows, "--recipe": arguments.recipe}
+    flags = [part for flag, value in settings.items() if value for part in (flag, value)]
+    return [*flags, *(part for change in arguments.changes for part in ("--set", change))]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measures, prints, writes; returns the exit status.
+
+    Raises:
+        V2VError: wrong usage, or no server.
+    """
+    if arguments.seconds <= 0 or arguments.warmup_batches < 0 or arguments.trainer_ms < 0:
+        raise UsageError("--seconds is more than 0, --warmup-batches and --trainer-ms are 0 or more")
+    if arguments.connect and (arguments.workers or arguments.rows):
+        raise UsageError("--workers and --rows are for servers of our own: use them with --videos")
+    options = {
+        "batch_size": arguments.batch_size,
+        "seconds": arguments.seconds,
+        "warmup_batches": arguments.warmup_batches,
+        "trainer_seconds": arguments.trainer_ms / 1e3,
+    }
+    results = []
+    if arguments.connect:
+        dataset = _dataset(arguments, arguments.connect)
+        results.append(measure(dataset, address=arguments.connect, workers=None, server=None, **options))
+    else:
+        _dataset(arguments, "tcp://127.0.0.1:0")  # a wrong option should not cost the start of a server
+        for workers in arguments.workers or (1, 2):
+            with LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server:
+                dataset = _dataset(arguments, server.address)
+                results.append(measure(dataset, address=server.address, workers=workers, server=server, **options))
+    records = [record for record, _ in results]
+    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
+    console.print(table(records))
+    print(
+        f"batch size {arguments.batch_size}; {arguments.warmup_batches} warm-up batches not timed; p50 and p99: time "
+        "between asking for and having a batch; CPU: " + _cpu_scope(arguments)
+    )
+    if arguments.json:
+        write_json(arguments.json, records)
+    return 0 if all(check.faultless for _, check in results) else 1
+
+
+def _cpu_scope(arguments: argparse.Namespace) -> str:
+    if arguments.connect:
+        return "this process, and what the server's workers state for each sample (not its broker)"
+    return "this process, server and workers"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    return run_command(_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""What the dispatcher wants done. Whoever has the sockets, the processes and the disk carries it out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from v2v_protocol.messages import ErrorCode, Refused
+from v2v_protocol.wire import Frames, encode
+from v2v_server.broker.leases import Task
+from v2v_server.broker.quarantine import Verdict
+
+_LONGEST_TEXT = 2000
+"""Characters of a refusal: it quotes what the peer sent, which may be long, and must itself fit a header."""
+
+
+@dataclass(frozen=True, slots=True)
+class ToConsumer:
+    """Send these frames to a consumer."""
+
+    identity: bytes
+    frames: Sequence[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ToWorker:
+    """Send these frames to a worker."""
+
+    identity: bytes
+    frames: Frames
+
+
+@dataclass(frozen=True, slots=True)
+class GiveUp:
+    """This worker hangs: end its process where that is in our power, and report its loss."""
+
+    identity: bytes
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Write this verdict down before anything that follows is sent, and report what came of it.
+
+    Attributes:
+        verdict: not numbered yet.
+        task: whose candidate it refuses.
+    """
+
+    verdict: Verdict
+    task: Task
+
+
+@dataclass(frozen=True, slots=True)
+class LookFor:
+    """A worker cannot have a video on its host: see whether it is on this one as it was catalogued, and report.
+
+    Attributes:
+        video, fingerprint: of the file.
+        identity: the worker.
+        frame, reason: what the worker said.
+        task: what it was to make of it.
+    """
+
+    video: str
+    fingerprint: str
+    identity: bytes
+    frame: int | None
+    reason: str
+    task: Task
+
+
+Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor
+
+
+def refusal(code: ErrorCode, text: str) -> Frames:
+    """A Refused message that is short enough whatever the text quotes."""
+    return encode(Refused(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))

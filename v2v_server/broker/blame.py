@@ -1,0 +1,63 @@
+"""Blame: what the death of a worker says about the sample it was at. Pure.
+
+    crashed, hung                the sample did it: its candidate is refused at once, and the verdict is written down
+    unexplained                  an exception, no memory, a lost connection, storage that does not answer: the sample is
+                                 tried again; after two such deaths it runs alone on its worker, and a third death
+                                 counts like a crash
+    killed                       from outside (pre-emption, an impatient operator): says nothing about any sample
+
+Only the lease that the worker had begun is judged; those queued behind it go back as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from v2v_server.broker.leases import Task
+
+ALONE_AFTER = 2
+"""Unexplained deaths after which a sample runs alone."""
+
+
+class Cause(StrEnum):
+    """Why a worker is gone."""
+
+    CRASHED = "crashed"
+    HUNG = "hung"
+    UNEXPLAINED = "unexplained"
+    KILLED = "killed"
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """A worker that is gone.
+
+    Attributes:
+        cause: what it says about the sample in work.
+        text: what happened, in words: "was ended by SIGSEGV".
+        lease: the lease it was at by its own record, 0 for none; None where there is no record and what it announced
+            has to do.
+    """
+
+    cause: Cause
+    text: str
+    lease: int | None = None
+
+
+def runs_alone(task: Task) -> bool:
+    """Whether the task must have its worker to itself."""
+    return task.deaths >= ALONE_AFTER
+
+
+def judged(task: Task, loss: Loss) -> Task | str:
+    """The verdict on a task that was begun when its worker was lost.
+
+    Returns:
+        the task to try again, or the reason why its candidate is refused.
+    """
+    if loss.cause is Cause.KILLED:
+        return task
+    if loss.cause is Cause.UNEXPLAINED and not runs_alone(task):
+        return replace(task, deaths=task.deaths + 1)
+    return f"a worker {loss.text} over it"

@@ -1,0 +1,425 @@
+"""The server's mind: messages and deaths in, instructions out. No sockets, no processes, no clock.
+
+Consumers ask (Want), sessions queue, free workers are given leases, results pass through as they are. Whatever a peer
+sends, the answer is an instruction or a counted fault, never an exception: one bad peer must not stop the others.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
+from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
+from v2v_protocol.messages import (
+    Begun,
+    ErrorCode,
+    Goodbye,
+    Hello,
+    JobFailed,
+    Message,
+    Ping,
+    Pong,
+    Refused,
+    Result,
+    SampleHeader,
+    Stop,
+    Want,
+    WorkerHello,
+)
+from v2v_protocol.sample import Refusal, SampleId
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import Buffer, Frames, decode, encode
+from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, refusal
+from v2v_server.broker.admission import Reception
+from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
+from v2v_server.broker.candidates import Candidates
+from v2v_server.broker.counters import Counters
+from v2v_server.broker.inspection import inspected
+from v2v_server.broker.jobs import describe
+from v2v_server.broker.leases import LeaseBook, Task
+from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.session import Session, Sessions
+from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
+from v2v_server.catalogue.catalogue import Catalogue
+
+MOST_SESSIONS = 4096
+_MOST_CPU_SECONDS = 86_400.0
+
+
+class Dispatcher:
+    """Decides who gets what.
+
+    Args:
+        catalogue: the corpus.
+        default_spec: what a consumer gets that asks for nothing in particular.
+        lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
+        session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
+        max_credit_bytes: bound on the bytes in flight to one consumer.
+        quarantine: the snapshots; verdicts that were written down are added to it.
+        wall_clock: gives the time for a verdict, ISO 8601.
+        expected_workers: workers that will serve in all, this host's and others', counted before they have said
+            hello: a consumer's credit is settled when it connects, which may be before the first of them is there.
+
+    Attributes:
+        counters: what happened so far.
+        sessions: the consumers.
+    """
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        default_spec: StreamSpec,
+        *,
+        lease_deadline_seconds: float,
+        session_idle_seconds: float,
+        max_credit_bytes: int,
+        quarantine: Quarantine,
+        wall_clock: Callable[[], str],
+        expected_workers: int = 0,
+    ) -> None:
+        self.counters = Counters()
+        self.sessions = Sessions(session_idle_seconds)
+        self._expected_workers = expected_workers
+        self._catalogue = catalogue
+        self._quarantine = quarantine
+        self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
+        self._reception = Reception(catalogue, default_spec, max_credit_bytes, quarantine)
+        self._leases = LeaseBook(lease_deadline_seconds)
+        self._workers = Workers(self._leases)
+        self._lone: deque[Task] = deque()
+
+    @property
+    def workers(self) -> int:
+        """Workers that said hello and are alive as far as is known."""
+        return len(self._workers)
+
+    @property
+    def waiting(self) -> int:
+        """Asked samples that nobody works on yet."""
+        return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
+
+    def take_refusals(self) -> list[Refusal]:
+        """The candidates that failed since the last call, for the log."""
+        return self._candidates.take_refusals()
+
+    # --- consumers ----------------------------------------------------------------------------------------------------
+
+    def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Instruction]:
+        """A message from the consumers' side."""
+        try:
+            message = _only(frames)
+        except ProtocolError as error:
+            return [ToConsumer(identity, self._malformed(error))]
+        session = self.sessions.get(identity)
+        if session is not None:
+            session.last_heard = now
+        match message:
+            case Hello():
+                return [self._hello(identity, message, now)]
+            case Ping():
+                return [ToConsumer(identity, encode(Pong()))]
+            case Goodbye():
+                self.consumer_lost(identity)
+                return []
+            case Want():
+                if session is None:
+                    return [_refuse(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
+                return self._want(session, message) or self._assign(now)
+            case _:
+                stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
+                return [ToConsumer(identity, self._malformed(stray))]
+
+    def consumer_lost(self, identity: bytes) -> None:
+        """The consumer left, or cannot be reached any more."""
+        self.sessions.forget(identity)
+        self._leases.forget_session(identity)
+        self._lone = deque(task for task in self._lone if task.session != identity)
+
+    def _hello(self, identity: bytes, hello: Hello, now: float) -> Instruction:
+        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+            return _refuse(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
+        try:
+            workers = max(len(self._workers), self._expected_workers)
+            session, welcome = self._reception.receive(identity, hello, workers, now)
+        except (UsageError, CorpusError) as error:
+            return _refuse(identity, ErrorCode.SPEC, str(error))
+        self.consumer_lost(identity)
+        self.sessions.open(session)
+        return ToConsumer(identity, encode(welcome))
+
+    def _want(self, session: Session, want: Want) -> list[Instruction]:
+        try:
+            slots = _slots(want)
+        except ProtocolError as error:
+            return [ToConsumer(session.identity, self._malformed(error))]
+        try:
+            for index in want.indices[:1]:
+                SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
+            self.sessions.want(session, want.epoch, want.indices, slots)
+        except LimitExceeded as error:
+            return [_refuse(session.identity, ErrorCode.CREDIT, str(error))]
+        except (IndexError, UsageError) as error:
+            return [_refuse(session.identity, ErrorCode.RANGE, str(error))]
+        return []
+
+    def _malformed(self, error: ProtocolError) -> Frames:
+        self.counters.malformed += 1
+        code = ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED
+        return refusal(code, str(error))
+
+    # --- workers ------------------------------------------------------------------------------------------------------
+
+    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Instruction]:
+        """A message from the workers' side. The frames behind a Result are passed on as they are."""
+        try:
+            message = decode(frames[0]) if frames else _only(frames)
+        except ProtocolError as error:
+            return [ToWorker(identity, self._malformed(error))]
+        if isinstance(message, WorkerHello):
+            return self._worker_hello(identity, message, now)
+        if not self._workers.heard(identity, now):
+            return [ToWorker(identity, encode(Refused(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
+        match message:
+            case Begun(lease):
+                self._leases.begun(lease, identity, now)
+                return []
+            case Result():
+                return self._result(identity, message, frames[1:], now)
+            case JobFailed():
+                return self._job_failed(identity, message, now)
+            case Ping():
+                return [ToWorker(identity, encode(Pong()))]
+            case Goodbye():
+                return self._take_back(identity, Loss(Cause.KILLED, "left"), now)
+            case _:
+                self.counters.malformed += 1
+                return []
+
+    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+        """A worker died, was given up, or cannot be reached any more."""
+        self.counters.workers_lost += 1
+        return self._take_back(identity, loss, now)
+
+    def worker_unreachable(self, identity: bytes, now: float) -> list[Instruction]:
+        """Something sent to a worker did not go out, and nobody will say what became of its process."""
+        if identity not in self._workers:
+            return []
+        return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
+
+    def recorded(self, record: Record, written: Sequence[Verdict], now: float) -> list[Instruction]:
+        """What came of a :class:`Record`.
+
+        Args:
+            record: the instruction.
+            written: the lines that the quarantine has more now, others' among them; none when it cannot be written.
+            now: the time.
+        """
+        before = self._quarantine.latest
+        self._quarantine.extend(written)
+        # Consumers that went on under the newest snapshot go on under the newest. One that resumed an older one keeps
+        # it: what was cleared since must not come back, nor what it had refused be admitted.
+        for each in self.sessions:
+            if each.quarantine == before:
+                each.quarantine = self._quarantine.latest
+        return [*self._candidates.refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
+
+    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Instruction]:
+        """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
+
+        Args:
+            missing: the instruction.
+            found: whether this host has the video as it was catalogued.
+            now: the time.
+        """
+        if not found:
+            return [*self._candidates.refuse(missing.task, missing.frame, missing.reason), *self._assign(now)]
+        self.counters.missing_videos += 1
+        self._workers.rest(missing.identity, now)
+        self.sessions.put_back(missing.task)
+        return self._assign(now)
+
+    def tick(self, now: float) -> list[Instruction]:
+        """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
+        for identity in self.sessions.idle(now):
+            self.consumer_lost(identity)
+        instructions: list[Instruction] = []
+        self._workers.wake(now)
+        for identity in self._workers.hanging(now):
+            instructions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
+        for identity in self._workers.vanished(now):
+            instructions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
+        for task, worker in self._leases.slow(now):
+            second = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone), other_than=worker)
+            if second is not None and not runs_alone(task):
+                self.counters.second_leases += 1
+                instructions += self._grant(replace(task, slot=None), second, now)
+        # A consumer that left may have freed a worker that was kept for it, or for its tasks.
+        return instructions + self._assign(now)
+
+    def stop_workers(self) -> list[Instruction]:
+        """Tells every worker to finish and leave."""
+        return [ToWorker(identity, encode(Stop())) for identity in self._workers.identities()]
+
+    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Instruction]:
+        again = Loss(Cause.KILLED, "started again")
+        instructions = self._take_back(identity, again, now) if identity in self._workers else []
+        if hello.numerics_version != NUMERICS_VERSION:
+            text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
+            return [ToWorker(identity, encode(Refused(ErrorCode.VERSION, text))), *instructions]
+        if len(self._workers) >= MOST_WORKERS:
+            text = f"this server has {MOST_WORKERS} workers, its limit"
+            return [ToWorker(identity, refusal(ErrorCode.BUSY, text)), *instructions]
+        self._workers.add(identity, hello.credit, now)
+        return instructions + self._assign(now)
+
+    def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
+        task = self._leases.task(result.lease, identity)
+        session = None if task is None else self.sessions.get(task.session)
+        instructions: list[Instruction] = []
+        decoded = True
+        if task is None or session is None:
+            self.counters.late_results += 1
+        else:
+            try:
+                header = inspected(payload, task, session.form)
+            except ProtocolError as error:
+                # No worker of ours does this, and one that did it once would do it again.
+                refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
+                return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+            decoded = header.decoded
+            if self._count(session, task, header, in_slot=len(payload) == 1):
+                instructions.append(ToConsumer(task.session, payload))
+        self._leases.finished(result.lease, identity, now, decoded=decoded)
+        self._leases.begun(result.begins, identity, now)
+        return instructions + self._assign(now)
+
+    def _job_failed(self, identity: bytes, failed: JobFailed, now: float) -> list[Instruction]:
+        task = self._leases.finished(failed.lease, identity, now)
+        session = None if task is None else self.sessions.get(task.session)
+        if task is None or session is None:
+            return self._assign(now)
+        if not failed.here:
+            return [*self._candidates.refuse(task, failed.frame, failed.reason), *self._assign(now)]
+        # The catalogue is of this host's files: if the video is here, other workers can have it too.
+        video = self._candidates.sequence(session, task).video
+        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, task)]
+
+    def _count(self, session: Session, task: Task, header: SampleHeader, *, in_slot: bool) -> bool:
+        """Accounts for a sample; False when nobody waits for it."""
+        cpu_seconds = min(max(header.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
+        if not self.sessions.answered(task, cpu_seconds):
+            self.counters.late_results += 1
+            return False
+        self.counters.samples += 1
+        self.counters.decodes += header.decoded
+        self.counters.worker_cpu_seconds += cpu_seconds
+        self.counters.batches += 1 / session.batch_size
+        self.counters.bytes += sum(session.form.sizes)
+        self.counters.in_slots += in_slot
+        return True
+
+    def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+        self._workers.remove(identity)
+        instructions: list[Instruction] = []
+        returned = self._leases.lost(identity, loss.lease)
+        self.counters.returned_leases += len(returned)
+        for task, begun in reversed(returned):
+            verdict = judged(task, loss) if begun else task
+            if isinstance(verdict, Task):
+                self.sessions.put_back(verdict)
+            else:
+                instructions += self._candidates.condemn(task, verdict)
+        return instructions + self._assign(now)
+
+    # --- tasks --------------------------------------------------------------------------------------------------------
+
+    def _assign(self, now: float) -> list[Instruction]:
+        """Gives waiting tasks to workers, until there is no task or no room."""
+        instructions: list[Instruction] = []
+        while True:
+            if self._lone:
+                empty = self._workers.for_lone_task()
+                if empty is not None:
+                    instructions += self._give([self._lone.popleft()], empty, now)
+                    continue
+            worker = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone))
+            task = self.sessions.next_task() if worker is not None else None
+            if worker is None or task is None:
+                return instructions
+            if runs_alone(task):
+                self._lone.append(task)
+            else:
+                instructions += self._give([task, *self.sessions.take_siblings(task)], worker, now)
+
+    def _give(self, tasks: list[Task], worker: bytes, now: float) -> list[Instruction]:
+        """Gives a worker the tasks of one clip, except those whose candidate is in quarantine."""
+        session = self.sessions.get(tasks[0].session)
+        if session is None:
+            return []
+        instructions: list[Instruction] = []
+        good: list[Task] = []
+        for task in tasks:
+            current = self._candidates.current(task, session)
+            quarantined = self._candidates.quarantined(session, current, session.quarantine)
+            if quarantined is None:
+                good.append(current)
+            else:
+                instructions += self._candidates.refuse(current, None, quarantined, log=False)
+        for place, task in enumerate(good):
+            instructions += self._grant(task, worker, now, tuple(other.index for other in good[place + 1 :]))
+        return instructions
+
+    def _grant(self, task: Task, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Instruction]:
+        session = self.sessions.get(task.session)
+        if session is None:
+            return []
+        number = self._leases.grant(task, worker, now)
+        try:
+            lease = describe(
+                task,
+                number=number,
+                sequence=self._candidates.sequence(session, task),
+                quarantine=task.snapshot,
+                catalogue=self._catalogue,
+                spec=session.spec,
+                seed=session.seed,
+                arrays=session.arrays,
+                deadline_seconds=self._leases.deadline_seconds,
+                siblings=siblings,
+            )
+            return [ToWorker(worker, encode(lease))]
+        except V2VError as error:
+            # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
+            returned = self._leases.finished(number, worker, now)
+            return [] if returned is None else self._candidates.refuse(returned, None, str(error))
+
+
+def _only(frames: Sequence[Buffer]) -> Message:
+    if len(frames) != 1:
+        raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
+    return decode(frames[0])
+
+
+def _slots(want: Want) -> list[Slot | None]:
+    """Where the samples may be put.
+
+    Raises:
+        ProtocolError: that is nowhere.
+    """
+    if not len(want.arenas) == len(want.slots) in (0, len(want.indices)):
+        raise ProtocolError(f"want: {len(want.arenas)} arenas, {len(want.slots)} slots for {len(want.indices)} indices")
+    numbers = {arena: (1, ArenaName.parse(arena).slots) for arena in set(want.arenas) - {""}}
+    numbers[""] = NO_SLOT, NO_SLOT
+    for arena, number in zip(want.arenas, want.slots, strict=True):
+        least, most = numbers[arena]
+        if not least <= number <= most:
+            raise ProtocolError(f"want.slots: {number} of arena {arena!r:.80}; it has {least} to {most}")
+    return [Slot(arena, number) if arena else None for arena, number in zip(want.arenas, want.slots, strict=True)]
+
+
+def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
+    return ToConsumer(identity, refusal(code, text))

@@ -1,0 +1,234 @@
+"""Leases: which worker is making which sample. A state machine without I/O; time is passed in.
+
+    pending (in its session's queue) --grant--> leased --begun--> working --finished--> gone
+                 ^                                 |                 |
+                 `------- returned to its session -+-----------------'   worker lost
+
+A task is one asked sample. Every grant gets a new number, so an answer to a lease that was taken away is recognised by
+its number and dropped. A task that takes much longer than its consumer's others is given to a second worker as well;
+the first answer retires its twin.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from v2v_protocol.arena import Slot
+from v2v_protocol.sample import Refusal
+
+SLOW_FACTOR = 3.0
+"""A lease in work for this many times the median of its session's decoded clips is slow."""
+_LEAST_SLOW_SECONDS = 1.0
+_REMEMBERED = 64
+_LEAST_REMEMBERED = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One asked sample on its way.
+
+    Attributes:
+        session: routing identity of the consumer.
+        epoch, index: which sample.
+        candidate: which candidate sequence is being tried.
+        refusals: the candidates that failed before it.
+        deaths: unexplained deaths of workers that were at this candidate.
+        snapshot: number of the quarantine snapshot under which those candidates were passed over.
+        place: of the index in the epoch's order (:mod:`v2v_server.schedule.epoch`); None: the index itself.
+        slot: where its consumer lets it be put; given to one worker only.
+    """
+
+    session: bytes
+    epoch: int
+    index: int
+    candidate: int = 0
+    refusals: tuple[Refusal, ...] = ()
+    deaths: int = 0
+    snapshot: int = 0
+    place: int | None = None
+    slot: Slot | None = None
+
+    @property
+    def clip(self) -> tuple[bytes, int, int, int]:
+        """What it is made from: tasks of equal clip are made from the same decoded frames."""
+        return self.session, self.epoch, self.index if self.place is None else self.place, self.candidate
+
+    @property
+    def sample(self) -> tuple[bytes, int, int]:
+        """What is asked, whichever candidate it will be made from."""
+        return self.session, self.epoch, self.index
+
+
+@dataclass(slots=True)
+class _Lease:
+    task: Task | None  # None: answered, or its consumer is gone; but the worker still has to get through it
+    worker: bytes
+    deadline: float
+    begun_at: float | None = None
+
+
+class LeaseBook:
+    """All leases that are out.
+
+    Args:
+        deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer.
+    """
+
+    def __init__(self, deadline_seconds: float) -> None:
+        self.deadline_seconds = deadline_seconds
+        self._leases: dict[int, _Lease] = {}
+        self._held: dict[bytes, list[int]] = {}
+        self._out: dict[tuple[bytes, int, int], list[int]] = {}
+        self._durations: dict[bytes, deque[float]] = {}
+        self._next = 1
+        self._changed: set[bytes] = set()
+
+    def __len__(self) -> int:
+        return len(self._leases)
+
+    def held_by(self, worker: bytes) -> int:
+        """Clips that this worker has to decode for the leases that are out to it.
+
+        Of those that nobody waits for any more each counts, lest a clip that is asked for anew hides behind an old one.
+        """
+        tasks = [self._leases[number].task for number in self._held.get(worker, ())]
+        return len({task.clip for task in tasks if task is not None}) + tasks.count(None)
+
+    def take_changed(self) -> set[bytes]:
+        """Workers that hold more or less than at the last call, or something that nobody waits for any more."""
+        changed, self._changed = self._changed, set()
+        return changed
+
+    def tasks_of(self, worker: bytes) -> Iterator[Task]:
+        """The tasks that this worker holds and somebody still waits for."""
+        for number in self._held.get(worker, ()):
+            task = self._leases[number].task
+            if task is not None:
+                yield task
+
+    def task(self, number: int, worker: bytes) -> Task | None:
+        """What this worker's lease asks for; None when nobody waits for its answer."""
+        lease = self._leases.get(number)
+        return None if lease is None or lease.worker != worker else lease.task
+
+    def grant(self, task: Task, worker: bytes, now: float) -> int:
+        """Gives the task to a worker; returns the number of the lease."""
+        number = self._next
+        self._next += 1
+        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
+        self._held.setdefault(worker, []).append(number)
+        self._out.setdefault(task.sample, []).append(number)
+        self._changed.add(worker)
+        return number
+
+    def begun(self, number: int, worker: bytes, now: float) -> None:
+        """The worker started on it. The clock of those queued behind it starts again: they wait through no fault.
+
+        A lease begins once: said again it would put off the deadline for ever.
+        """
+        lease = self._leases.get(number)
+        if lease is None or lease.worker != worker or lease.begun_at is not None:
+            return
+        lease.begun_at = now
+        for other in self._held[worker]:
+            self._leases[other].deadline = now + self.deadline_seconds
+
+    def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Task | None:
+        """The worker answered, well or badly.
+
+        Args:
+            number, worker: of the lease.
+            now: the time.
+            decoded: whether a clip was decoded for it. What a sibling of a decoded one takes says nothing of how long
+                a clip may take.
+
+        Returns:
+            the task, or None when nobody waits for this answer: the lease had been taken away from the worker, the
+            consumer is gone, or the twin was faster.
+        """
+        lease = self._leases.get(number)
+        if lease is None or lease.worker != worker:
+            return None
+        task = lease.task
+        if task is not None:
+            if lease.begun_at is not None and decoded:
+                remembered = self._durations.setdefault(task.session, deque(maxlen=_REMEMBERED))
+                remembered.append(now - lease.begun_at)
+            self._retire(task.sample)
+        self._drop(number)
+        return task
+
+    def lost(self, worker: bytes, at: int | None = None) -> list[tuple[Task, bool]]:
+        """The worker is gone.
+
+        Args:
+            worker: which one.
+            at: number of the lease it was at by its own record; None goes by what it announced.
+
+        Returns:
+            those of its tasks that nobody else is at, oldest first, each with whether it had been begun; without their
+            slots, where this worker may still write.
+        """
+        returned = []
+        for number in list(self._held.get(worker, ())):
+            lease = self._leases[number]
+            self._drop(number)
+            if lease.task is not None and lease.task.sample not in self._out:
+                begun = lease.begun_at is not None if at is None else number == at
+                returned.append((replace(lease.task, slot=None), begun))
+        return returned
+
+    def overdue(self, now: float) -> set[bytes]:
+        """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
+        return {lease.worker for lease in self._leases.values() if now > lease.deadline}
+
+    def slow(self, now: float) -> list[tuple[Task, bytes]]:
+        """For each session its oldest task, with its worker, if it is slow and nobody else is at it.
+
+        Counted from when its worker last began something, so that a task queued behind one that hangs is slow too.
+        """
+        oldest: dict[bytes, _Lease] = {}
+        for lease in self._leases.values():
+            if lease.task is not None:
+                oldest.setdefault(lease.task.session, lease)
+        found = []
+        for session, lease in oldest.items():
+            durations = self._durations.get(session, ())
+            if lease.task is None or len(durations) < _LEAST_REMEMBERED:
+                continue
+            limit = max(_LEAST_SLOW_SECONDS, SLOW_FACTOR * statistics.median(durations))
+            waited = now - (lease.deadline - self.deadline_seconds)
+            if waited > limit and len(self._out[lease.task.sample]) == 1:
+                found.append((lease.task, lease.worker))
+        return found
+
+    def forget_session(self, session: bytes) -> None:
+        """The consumer is gone: answers to its leases will find nothing.
+
+        The leases stay with their workers, which do not know and work through them: that is room they do not have for
+        others, and time for which those queued behind must not be called overdue.
+        """
+        self._durations.pop(session, None)
+        for sample in [sample for sample in self._out if sample[0] == session]:
+            self._retire(sample)
+
+    def _retire(self, sample: tuple[bytes, int, int]) -> None:
+        for number in self._out.pop(sample, ()):
+            self._leases[number].task = None
+            self._changed.add(self._leases[number].worker)
+
+    def _drop(self, number: int) -> None:
+        lease = self._leases.pop(number)
+        self._changed.add(lease.worker)
+        held = self._held[lease.worker]
+        held.remove(number)
+        if not held:
+            del self._held[lease.worker]
+        if lease.task is not None:
+            out = self._out[lease.task.sample]
+            out.remove(number)
+            if not out:
+                del self._out[lease.task.sample]

@@ -1,0 +1,182 @@
+"""Consumer sessions: what each consumer asked for, how much credit it has, whose turn it is. No I/O; time is passed in.
+
+The server keeps no position: a consumer asks for indices, each of which is one unit of its credit until it is answered,
+and an index that was answered is forgotten. So a session can be dropped and opened again at any time.
+
+Worker time is shared by deficit round robin (Shreedhar and Varghese, "Efficient fair queuing using deficit round
+robin", SIGCOMM 1995). What a sample costs is known only once it is made, so a session pays afterwards: it may be served
+while its balance is positive, and when none is, all waiting sessions earn one quantum. A consumer whose samples take
+ten times the work so gets a tenth of the samples, not ten times the time.
+
+Memory: the server holds at most credit x sample bytes for a session in its queues, whatever the consumer does.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from v2v_protocol.arena import Slot
+from v2v_protocol.errors import LimitExceeded
+from v2v_protocol.sample import Form, array_layout
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.blame import runs_alone
+from v2v_server.broker.leases import Task
+from v2v_server.schedule.epoch import Schedule
+
+_QUANTUM_SECONDS = 0.05
+
+
+@dataclass(slots=True)
+class Session:
+    """One consumer.
+
+    Attributes:
+        identity: its routing identity.
+        spec, seed, arrays, batch_size: what it asked for.
+        schedule: the order of its samples.
+        credit: most indices it may have asked for and not yet been answered.
+        last_heard: when its last message came, on the caller's clock.
+        waiting: tasks nobody works on yet, in the order asked.
+        unanswered: every (epoch, index) asked for and not yet answered.
+        balance_seconds: worker time it has earned and not used.
+        served: samples sent.
+        quarantine: number of the quarantine snapshot its samples are made under.
+        form: of one of its samples.
+    """
+
+    identity: bytes
+    spec: StreamSpec
+    seed: int
+    arrays: tuple[str, ...]
+    batch_size: int
+    schedule: Schedule
+    credit: int
+    last_heard: float
+    waiting: deque[Task] = field(default_factory=deque)
+    unanswered: set[tuple[int, int]] = field(default_factory=set)
+    balance_seconds: float = 0.0
+    served: int = 0
+    quarantine: int = 0
+
+    form: Form = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
+
+
+class Sessions:
+    """All consumers, and whose turn it is.
+
+    Args:
+        idle_seconds: a session silent for longer is forgotten, whatever it waits for. Its consumer opens it again when
+            it asks next, so the limit only bounds what abandoned consumers cost.
+    """
+
+    def __init__(self, idle_seconds: float) -> None:
+        self._idle_seconds = idle_seconds
+        self._sessions: dict[bytes, Session] = {}
+        self._turns: deque[bytes] = deque()
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(self._sessions.values())
+
+    def get(self, identity: bytes) -> Session | None:
+        """The session of that consumer, if it has one."""
+        return self._sessions.get(identity)
+
+    def open(self, session: Session) -> None:
+        """Adds a session; one of the same consumer is replaced (its unanswered indices are forgotten)."""
+        self.forget(session.identity)
+        self._sessions[session.identity] = session
+        self._turns.append(session.identity)
+
+    def forget(self, identity: bytes) -> None:
+        """Drops a session, if there is one."""
+        if self._sessions.pop(identity, None) is not None:
+            self._turns.remove(identity)
+
+    def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
+        """The consumer asks for samples. Those it is already waiting for are not made twice, and keep their slots.
+
+        Args:
+            session: of the consumer.
+            epoch, indices: which samples.
+            slots: where each may be put; empty: none of them anywhere.
+
+        Raises:
+            LimitExceeded: more than its credit would then be unanswered; none of them is taken.
+            IndexError: an index outside the epoch; none of them is taken.
+        """
+        places: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
+        new = [index for index in places if (epoch, index) not in session.unanswered]
+        for index in new:
+            if index >= session.schedule.count:
+                raise IndexError(f"index {index} of an epoch of {session.schedule.count} sequences")
+        if len(session.unanswered) + len(new) > session.credit:
+            raise LimitExceeded(
+                f"{len(new)} more samples asked while {len(session.unanswered)} are unanswered; "
+                f"the credit is {session.credit}"
+            )
+        for index in new:
+            session.unanswered.add((epoch, index))
+            place = session.schedule.place(index)
+            session.waiting.append(Task(session.identity, epoch, index, place=place, slot=places[index]))
+
+    def next_task(self) -> Task | None:
+        """The next task to give to a worker, by deficit round robin; None when nobody waits."""
+        waiting = [identity for identity in self._turns if self._sessions[identity].waiting]
+        if not waiting:
+            return None
+        while True:
+            for identity in waiting:
+                session = self._sessions[identity]
+                if session.balance_seconds >= 0.0:
+                    self._turns.remove(identity)
+                    self._turns.append(identity)
+                    return session.waiting.popleft()
+            # Everybody who waits is in debt: let time pass in steps of one quantum until the smallest debt is paid.
+            debt = -max(self._sessions[identity].balance_seconds for identity in waiting)
+            quanta = int(debt / _QUANTUM_SECONDS) + 1
+            for identity in waiting:
+                self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
+
+    def take_siblings(self, task: Task) -> list[Task]:
+        """The waiting tasks that are made from the same clip as ``task``; they wait no more."""
+        session = self._sessions.get(task.session)
+        if session is None or session.spec.samples_per_decode == 1:
+            return []
+        siblings = [other for other in session.waiting if other.clip == task.clip and not runs_alone(other)]
+        for sibling in siblings:
+            session.waiting.remove(sibling)
+        return siblings
+
+    def put_back(self, task: Task) -> None:
+        """A task that comes back unanswered: it is next, because its consumer has waited longest for it."""
+        session = self._sessions.get(task.session)
+        if session is not None and (task.epoch, task.index) in session.unanswered:
+            session.waiting.appendleft(task)
+
+    def answered(self, task: Task, worker_seconds: float) -> bool:
+        """The task is answered; returns False when nobody waits for it (the session is gone, or had it already)."""
+        session = self._sessions.get(task.session)
+        if session is None or (task.epoch, task.index) not in session.unanswered:
+            return False
+        session.unanswered.remove((task.epoch, task.index))
+        session.balance_seconds -= worker_seconds
+        if not session.unanswered:
+            # Nothing is saved up while idle. A debt stays, or asking for one sample at a time would be free of charge;
+            # it is never more than the cost of what was in work at once.
+            session.balance_seconds = min(session.balance_seconds, 0.0)
+        session.served += 1
+        return True
+
+    def idle(self, now: float) -> list[bytes]:
+        """Sessions to forget: silent for too long."""
+        return [
+            session.identity for session in self._sessions.values() if now - session.last_heard > self._idle_seconds
+        ]

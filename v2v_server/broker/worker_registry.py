@@ -1,0 +1,157 @@
+"""The workers as far as is known: who is there, who has room, who is silent. No I/O; time is passed in."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from v2v_server.broker.blame import runs_alone
+from v2v_server.broker.leases import LeaseBook
+
+MOST_WORKERS = 4096
+MOST_WORKER_CREDIT = 64
+SILENCE_SECONDS = 30.0
+"""A worker without work says so every five seconds; after this long without a word it is taken for gone."""
+REST_SECONDS = 10.0
+"""A worker whose host cannot read what the server's can gets no work for so long: storage may come back."""
+_MOST_STALE = 64
+"""Entries out of date that the heap may hold, besides one for each worker with room, before it is made anew."""
+
+
+@dataclass(slots=True)
+class _Worker:
+    credit: int
+    last_heard: float
+    given_up: bool = False
+
+
+class Workers:
+    """Workers that said hello and are alive as far as is known.
+
+    Args:
+        leases: what they hold.
+    """
+
+    def __init__(self, leases: LeaseBook) -> None:
+        self._leases = leases
+        self._workers: dict[bytes, _Worker] = {}
+        self._resting: dict[bytes, float] = {}  # until when
+        # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
+        self._changed: set[bytes] = set()
+        self._room: dict[bytes, int] = {}  # what they hold who have room for more
+        self._heap: list[tuple[int, bytes]] = []  # all of that, and what was so once
+        self._in_heap: set[tuple[int, bytes]] = set()
+
+    def __len__(self) -> int:
+        return len(self._workers)
+
+    def __contains__(self, identity: bytes) -> bool:
+        return identity in self._workers
+
+    def identities(self) -> list[bytes]:
+        """All of them."""
+        return list(self._workers)
+
+    def add(self, identity: bytes, credit: int, now: float) -> None:
+        """A worker said hello."""
+        self._workers[identity] = _Worker(max(1, min(credit, MOST_WORKER_CREDIT)), now)
+        self._changed.add(identity)
+
+    def remove(self, identity: bytes) -> None:
+        """It is gone."""
+        self._workers.pop(identity, None)
+        self._resting.pop(identity, None)
+        self._changed.add(identity)
+
+    def heard(self, identity: bytes, now: float) -> bool:
+        """A message came from it; False when nobody of that name said hello."""
+        worker = self._workers.get(identity)
+        if worker is None:
+            return False
+        worker.last_heard = now
+        return True
+
+    def rest(self, identity: bytes, now: float) -> None:
+        """It gets no work for a while."""
+        if identity in self._workers:
+            self._resting[identity] = now + REST_SECONDS
+            self._changed.add(identity)
+
+    def wake(self, now: float) -> None:
+        """Those that have rested get work again."""
+        rested = [identity for identity, until in self._resting.items() if now >= until]
+        for identity in rested:
+            del self._resting[identity]
+        self._changed.update(rested)
+
+    def hanging(self, now: float) -> list[bytes]:
+        """Workers with an overdue lease. Each is reported once, and gets no more work."""
+        return self._give_up(identity for identity in self._leases.overdue(now) if identity in self._workers)
+
+    def vanished(self, now: float) -> list[bytes]:
+        """Workers that hold nothing and have been silent for too long. Each is reported once, and gets no more work."""
+        return self._give_up(
+            identity
+            for identity, worker in self._workers.items()
+            if not self._leases.held_by(identity) and now - worker.last_heard > SILENCE_SECONDS
+        )
+
+    def for_ordinary_task(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:
+        """The worker that holds least and has room for more.
+
+        Args:
+            keep_one_empty: a task that runs alone waits: the worker that holds least is left to work itself empty.
+            other_than: not this one, which is slow at the task.
+        """
+        lightest = self._lightest(2 + keep_one_empty)[keep_one_empty:]
+        return next((identity for _, identity in lightest if identity != other_than), None)
+
+    def for_lone_task(self) -> bytes | None:
+        """A worker that holds nothing."""
+        return next((identity for held, identity in self._lightest(1) if not held), None)
+
+    def _give_up(self, found: Iterable[bytes]) -> list[bytes]:
+        given_up = [identity for identity in found if not self._workers[identity].given_up]
+        for identity in given_up:
+            self._workers[identity].given_up = True
+        self._changed.update(given_up)
+        return given_up
+
+    def _lightest(self, most: int) -> list[tuple[int, bytes]]:
+        """(leases held, identity) of those with room who hold least, in that order; equals by name."""
+        self._look_at_changed()
+        found: list[tuple[int, bytes]] = []
+        while self._heap and len(found) < most:
+            entry = heapq.heappop(self._heap)
+            if self._room.get(entry[1]) == entry[0]:
+                found.append(entry)
+            else:
+                self._in_heap.remove(entry)
+        for entry in found:
+            heapq.heappush(self._heap, entry)
+        return found
+
+    def _look_at_changed(self) -> None:
+        changed, self._changed = self._changed | self._leases.take_changed(), set()
+        for identity in changed:
+            worker, held = self._workers.get(identity), self._leases.held_by(identity)
+            if worker is None or worker.given_up or identity in self._resting:
+                self._room.pop(identity, None)
+                continue
+            if held >= worker.credit or self._is_alone(identity):
+                self._room.pop(identity, None)
+                continue
+            self._room[identity] = held
+            # An entry that is out of date stays until it comes up, or until there are more of them than of others.
+            if (held, identity) not in self._in_heap:
+                self._in_heap.add((held, identity))
+                heapq.heappush(self._heap, (held, identity))
+        if len(self._heap) > 2 * len(self._room) + _MOST_STALE:
+            self._heap = [(held, identity) for identity, held in self._room.items()]
+            self._in_heap = set(self._heap)
+            heapq.heapify(self._heap)
+
+    def _is_alone(self, identity: bytes) -> bool:
+        """A task that runs alone leaves no room."""
+        return any(runs_alone(task) for task in self._leases.tasks_of(identity))

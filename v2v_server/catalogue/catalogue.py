@@ -1,0 +1,377 @@
+"""The catalogue: which videos a corpus has, under stable names, and what each of them holds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
+from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list, regular_files
+from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
+from v2v_server.catalogue.round_trips import Notice
+from v2v_server.catalogue.scene import Scene
+from v2v_server.catalogue.scenes import Looking
+from v2v_server.catalogue.tree import VIDEO_SUFFIXES, printable, video_files
+from v2v_server.store.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
+from v2v_server.video.frame_index import FrameIndex, unseekable
+from v2v_server.video.rows import Rows
+
+_KEPT_SLICES = 64
+_SMALL_INDEX_BYTES = 4096
+"""Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
+that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+
+
+@dataclass(frozen=True, slots=True)
+class VideoEntry:
+    """A video that can be used.
+
+    Attributes:
+        id: relative POSIX path; its name for ever.
+        fingerprint: size and hash of head and tail.
+        frames: how many frames there are to decode.
+        width_px, height_px: size of the upright picture, before ``rows``.
+        frames_per_second: average rate; NaN where unknown.
+        codec: FFmpeg's name of the format.
+        threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
+        runs: (first frame, frame after the last) of each stretch without a cut and with something to see; None where
+            the catalogue was opened without ``scene``.
+    """
+
+    id: str
+    fingerprint: str
+    frames: int
+    width_px: int
+    height_px: int
+    frames_per_second: float
+    codec: str
+    threshold_pos: float | None = None
+    threshold_neg: float | None = None
+    runs: tuple[tuple[int, int], ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A file, folder or line of the list that gives no video, and why."""
+
+    id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
+
+    Attributes:
+        root: the folder that ids are relative to, resolved.
+        rows: which rows of the pictures may be used.
+        videos: the videos that can be used, by id.
+        problems: what could not be taken in, by id.
+        notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
+        digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
+        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare.prepare`). Its videos
+            are those of its source in number, order, id and frames, so that every position means the same frames;
+            one without a sound prepared file is refused when it is opened, like a damaged one.
+        scene_digest: names this snapshot together with the statistics of its videos; None without them.
+    """
+
+    root: Path
+    rows: Rows
+    videos: tuple[VideoEntry, ...]
+    problems: tuple[Problem, ...]
+    notes: tuple[str, ...]
+    digest: str
+    prepared: Header | None
+    scene_digest: str | None
+    _store: Store = field(repr=False, compare=False)
+    _fingerprints: dict[str, str] = field(repr=False, compare=False)
+    _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
+    _looking: Looking | None = field(repr=False, compare=False)
+    _unseen: frozenset[str] = field(repr=False, compare=False)
+    _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
+
+    def path(self, id: str) -> Path:
+        """Where the video lies.
+
+        Raises:
+            CorpusError: no such id in this catalogue.
+        """
+        self._fingerprint(id)
+        return self.root / id
+
+    def frame_index(self, id: str) -> FrameIndex:
+        """The frames of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue, or the index can no longer be read.
+            VideoChanged: another process has catalogued a changed file under this id since.
+            ProtocolError: what the index says of this video is damaged.
+        """
+        return FrameIndex.from_bytes(self._stored_index(id))
+
+    def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
+        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
+
+        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
+        kept, because siblings ask for the same one after the other.
+
+        Raises:
+            CorpusError, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
+        """
+        key = id, start, count
+        if key not in self._slices:
+            encoded = self._stored_index(id)
+            if len(encoded) > _SMALL_INDEX_BYTES:
+                encoded = FrameIndex.from_bytes(encoded).slice(start, count).to_bytes()
+            while len(self._slices) >= _KEPT_SLICES:
+                del self._slices[next(iter(self._slices))]
+            self._slices[key] = encoded
+        return self._slices[key]
+
+    def _stored_index(self, id: str) -> bytes:
+        fingerprint = self._fingerprint(id)
+        if id in self._absent:
+            video = self._absent[id]
+            return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
+        try:
+            data = self._store.frame_index(id, fingerprint)
+        except sqlite3.Error as error:
+            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return data
+
+    def scene(self, id: str) -> Scene:
+        """The statistics of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue, the catalogue was opened without ``scene``, or the index can no
+                longer be read.
+            VideoChanged: another process has catalogued a changed file under this id since.
+        """
+        fingerprint = self._fingerprint(id)
+        if self._looking is None:
+            raise CorpusError("this catalogue was opened without statistics of its videos")
+        if id in self._unseen:
+            return Scene.unknown()
+        try:
+            data = self._store.scene(id, fingerprint, self._looking.key)
+        except sqlite3.Error as error:
+            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return Scene.from_bytes(data)
+
+    def digest_under(self, scene: str) -> str:
+        """The digest that names this snapshot in samples of a spec.
+
+        Args:
+            scene: of the spec; with "off" the statistics do not count.
+
+        Raises:
+            UsageError: "auto", and the catalogue was opened without ``scene``.
+        """
+        if scene == "off":
+            return self.digest
+        if self.scene_digest is None:
+            raise UsageError(
+                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
+                "server with --scene auto"
+            )
+        return self.scene_digest
+
+    def close(self) -> None:
+        """Close the index; ``frame_index`` works no more."""
+        self._store.close()
+
+    def _fingerprint(self, id: str) -> str:
+        if id not in self._fingerprints:
+            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
+        return self._fingerprints[id]
+
+
+def open_catalogue(
+    source: str | os.PathLike[str],
+    *,
+    list_file: str | os.PathLike[str] | None = None,
+    rows: Rows | None = None,
+    cache_dir: str | os.PathLike[str] | None = None,
+    scene: bool = False,
+    processes: int = 1,
+    progress: Progress | None = None,
+    notice: Notice | None = None,
+) -> Catalogue:
+    """Take in a corpus: probe what is new or changed, forget what is gone.
+
+    Args:
+        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder.
+        list_file: a list that restricts the folder ``source`` to the videos it names.
+        rows: which rows may be used; all when None.
+        cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
+            ``~/.cache/v2v``.
+        scene: also take in what the videos show, which decodes what was not looked at yet; see
+            :mod:`v2v_server.catalogue.scene`.
+        processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
+        progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
+        notice: told what is looked at before that, file by file, and how far it is.
+
+    Raises:
+        CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
+            be used.
+    """
+    try:
+        root, listed = _wanted(Path(source), list_file)
+        manifest = find_manifest(root)
+    except OSError as error:  # a folder that this user may not enter, a share that has gone
+        raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
+    refused: dict[str, str] = {}
+    if manifest is not None:
+        manifest.check_served(rows)
+        rows = None
+        ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
+    else:
+        ids = _found(root, refused, notice) if listed is None else regular_files(root, listed, refused, notice)
+        refuse_prepared_below(root, ids)
+    if not ids:
+        raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
+    looking = Looking(rows or Rows(), manifest) if scene else None
+    store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress, notice)
+    try:
+        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
+    except BaseException:
+        store.close()
+        raise
+
+
+def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Path, tuple[ListEntry, ...] | None]:
+    """The root folder, and the entries to take from it; None takes every video below it."""
+    if source.is_dir():
+        return source.resolve(), None if list_file is None else read_list(list_file)
+    if list_file is not None:
+        raise CorpusError(f"{source}: not a folder; a list file names videos of a folder")
+    if not source.is_file():
+        raise CorpusError(f"{source}: there is no such folder, video or list file")
+    folder = source.parent.resolve()
+    if source.suffix.lower() in LIST_SUFFIXES:
+        return folder, read_list(source)
+    if printable(source.name) != source.name:
+        raise CorpusError(f"{printable(source.name)}: its name is not UTF-8 text; rename it")
+    return folder, (ListEntry(source.name),)
+
+
+def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
+    """The videos below a folder."""
+    ids = []
+    for id in video_files(root, refused):
+        ids.append(id)
+        if notice is not None:
+            notice(f"looking for videos: {len(ids)} so far")
+    return tuple(ids)
+
+
+def _snapshot(
+    root: Path,
+    rows: Rows,
+    records: dict[str, Record],
+    listed: Sequence[ListEntry],
+    refused: dict[str, str],
+    notes: list[str],
+    store: Store,
+    manifest: Manifest | None,
+    looking: Looking | None,
+) -> Catalogue:
+    by_id = {entry.id: entry for entry in listed}
+    problems = dict(refused)
+    used = []
+    videos = []
+    shorter = []
+    absent: dict[str, PreparedVideo] = {}
+    for id in sorted(records):
+        record, entry = records[id], by_id.get(id, ListEntry(id))
+        if manifest is not None:
+            if not manifest.describes(record):
+                absent[id] = manifest.videos[id]
+            record = manifest.as_source(record)
+        if record.problem is not None:
+            problems[id] = record.problem
+            continue
+        used.append(record)
+        videos.append(_entry(record, entry))
+        if entry.frames is not None and entry.frames > record.frames:
+            shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
+    if not videos:
+        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{_told(problems)}")
+    if absent:
+        if len(absent) == len(videos):
+            raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
+        reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
+        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{_told(reasons)}"]
+    if manifest is not None and manifest.aside:
+        notes = [
+            *notes,
+            f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
+            "them; run it once for all to have them served",
+        ]
+    if shorter:
+        notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
+    digest = _digest(rows, videos)
+    scene_digest, unseen = None, set(absent)
+    if looking is not None:
+        runs, scene_digest = looking.runs(store, used, unseen, digest)
+        videos = [replace(video, runs=its) for video, its in zip(videos, runs, strict=True)]
+        if died := sorted(unseen - absent.keys()):
+            notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
+    return Catalogue(
+        root=root,
+        rows=rows,
+        videos=tuple(videos),
+        problems=tuple(Problem(id, problems[id]) for id in sorted(problems)),
+        notes=tuple(notes),
+        digest=digest,
+        prepared=None if manifest is None else manifest.header,
+        scene_digest=scene_digest,
+        _store=store,
+        _fingerprints={video.id: video.fingerprint for video in videos},
+        _absent=absent,
+        _looking=looking,
+        _unseen=frozenset(unseen),
+    )
+
+
+def _entry(record: Record, entry: ListEntry) -> VideoEntry:
+    return VideoEntry(
+        id=record.id,
+        fingerprint=record.fingerprint,
+        frames=record.frames,
+        width_px=record.width_px,
+        height_px=record.height_px,
+        frames_per_second=float("nan") if record.frames_per_second is None else record.frames_per_second,
+        codec=record.codec,
+        threshold_pos=entry.threshold_pos,
+        threshold_neg=entry.threshold_neg,
+    )
+
+
+def _digest(rows: Rows, videos: Sequence[VideoEntry]) -> str:
+    digest = hashlib.sha256(f"v2v catalogue 1\n{rows}\n".encode())
+    for video in videos:
+        fields = (
+            video.id, video.fingerprint, video.frames, video.width_px, video.height_px, video.threshold_pos,
+            video.threshold_neg,
+        )  # fmt: skip
+        digest.update("\0".join(map(str, fields)).encode() + b"\n")
+    return digest.hexdigest()[:32]
+
+
+def _told(problems: dict[str, str]) -> str:
+    """The first few reasons, for an error message."""
+    if not problems:
+        return ""
+    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    return f" ({shown}{more})"

@@ -1,0 +1,184 @@
+"""The index of a corpus on disk: what probing each file has found, so that the next start need not do it again.
+
+One SQLite file per corpus. A row is believed as long as the file's size and modification time stay the same. Writes are
+short transactions with a busy timeout, so several servers may share one index; since a row is a function of the file
+alone, it does not matter which of them wrote it.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+SCHEMA_VERSION = 1
+"""Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
+
+_BUSY_SECONDS = 30.0
+_COLUMNS = "id, size_bytes, mtime_ns, fingerprint, frames, width_px, height_px, frames_per_second, codec, problem"
+_TABLE = """
+CREATE TABLE video (
+    id TEXT PRIMARY KEY,
+    size_bytes INTEGER NOT NULL,
+    mtime_ns INTEGER NOT NULL,
+    fingerprint TEXT NOT NULL,
+    frames INTEGER NOT NULL,
+    width_px INTEGER NOT NULL,
+    height_px INTEGER NOT NULL,
+    frames_per_second REAL,
+    codec TEXT NOT NULL,
+    problem TEXT,
+    frame_index BLOB
+)"""
+
+
+_SCENES = """
+CREATE TABLE IF NOT EXISTS scene (
+    id TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    look TEXT NOT NULL,
+    data BLOB NOT NULL,
+    PRIMARY KEY (id, look)
+)"""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What is known of one file.
+
+    Attributes:
+        id: relative POSIX path.
+        size_bytes, mtime_ns: of the file when it was probed.
+        fingerprint: size and hash of head and tail.
+        frames, width_px, height_px, frames_per_second, codec: see :class:`v2v_server.video.probe.VideoFacts`;
+            frames_per_second is None where unknown.
+        problem: why the file cannot be used; None if it can.
+        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and in what :meth:`Store.records` returns.
+    """
+
+    id: str
+    size_bytes: int
+    mtime_ns: int
+    fingerprint: str = ""
+    frames: int = 0
+    width_px: int = 0
+    height_px: int = 0
+    frames_per_second: float | None = None
+    codec: str = ""
+    problem: str | None = None
+    frame_index: bytes | None = None
+
+
+class Store:
+    """An open index.
+
+    Args:
+        path: the SQLite file, made if missing; None keeps the index in memory.
+
+    Raises:
+        sqlite3.Error, OSError: the file cannot be made, opened or read.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self._database = sqlite3.connect(
+            ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
+        )
+        try:
+            self._prepare()
+        except BaseException:
+            self._database.close()
+            raise
+
+    def _prepare(self) -> None:
+        if self._version() == SCHEMA_VERSION:
+            return
+        self._database.execute("BEGIN IMMEDIATE")
+        with self._database:
+            if self._version() != SCHEMA_VERSION:  # nobody else made it meanwhile
+                self._database.execute("DROP TABLE IF EXISTS video")
+                self._database.execute(_TABLE)
+                self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+    def _version(self) -> int:
+        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+
+    def records(self) -> dict[str, Record]:
+        """All records by id, without their frame indices.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video")) as rows:
+            return {row[0]: Record(*row) for row in rows}
+
+    def frame_index(self, id: str, fingerprint: str) -> bytes | None:
+        """The encoded frame index of a file; None if the index does not know that state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT frame_index FROM video WHERE id = ? AND fingerprint = ?"
+        row = self._database.execute(query, (id, fingerprint)).fetchone()
+        return None if row is None else row[0]
+
+    def looked_at(self, look: str) -> dict[str, str]:
+        """Fingerprint by id of the files whose scene is known.
+
+        Args:
+            look: how and at which rows, see :class:`v2v_server.catalogue.scenes.Looking`.
+
+        Raises:
+            sqlite3.Error: the file is damaged or cannot be written.
+        """
+        self._database.execute(_SCENES)
+        return dict(self._database.execute("SELECT id, fingerprint FROM scene WHERE look = ?", (look,)).fetchall())
+
+    def scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
+        """The encoded scene of a file; None if the index has none of that state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
+        row = self._database.execute(query, (id, fingerprint, look)).fetchone()
+        return None if row is None else row[0]
+
+    def put_scenes(self, scenes: Iterable[tuple[str, str, str, bytes]]) -> None:
+        """Add or replace (id, fingerprint, look, encoded scene), in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._change("INSERT OR REPLACE INTO scene (id, fingerprint, look, data) VALUES (?, ?, ?, ?)", list(scenes))
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Add or replace records, in one transaction.
+
+        Raises:
+            sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
+        """
+        rows = [tuple(getattr(record, name) for name in Record.__slots__) for record in records]
+        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({'?, ' * 10}?)", rows)
+
+    def forget(self, ids: Iterable[str]) -> None:
+        """Drop records, in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
+
+    def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
+        if not rows:
+            return
+        self._database.execute("BEGIN IMMEDIATE")
+        with self._database:
+            self._database.executemany(statement, rows)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()

@@ -1,0 +1,158 @@
+"""The catalogue's index on disk, brought up to date: what is new or changed is probed, what is gone is forgotten."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import sqlite3
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.round_trips import Notice, answers
+from v2v_server.catalogue.scenes import Looking
+from v2v_server.catalogue.survey import survey
+
+_WRITE_EVERY = 256
+
+Progress = Callable[[int, int], None]
+"""(files probed so far, files to probe)."""
+
+
+def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+    """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+
+    Raises:
+        CorpusError: none was chosen, and this user has no home folder.
+    """
+    if cache_dir is not None:
+        folder = Path(cache_dir)
+    elif chosen := os.environ.get("V2V_CACHE_DIR"):
+        folder = Path(chosen)
+    else:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or _home() / ".cache") / "v2v"
+    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    return folder / f"catalogue-{name}.sqlite3"
+
+
+def _home() -> Path:
+    try:
+        return Path.home()
+    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
+        raise CorpusError(
+            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
+            "V2V_CACHE_DIR"
+        ) from error
+
+
+def up_to_date(
+    root: Path,
+    ids: Sequence[str],
+    path: Path,
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
+    notice: Notice | None,
+) -> tuple[Store, dict[str, Record], list[str]]:
+    """An open index that knows every id, its records, and notes for the user.
+
+    The index is in memory, with a note, where the file cannot serve.
+
+    Args:
+        root: the folder that ids are relative to.
+        ids: of the videos to know.
+        path: of the index.
+        looking: how to look at what the videos show; None does not.
+        processes, progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+    """
+    try:
+        return *_refreshed(path, root, ids, looking, processes, progress, notice), []
+    except (sqlite3.Error, OSError) as error:
+        note = (
+            f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
+            "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
+            "another place with V2V_CACHE_DIR"
+        )
+        return *_refreshed(None, root, ids, looking, processes, progress, notice), [note]
+
+
+def _refreshed(
+    path: Path | None,
+    root: Path,
+    ids: Sequence[str],
+    looking: Looking | None,
+    processes: int,
+    progress: Progress | None,
+    notice: Notice | None,
+) -> tuple[Store, dict[str, Record]]:
+    store = Store(path)
+    try:
+        known = store.records()
+        stale = _stale(root, ids, known, notice)
+        store.forget(_gone(root, known.keys() - set(ids), notice))
+        with closing(survey(root, stale, processes)) as found:
+            for batch in _batches(found, len(stale), progress):
+                store.put(batch)
+                known.update((record.id, record) for record in batch)
+        records = {id: known[id] for id in ids}
+        if looking is not None:
+            looking.take_in(store, root, records, processes, progress)
+        return store, records
+    except BaseException:
+        store.close()
+        raise
+
+
+def _stale(root: Path, ids: Sequence[str], known: Mapping[str, Record], notice: Notice | None) -> list[str]:
+    """Those of the ids whose files are new or changed."""
+
+    def is_unchanged(id: str) -> bool:
+        if id not in known:
+            return False
+        try:
+            status = os.stat(os.path.join(root, id))
+        except OSError:
+            return False
+        return (status.st_size, status.st_mtime_ns) == (known[id].size_bytes, known[id].mtime_ns)
+
+    stale = []
+    for done, (id, unchanged) in enumerate(answers(is_unchanged, ids), 1):
+        if not unchanged:
+            stale.append(id)
+        if notice is not None:
+            notice(f"looking at files: {done} of {len(ids)}, {len(stale)} of them new or changed")
+    return stale
+
+
+def _gone(root: Path, ids: Iterable[str], notice: Notice | None) -> list[str]:
+    """Those of the ids of which there is no file any more. One that cannot be looked at today is not gone."""
+
+    def is_gone(id: str) -> bool:
+        try:
+            return not stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
+        except OSError as error:
+            return error.errno in (errno.ENOENT, errno.ENOTDIR)
+
+    unlisted, gone = sorted(ids), []
+    for done, (id, is_none) in enumerate(answers(is_gone, unlisted), 1):
+        if is_none:
+            gone.append(id)
+        if notice is not None:
+            notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
+    return gone
+
+
+def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:
+    batch: list[Record] = []
+    for done, record in enumerate(records, 1):
+        batch.append(record)
+        if progress is not None:
+            progress(done, total)
+        if len(batch) == _WRITE_EVERY:
+            yield batch
+            batch = []
+    yield batch

@@ -1,0 +1,170 @@
+"""The statistics of every video of a corpus: from the index on disk, from a prepared folder's manifest, or from a look.
+
+A look decodes the beginning of a video once, in a process of its own, and its result is kept under the file's
+fingerprint and the rows it was taken of.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from base64 import b64decode
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
+from v2v_server.catalogue.survey import LONGEST_SECONDS
+from v2v_server.store.manifest import Manifest
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.orientation import Window
+from v2v_server.video.rows import Rows
+
+_WRITE_EVERY = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Looking:
+    """Which part of the pictures is looked at.
+
+    Attributes:
+        rows: of the corpus; all of a prepared one.
+        manifest: of a prepared folder, whose statistics are those of its source's frames where it has them.
+    """
+
+    rows: Rows
+    manifest: Manifest | None
+
+    @property
+    def key(self) -> str:
+        """Tells looks of one file apart."""
+        made = "" if self.manifest is None else f"prepared {self.manifest.header.rows}, "
+        return f"{made}{self.rows}, look {LOOK_VERSION}"
+
+    def take_in(
+        self,
+        store: Store,
+        root: Path,
+        records: Mapping[str, Record],
+        processes: int,
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        """Makes sure that the index has a look at each sound record, if it can be had.
+
+        Raises:
+            sqlite3.Error: the index cannot be written.
+        """
+        sound = [record for record in records.values() if record.problem is None]
+        known = store.looked_at(self.key)
+        missing = [record for record in sound if known.get(record.id) != record.fingerprint]
+        total = len(missing)
+        batch: list[tuple[str, str, str, bytes]] = []
+        with closing(self._found(store, root, missing, processes)) as found:
+            for done, (record, scene) in enumerate(found, 1):
+                batch.append((record.id, record.fingerprint, self.key, scene.to_bytes()))
+                if progress is not None:
+                    progress(done, total)
+                if len(batch) == _WRITE_EVERY:
+                    store.put_scenes(batch)
+                    batch = []
+        store.put_scenes(batch)
+
+    def runs(
+        self, store: Store, records: Iterable[Record], unseen: set[str], digest: str
+    ) -> tuple[list[tuple[tuple[int, int], ...]], str]:
+        """The runs of each video, and a digest that names all that is known of them.
+
+        Args:
+            records: of the videos of a snapshot, in its order.
+            unseen: ids of videos of which nothing is known; receives those that the index has no look at.
+            digest: of the snapshot.
+        """
+        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+        runs = []
+        for record in records:
+            data = None if record.id in unseen else store.scene(record.id, record.fingerprint, self.key)
+            if data is None:
+                unseen.add(record.id)
+            scene = Scene.unknown() if data is None else Scene.from_bytes(data)
+            sha.update(scene.to_bytes())
+            runs.append(tuple(scene.runs(record.frames)))
+        return runs, sha.hexdigest()[:32]
+
+    def _found(
+        self, store: Store, root: Path, missing: list[Record], processes: int
+    ) -> Generator[tuple[Record, Scene], None, None]:
+        by_id = {record.id: record for record in missing}
+        left = []
+        for record in missing:
+            told = self._told(record)
+            if told is not None:
+                yield record, told
+            else:
+                left.append(record)
+
+        def jobs() -> Iterator[_Job]:
+            for record in left:
+                index = store.frame_index(record.id, record.fingerprint) or b""
+                yield _Job(record.id, index, self._window(record))
+
+        look = partial(_look_at, os.fspath(root))
+        suspects = []
+        for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS):
+            if isinstance(scene, Died) and scene.overdue_seconds:
+                continue  # the next start tries again
+            if isinstance(scene, Died) or not scene:
+                suspects.append(job)
+            else:
+                yield by_id[job.id], Scene.from_bytes(scene)
+        # Once more, alone: it may have been killed from outside, or for want of memory, or its storage failed for a
+        # moment. A second failure is not kept: of such a video nothing is known, and the next start tries again.
+        for job, scene in run_isolated(look, suspects, 1, lambda job: LONGEST_SECONDS):
+            if not isinstance(scene, Died) and scene:
+                yield by_id[job.id], Scene.from_bytes(scene)
+
+    def _told(self, record: Record) -> Scene | None:
+        """What the manifest says."""
+        if self.manifest is None or not self.manifest.videos[record.id].scene or not self.manifest.describes(record):
+            return None
+        return Scene.from_bytes(b64decode(self.manifest.videos[record.id].scene))
+
+    def _window(self, record: Record) -> Window | None:
+        try:
+            top, bottom = self.rows.bounds(record.height_px)
+        except UsageError:
+            return None  # no sequence is made of it either
+        return top, 0, bottom - top, record.width_px
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    id: str
+    index: bytes
+    window: Window | None
+
+
+def _look_at(root: str, job: _Job) -> bytes:
+    """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
+    decoder, reports an error."""
+    # The catalogue is opened by processes that need none of what a look does.
+    from v2v_server.catalogue.look import Look
+    from v2v_server.prepare.transcode import luma_frames
+
+    seen = Look()
+    if job.index and job.window is not None:
+        try:
+            for picture in islice(
+                luma_frames(Path(root, job.id), FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES
+            ):
+                seen.add(picture)
+        except VideoError as error:
+            if isinstance(error.__cause__, OSError):
+                return b""
+            return seen.scene().to_bytes()  # whoever is served what lies behind finds the same error
+    return seen.scene().to_bytes()

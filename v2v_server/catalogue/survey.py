@@ -1,0 +1,123 @@
+"""Probing many files in processes of their own, so that a file that kills its reader costs only itself."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Generator, Iterable
+from functools import partial
+from pathlib import Path
+
+from v2v_protocol.errors import VideoError, VideoUnreadable
+from v2v_server.catalogue.index_file import Record
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.probe import VideoFacts, probe
+
+LONGEST_SECONDS = 3600.0
+"""For reading a file from end to end, on slow storage: who needs longer waits for a file that never comes."""
+
+Examine = Callable[[str, str], Record]
+"""(root, id) -> what is known of that file; see :func:`examine`."""
+
+
+def examine(root: str, id: str) -> Record:
+    """What is known of one file. Never raises: what goes wrong is the record's ``problem``.
+
+    A file that cannot be read gets the size -1, which no file has: it is looked at again next time.
+    """
+    path = Path(root, id)
+    try:
+        status = path.stat()
+        mark = fingerprint(path)
+    except OSError as error:
+        return Record(id, -1, 0, problem=f"cannot be read: {error.strerror or error}")
+    except VideoError as error:
+        return Record(id, -1, 0, problem=error.reason)
+    size, mtime = status.st_size, status.st_mtime_ns
+    try:
+        facts = _facts(path)
+    except VideoUnreadable as error:
+        return Record(id, -1, 0, problem=error.reason)
+    except VideoError as error:
+        where = "" if error.frame is None else f"frame {error.frame}: "
+        return Record(id, size, mtime, problem=where + error.reason)
+    except Exception as error:  # noqa: BLE001 - one strange file must not end the survey of all others
+        return Record(id, size, mtime, problem=f"probing failed: {type(error).__name__}: {error}")
+    return Record(
+        id=id,
+        size_bytes=size,
+        mtime_ns=mtime,
+        fingerprint=mark,
+        frames=facts.frames,
+        width_px=facts.width_px,
+        height_px=facts.height_px,
+        frames_per_second=None if math.isnan(facts.frames_per_second) else facts.frames_per_second,
+        codec=facts.codec,
+        frame_index=facts.index.to_bytes(),
+    )
+
+
+def _facts(path: Path) -> VideoFacts:
+    """What is known of the video; an error of the system, rather than of the decoder, has to come twice.
+
+    Raises:
+        VideoUnreadable: it came twice.
+        VideoError: the file is no video that this program serves.
+    """
+    try:
+        return probe(path)
+    except VideoError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+    try:
+        return probe(path)
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError):
+            raise VideoUnreadable(error.video, error.frame, error.reason) from error
+        raise
+
+
+def survey(
+    root: Path,
+    ids: Iterable[str],
+    processes: int,
+    examine: Examine = examine,
+    longest_seconds: float = LONGEST_SECONDS,
+) -> Generator[Record, None, None]:
+    """A record for each id, in any order.
+
+    A file at which a process died is examined once more when all others are done, alone: the process may have been
+    killed from outside, or the memory may not have sufficed for it and its neighbours.
+
+    Args:
+        root: the folder that ids are relative to.
+        ids: relative paths.
+        processes: processes to probe in, spawned and ended here; 0 probes in this one, where a file that crashes the
+            decoder takes the caller along.
+        examine: what is done with each file; must be picklable.
+        longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
+    """
+    look = partial(examine, os.fspath(root))
+    suspects: list[str] = []
+    for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds):
+        if isinstance(found, Died) and found.overdue_seconds:
+            yield Record(id, -1, 0, problem=f"cannot be probed: {found.how}; the next start tries again")
+        elif isinstance(found, Died):
+            suspects.append(id)
+        else:
+            yield found
+    for id, found in run_isolated(look, suspects, 1, lambda id: longest_seconds):
+        yield _culprit(root, id, found) if isinstance(found, Died) else found
+
+
+def _culprit(root: Path, id: str, death: Died) -> Record:
+    if death.from_outside:
+        why = f"could not be probed: the process was ended from outside or for want of memory ({death.how}), twice"
+        return Record(id, -1, 0, problem=f"{why}; the next start tries again")
+    why = f"crashes the decoder: the process that probed it died ({death.how})"
+    try:
+        status = Path(root, id).stat()
+    except OSError:
+        return Record(id, -1, 0, problem=why)  # gone meanwhile; should it come back, it is looked at again
+    return Record(id, status.st_size, status.st_mtime_ns, problem=why)

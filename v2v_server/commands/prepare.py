@@ -1,0 +1,204 @@
+"""The command line of `v2v-prepare`: arguments -> settings -> call.
+
+Exit status: 0 every video file of the source was prepared, 1 some were not, fall below a floor or lack the statistics
+that were asked for, 2 wrong usage or input, 130 interrupted. Errors are one line on stderr; `--debug` shows the trace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.records import write_json
+from v2v_protocol.spec import SCENES
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.catalogue.listfile import LIST_SUFFIXES
+from v2v_server.commands.cli import new_parser, run_command
+from v2v_server.console.progress import catalogue_progress
+from v2v_server.prepare import prepare
+from v2v_server.prepare.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
+from v2v_server.prepare.report import Report
+from v2v_server.system.process import usable_cores
+from v2v_server.video.rows import Rows
+
+_SHOWN = 20
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-prepare`."""
+    parser = new_parser(
+        "v2v-prepare", "Transcode a corpus once to what training needs: chosen rows, grey, fast decode."
+    )
+    defaults = ", ".join(f"{name} {codec.default}" for name, codec in CODECS.items())
+    parser.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
+    parser.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
+    parser.add_argument(
+        "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
+    )
+    parser.add_argument("--codec", choices=tuple(CODECS), default=DEFAULT_CODEC, help=f"default {DEFAULT_CODEC}")
+    parser.add_argument("--quality", type=int, metavar="Q", help=f"lower is better and larger; default {defaults}")
+    parser.add_argument(
+        "--gop", type=int, default=DEFAULT_GOP, metavar="N", help=f"distance of keyframes (default {DEFAULT_GOP})"
+    )
+    parser.add_argument(
+        "--tile-width", type=int, default=0, metavar="PX", dest="tile_px",
+        help="store pictures as tiles about PX wide; a crop decodes those that it touches (default 0: no tiles)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tile-overlap", type=int, default=0, metavar="PX", dest="tile_overlap_px",
+        help="let each tile share PX columns with the next, so that a crop no wider touches one (default 0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=usable_cores(),
+        metavar="N",
+        help="processes (default: one a core that it may use)",
+    )
+    parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts SRC")
+    parser.add_argument(
+        "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
+        help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--frame-floor", type=float, metavar="DB",
+        help="the same for the worst frame of a clip, which the clip's PSNR hides "
+        f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
+    )
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_argument("--json", metavar="FILE", help="also write a record of each video")
+
+    def run(arguments: argparse.Namespace) -> None:
+        if not _run(arguments):
+            sys.exit(1)
+
+    run_command(parser, run, argv, interrupted="interrupted; the same command goes on from here")
+
+
+def _run(arguments: argparse.Namespace) -> bool:
+    quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
+    encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px, arguments.tile_overlap_px)
+    if arguments.workers < 1:
+        raise UsageError(f"--workers {arguments.workers}: give at least 1")
+    started = time.monotonic()
+    with catalogue_progress() as probing:
+        catalogue = open_catalogue(
+            arguments.source,
+            list_file=arguments.list,
+            rows=Rows.parse(arguments.rows),
+            cache_dir=arguments.cache_dir,
+            processes=arguments.workers,
+            progress=probing,
+            notice=probing.notice,
+        )
+    with contextlib.closing(catalogue), _progress() as progress:
+        report = prepare.prepare(
+            catalogue,
+            arguments.destination,
+            encoding,
+            processes=arguments.workers,
+            floor_db=arguments.floor,
+            frame_floor_db=arguments.frame_floor,
+            scene=arguments.scene != "off",
+            single=_is_video(Path(arguments.source)),
+            progress=progress,
+        )
+    for line in summary(report, encoding, time.monotonic() - started):
+        print(line)
+    if arguments.json is not None:
+        problems = (*report.not_looked_at, *report.unusable)
+        records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in problems]
+        write_json(arguments.json, records)
+    return report.complete
+
+
+def _is_video(source: Path) -> bool:
+    return source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
+
+
+def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
+    """Lines that say what was made, what it saved, what failed and why."""
+    prepared = report.prepared
+    lines = [
+        f"{len(prepared)} of {len(report.videos)} videos prepared as {encoding} ({report.kept} of them earlier) "
+        f"in {seconds:.0f} s"
+    ]
+    if report.looked_at:
+        lines.append(f"{report.looked_at} were prepared earlier: only the statistics of their scenes were added")
+    if report.aside:
+        lines.append(
+            f"{report.aside} others that were prepared earlier are set aside: not served, and not made again when a "
+            "run asks for them"
+        )
+    if prepared:
+        before, after = report.source_bytes, report.prepared_bytes
+        change = "saves" if after <= before else "costs"
+        lines.append(
+            f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "
+            f"{change} {abs(before - after) / 1e6:.1f} MB"
+        )
+        quality = {video.id: video.psnr_db or 0.0 for video in prepared}
+        worst = min(quality, key=lambda id: quality[id])
+        lines.append(
+            f"PSNR of a clip to its source: median {statistics.median(quality.values()):.1f} dB, "
+            f"lowest {quality[worst]:.1f} dB ({worst})"
+        )
+        frames = {video.id: video.worst_psnr_db or 0.0 for video in prepared}
+        worst = min(frames, key=lambda id: frames[id])
+        lines.append(
+            f"PSNR of the worst frame: {frames[worst]:.1f} dB ({worst}); the floors are {report.floor_db:g} dB for a "
+            f"clip and {report.frame_floor_db:g} dB for a frame"
+        )
+    lines += _listed(
+        f"below the floor of {report.floor_db:g} dB, or a frame below {report.frame_floor_db:g} dB (kept; a lower "
+        "--quality makes them better):",
+        [
+            (video.id, f"{video.psnr_db:.1f} dB, worst frame {video.worst_psnr_db:.1f} dB")
+            for video in report.below_floor
+        ],
+    )
+    lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
+    lines += _listed(
+        "have no statistics of their scenes (their files stay):",
+        [(problem.id, problem.reason) for problem in report.not_looked_at],
+    )
+    lines += _listed("cannot be used at all:", [(problem.id, problem.reason) for problem in report.unusable])
+    return lines
+
+
+def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
+    if not items:
+        return []
+    lines = [f"{len(items)} {title}", *(f"  {id}: {why}" for id, why in items[:_SHOWN])]
+    if len(items) > _SHOWN:
+        lines.append(f"  ... and {len(items) - _SHOWN} more; --json FILE has them all")
+    return lines
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[prepare.Progress]:
+    columns = (
+        TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(file=sys.stderr)
+    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("prepare", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""`v2v-quarantine`: shows what of a corpus is in quarantine, and clears it into a new snapshot.
+
+Servers may run meanwhile: the file gives every snapshot its number under a lock. A running server goes on under what it
+has read, and takes up a clearing with its next verdict or its next start.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.records import write_json
+from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
+from v2v_server.commands.cli import new_parser, run_command
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-quarantine`. Exit status as in :mod:`v2v_server.commands.cli`."""
+    parser = new_parser(
+        "v2v-quarantine", "List the sequences and videos that crashed or hung workers, or clear the list."
+    )
+    parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_argument("--clear", action="store_true", help="begin a new, empty snapshot; old ones can still be asked")
+    parser.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it holds")
+
+    def run(arguments: argparse.Namespace) -> None:
+        file = quarantine_path(_root(Path(arguments.videos)), arguments.cache_dir)
+        quarantine = read_quarantine(file)
+        if arguments.clear and quarantine.verdicts(quarantine.latest):
+            _clear(file, quarantine)
+        in_force = quarantine.verdicts(quarantine.latest)
+        for line in quarantine.lines:
+            print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
+        print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
+        if arguments.json is not None:
+            records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
+            write_json(arguments.json, records)
+
+    run_command(parser, run, argv)
+
+
+def _root(source: Path) -> Path:
+    """The corpus folder that a catalogue of this source would have."""
+    try:
+        is_there = source.exists()
+    except OSError as error:
+        raise CorpusError(f"--videos {source}: cannot be looked at: {error.strerror or error}") from error
+    if not is_there:
+        raise CorpusError(f"--videos {source}: there is no such folder, video or list file")
+    return (source if source.is_dir() else source.parent).resolve()
+
+
+def _clear(file: Path, quarantine: Quarantine) -> None:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    try:
+        quarantine.extend(write_verdict(file, clearing(now), quarantine))
+    except OSError as error:
+        raise V2VError(f"quarantine file {file} cannot be written: {error.strerror}; nothing was cleared") from error
+
+
+if __name__ == "__main__":
+    main()

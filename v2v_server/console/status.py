@@ -1,0 +1,121 @@
+"""What a person sees of a running server: the summary at the start and one live line."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from typing import TextIO
+
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.counters import Rate
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.schedule.sequences import SequenceTable
+
+_SHOWN = 5
+_LIVE_SECONDS = 0.5
+_LOG_SECONDS = 10.0
+
+
+def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> list[str]:
+    """Lines that say how many sequences there are, which videos give none, and which setting would admit them."""
+    recipe = spec.recipe
+    lines = [
+        f"{len(catalogue.videos)} videos in {catalogue.root}: {table.videos} give {table.count} sequences of "
+        f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
+    ]
+    if spec.scene != "off":
+        cut = sum(video.runs != ((0, video.frames),) for video in catalogue.videos)
+        lines.append(
+            f"scene {spec.scene}: {cut} videos have cuts or empty parts; {table.spoilt} sequences are left out or moved"
+        )
+    if table.rejections:
+        lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
+        for rejection in table.rejections[:_SHOWN]:
+            lines.append(f"  {rejection.video}: {rejection.reason}; would admit it: {rejection.remedy}")
+        if len(table.rejections) > _SHOWN:
+            lines.append(f"  ... and {len(table.rejections) - _SHOWN} more")
+        lines += _shorter_clips(table)
+    if catalogue.problems:
+        lines.append(f"{len(catalogue.problems)} files cannot be used at all:")
+        lines += [f"  {problem.id}: {problem.reason}" for problem in catalogue.problems[:_SHOWN]]
+        if len(catalogue.problems) > _SHOWN:
+            lines.append(f"  ... and {len(catalogue.problems) - _SHOWN} more")
+    return lines
+
+
+def _shorter_clips(table: SequenceTable) -> list[str]:
+    """How many of the videos that are too short a shorter clip would admit: half of them, and all."""
+    longest = sorted((rejection.voxels_per_clip for rejection in table.rejections), reverse=True)
+    longest = [voxels for voxels in longest if voxels]
+    if not longest:
+        return []
+    choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
+    shown = ", ".join(f"{choice} admits {sum(voxels >= choice for voxels in longest)}" for choice in choices)
+    return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]
+
+
+def write(stream: TextIO, text: str) -> None:
+    """Says something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
+    and there is nowhere left to say so."""
+    with suppress(OSError):
+        stream.write(text)
+        stream.flush()
+
+
+class StatusLine:
+    """One line that is kept up to date on a terminal, or printed every ten seconds into a log.
+
+    Args:
+        stream: where to.
+    """
+
+    def __init__(self, stream: TextIO = sys.stderr) -> None:
+        self._stream = stream
+        self._live = stream.isatty()
+        self._period = _LIVE_SECONDS if self._live else _LOG_SECONDS
+        self._next = 0.0
+        self._batches = Rate(window_seconds=5.0)
+        self._samples = Rate(window_seconds=5.0)
+        self._width = 0
+
+    def update(self, now: float, dispatcher: Dispatcher, running: int) -> None:
+        """Shows the state if it is time to."""
+        if now < self._next:
+            return
+        self._next = now + self._period
+        self._show(self._text(now, dispatcher, running))
+
+    def interrupt(self) -> None:
+        """Clears the live line, because something else is about to be printed."""
+        if self._live and self._width:
+            write(self._stream, "\r" + " " * self._width + "\r")
+            self._width = 0
+
+    def close(self) -> None:
+        """Leaves the last line standing."""
+        if self._live and self._width:
+            write(self._stream, "\n")
+
+    def _text(self, now: float, dispatcher: Dispatcher, running: int) -> str:
+        counters = dispatcher.counters
+        achieved = ""
+        if 0 < counters.decodes < counters.samples:
+            achieved = f"{counters.samples / counters.decodes:.1f} a decode  "
+        # Nothing where all come in messages: consumers elsewhere, or a container between worker and consumer.
+        share = counters.in_slots / counters.samples if counters.samples else 0.0
+        shared = f"{share:.0%} by shared memory  " if share else ""
+        return (
+            f"{self._batches.update(now, counters.batches):.2f} batches/s  "
+            f"{self._samples.update(now, counters.samples):.1f} samples/s  "
+            f"{achieved}{shared}"
+            f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
+            f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
+        )
+
+    def _show(self, text: str) -> None:
+        if self._live:
+            write(self._stream, "\r" + text.ljust(self._width))
+            self._width = len(text)
+        else:
+            write(self._stream, text + "\n")

@@ -1,0 +1,164 @@
+"""Any sample of any stream, made in this process: what `v2v-simulate` does, and how a test or a bug report remakes a
+sample that a trainer saw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.sample import Sample, SampleId, array_layout
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.candidates import next_candidate
+from v2v_server.broker.jobs import describe
+from v2v_server.broker.leases import Task
+from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.picture import check_drawable, draw_sample, write_png
+from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+from v2v_server.worker.produce import decode_for, make_sample
+
+
+def remake(
+    catalogue: Catalogue,
+    spec: StreamSpec,
+    *,
+    seed: int,
+    epoch: int,
+    index: int,
+    arrays: tuple[str, ...] = ("voxels", "frames"),
+    quarantine: Quarantine | None = None,
+    snapshot: int = 0,
+) -> Sample:
+    """The sample of an identity: the same bytes a server streams, candidates and refusals included.
+
+    Args:
+        catalogue: the corpus.
+        spec: the stream's spec.
+        seed, epoch, index: the rest of the identity.
+        arrays: which arrays to make.
+        quarantine, snapshot: the quarantine and the number of the snapshot to make it under; the empty one by default.
+
+    Raises:
+        UsageError: an index outside the epoch, or arrays nobody makes.
+        CorpusError: no video gives a sequence.
+        SampleUnavailable: no candidate could give the sample.
+        VideoUnreadable: this host cannot read a candidate's file, whatever a server made of it.
+    """
+    array_layout(spec.recipe, spec.voxel_dtype, arrays)
+    SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
+    table = SequenceTable(catalogue.videos, catalogue.rows, spec)
+    if not table.count:
+        story = "; ".join(
+            f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
+        )
+        raise CorpusError(f"no video gives a sequence: {story}")
+    schedule = Schedule.of(table, spec)
+    if index >= schedule.count:
+        raise UsageError(f"index {index}: the epoch has {schedule.count} samples, 0 .. {schedule.count - 1}")
+    held = quarantine or Quarantine()
+    task = Task(b"", epoch, index)
+    most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
+    while task.candidate < most:
+        sequence = schedule.candidate(seed, epoch, index, task.candidate)
+        quarantined = held.refusal(snapshot, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
+        if quarantined is not None:
+            task = next_candidate(task, sequence.video.id, None, quarantined)
+            continue
+        lease = describe(
+            task,
+            number=1,
+            sequence=sequence,
+            quarantine=snapshot,
+            catalogue=catalogue,
+            spec=spec,
+            seed=seed,
+            arrays=arrays,
+            deadline_seconds=60.0,
+        )
+        try:
+            return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+        except VideoError as error:
+            if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
+                raise
+            task = next_candidate(task, lease.video, error.frame, error.reason)
+    raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
+
+
+def _is_left_out(catalogue: Catalogue, video: str) -> bool:
+    """Whether a prepared folder only keeps the video's place, because it could not be prepared: no server has it."""
+    return catalogue.prepared is not None and not catalogue.path(video).exists()
+
+
+def simulate_to_file(
+    source: str,
+    *,
+    out: Path,
+    picture: Path | None,
+    list_file: str | None,
+    rows: str,
+    spec: Mapping[str, Any],
+    arrays: tuple[str, ...],
+    seed: int,
+    epoch: int,
+    index: int,
+    snapshot: int = 0,
+    cache_dir: str | None = None,
+) -> None:
+    """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
+
+    Args:
+        source, list_file, rows: the corpus, as for a server.
+        out: the .npz file; a name that does not end so gets it added.
+        picture: a .png file to draw it into, or None.
+        spec: fields of the StreamSpec; None in any takes the default.
+        arrays, seed, epoch, index: see :func:`remake`.
+        snapshot: number of the quarantine snapshot to make it under.
+        cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
+
+    Raises:
+        UsageError, CorpusError, SampleUnavailable, VideoUnreadable: see :func:`remake`; or a file cannot be written, or
+            there is no such snapshot.
+    """
+    stream = StreamSpec.from_dict(spec)
+    if picture is not None:
+        check_drawable(arrays)
+    scene = stream.scene != "off"
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
+    quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
+    quarantine.verdicts(snapshot)  # before any work: whether there is such a snapshot
+    for problem in catalogue.problems:
+        print(f"cannot be used: {problem.id}: {problem.reason}")
+    sample = remake(
+        catalogue,
+        stream,
+        seed=seed,
+        epoch=epoch,
+        index=index,
+        arrays=arrays,
+        quarantine=quarantine,
+        snapshot=snapshot,
+    )
+    if not out.name.endswith(".npz"):
+        out = Path(f"{out}.npz")  # as numpy would, which does not say so
+    provenance = sample.provenance.to_dict()
+    content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
+    try:
+        np.savez_compressed(out, **content)
+        if picture is not None:
+            write_png(picture, draw_sample(sample))
+    except OSError as error:
+        raise UsageError(f"{error.filename or out}: {error.strerror}") from error
+    params = sample.provenance.params
+    print(
+        f"{sample.provenance.video} from frame {sample.provenance.start_frame}: "
+        + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
+        + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
+        f"{params.hot_pixel_count} hot pixels, {sample.provenance.saturated_bins} bins saturated; written to {out}"
+    )

@@ -1,0 +1,253 @@
+"""`v2v-prepare`: a corpus transcoded once to what training needs.
+
+The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation, and
+a manifest that says what the files are. Its files are MP4 whatever their names end in; FFmpeg goes by content.
+
+Whatever happens, the folder stays sound: a file gets its name only when whole and verified, and its line in the
+manifest after that. A second run keeps what the manifest lists, if file and source are still those, and does the rest.
+No run forgets what it was not asked for: those records are set aside (see :mod:`v2v_server.store.manifest`).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from base64 import b64encode
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_server.catalogue.scene import Scene
+from v2v_server.prepare.encode import Encoding
+from v2v_server.prepare.report import Report
+from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
+from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
+from v2v_server.store.manifest import Header, PreparedVideo
+from v2v_server.store.manifest_writer import ManifestWriter
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.video.orientation import Window
+from v2v_server.video.rows import Rows
+
+DEFAULT_FLOOR_DB = 35.0
+DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
+"""How far below the clip's floor a frame may lie. The worst frame of a sound clip is some 5 dB worse than the clip at
+most; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
+
+Progress = Callable[[int, int], None]
+"""(source frames dealt with, source frames in all)."""
+
+
+def prepare(
+    catalogue: Catalogue,
+    destination: str | os.PathLike[str],
+    encoding: Encoding,
+    *,
+    processes: int = 1,
+    floor_db: float = DEFAULT_FLOOR_DB,
+    frame_floor_db: float | None = None,
+    scene: bool = False,
+    single: bool = False,
+    progress: Progress | None = None,
+) -> Report:
+    """Transcode a corpus; a video that cannot be is recorded with the reason, and the others go on.
+
+    Args:
+        catalogue: the source; its ``rows`` are what is kept of the pictures.
+        destination: the folder to make or to go on with.
+        encoding: codec settings.
+        processes: how many transcode at a time, spawned; 0 transcodes in this one.
+        floor_db: least PSNR of a clip for ``Report.below_floor``.
+        frame_floor_db: least PSNR of each frame for the same; None: 5 dB below ``floor_db``.
+        scene: also take the statistics of what each video shows; those of one prepared without them are taken from
+            its source, and its file stays.
+        single: the source is one video, so the destination may lie in its folder.
+        progress: told at the start, after each video whose file was looked for, and after each that was done.
+
+    Raises:
+        CorpusError: source and destination overlap, the destination holds something else or was prepared with other
+            settings or from another source, a prepared file cannot be read, another process is at work there, or the
+            source is prepared itself.
+        UsageError: a number outside its limits.
+    """
+    if frame_floor_db is None:
+        frame_floor_db = floor_db - DEFAULT_FRAME_FLOOR_BELOW_DB
+    if processes < 0 or not math.isfinite(floor_db) or not math.isfinite(frame_floor_db):
+        raise UsageError(
+            f"{processes} processes, floor {floor_db:g} dB, frame floor {frame_floor_db:g} dB: give 0 or more, and "
+            "finite numbers"
+        )
+    tell = progress or (lambda done, total: None)
+    total = sum(video.frames for video in catalogue.videos)
+    tell(0, total)
+    target = Path(destination).resolve()
+    refuse_overlap(catalogue, target, single)
+    header = Header(
+        str(catalogue.rows), encoding.codec, encoding.quality, encoding.gop, len(catalogue.videos),
+        catalogue.root.name, catalogue.digest, tile_px=encoding.tile_px, tile_overlap_px=encoding.tile_overlap_px,
+    )  # fmt: skip
+    made: dict[str, PreparedVideo] = {}
+    not_looked_at = []
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        with locked(target):
+            known = known_records(target, header, catalogue.videos)
+            earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total))
+            standing, finished = earlier.standing, earlier.finished
+            left = [video for video in catalogue.videos if video.id not in finished]
+            done = total - sum(video.frames for video in left)
+            wanted = {video.id for video in catalogue.videos}
+            aside = [record for id, record in known.items() if id not in wanted]
+            with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
+                for video, outcome in _outcomes(catalogue, left, standing, target, encoding, scene, processes):
+                    if isinstance(outcome, Problem):
+                        not_looked_at.append(outcome)
+                    else:
+                        manifest.add(outcome)
+                        made[outcome.id] = outcome
+                    done += video.frames
+                    tell(done, total)
+    except OSError as error:
+        raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
+    records = standing | made
+    return Report(
+        videos=tuple(records[id] for id in sorted(records)),
+        kept=len(finished),
+        unusable=catalogue.problems,
+        floor_db=floor_db,
+        frame_floor_db=frame_floor_db,
+        looked_at=len(made.keys() & standing.keys()),
+        aside=len(aside),
+        not_looked_at=tuple(not_looked_at),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Earlier:
+    """What earlier runs did of the videos that this one is asked for.
+
+    Attributes:
+        standing: records by id, whose prepared file is there.
+        finished: ids of those that lack nothing.
+        failed: records without a file. They stay until the video was tried again: a finished folder stays finished.
+    """
+
+    standing: dict[str, PreparedVideo]
+    finished: set[str]
+    failed: list[PreparedVideo]
+
+
+def _earlier(
+    target: Path, catalogue: Catalogue, known: dict[str, PreparedVideo], scene: bool, tell: Callable[[int], None]
+) -> _Earlier:
+    earlier = _Earlier({}, set(), [])
+    done = 0
+    with closing(standing_files(target, catalogue.videos, known)) as files:
+        for video, stands in files:
+            if stands:
+                record = earlier.standing[video.id] = known[video.id]
+                if record.scene or not scene:
+                    earlier.finished.add(video.id)
+                    done += video.frames
+            elif has_failed(video, known):
+                earlier.failed.append(known[video.id])
+            tell(done)
+    return earlier
+
+
+def _outcomes(
+    catalogue: Catalogue,
+    videos: Iterable[VideoEntry],
+    standing: dict[str, PreparedVideo],
+    target: Path,
+    encoding: Encoding,
+    scene: bool,
+    processes: int,
+) -> Iterator[tuple[VideoEntry, PreparedVideo | Problem]]:
+    """The new record of each video, in order of completion; a problem where the standing one has to stay as it is."""
+    jobs = []
+    for video in videos:
+        try:
+            jobs.append(_Job(video, _window(video, catalogue.rows), standing.get(video.id)))
+        except UsageError as error:
+            yield video, _record(video, 0, 0, str(error))
+
+    def transcodings() -> Iterator[tuple[_Job, Transcoding]]:
+        for job in jobs:
+            id = job.video.id
+            index = catalogue.frame_index(id).to_bytes()
+            yield job, Transcoding(
+                catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second, job.window, encoding,
+                target, target / id, scene,
+            )  # fmt: skip
+
+    for (job, _), result in run_isolated(_attempt, transcodings(), processes, lambda job: _deadline_seconds(job[0])):
+        if isinstance(result, Died):
+            if result.overdue_seconds:
+                result = f"hangs the transcoder: {result.how}"
+            else:
+                result = f"crashes the transcoder: its process died ({result.how})"
+        if isinstance(result, Scene) and job.standing is not None:
+            yield job.video, replace(job.standing, scene=_text(result))
+        elif isinstance(result, str) and job.standing is not None:
+            yield job.video, Problem(job.video.id, result)
+        else:
+            assert not isinstance(result, Scene)
+            yield job.video, _record(job.video, *job.window[2:], result)
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """A video to be transcoded; or, where its prepared file stands, only to be looked at."""
+
+    video: VideoEntry
+    window: Window
+    standing: PreparedVideo | None
+
+
+def _window(video: VideoEntry, rows: Rows) -> Window:
+    top, bottom = rows.bounds(video.height_px)
+    return top, 0, bottom - top, video.width_px
+
+
+def _deadline_seconds(job: _Job) -> float:
+    """Some fifty times as long as a core takes to transcode and verify it: for one that waits for a file for ever."""
+    video = job.video
+    return 600 + video.frames * (0.5 + 5e-6 * video.width_px * video.height_px)
+
+
+def _attempt(job: tuple[_Job, Transcoding]) -> Made | Scene | str:
+    """What was made or seen, or why nothing was."""
+    try:
+        return transcode(job[1]) if job[0].standing is None else look_again(job[1])
+    except VideoError as error:
+        return error.reason if error.frame is None else f"frame {error.frame}: {error.reason}"
+    except OSError as error:
+        return f"cannot be written: {error.strerror or error}"
+    except Exception as error:  # noqa: BLE001 - one strange file must not end the preparation of all others
+        return f"preparing failed: {type(error).__name__}: {error}"
+
+
+def _record(video: VideoEntry, height: int, width: int, result: Made | str) -> PreparedVideo:
+    rate = video.frames_per_second
+    # A fingerprint begins with the size in bytes.
+    size = int(video.fingerprint.partition("-")[0])
+    record = PreparedVideo(
+        video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, height, width
+    )
+    if isinstance(result, str):
+        return replace(record, problem=result)
+    return replace(
+        record,
+        fingerprint=result.fingerprint,
+        bytes=result.bytes,
+        psnr_db=result.psnr_db,
+        worst_psnr_db=result.worst_psnr_db,
+        scene="" if result.scene is None else _text(result.scene),
+    )
+
+
+def _text(scene: Scene) -> str:
+    return b64encode(scene.to_bytes()).decode()

@@ -1,0 +1,163 @@
+"""What earlier runs of `v2v-prepare` left in a folder, and which folders it takes at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError, VideoError
+from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.prepare.transcode import PARTIAL_SUFFIX
+from v2v_server.store.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
+from v2v_server.video.fingerprint import fingerprint
+
+_LOCK_NAME = ".v2v-prepare.lock"
+_NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
+_READERS = 16
+_AT_A_TIME = 1024
+"""Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
+
+
+def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
+    """Make sure that source and destination share no file, now or when the source is searched again.
+
+    Args:
+        catalogue: the source.
+        target: the destination, resolved.
+        single: the source is one video: nothing else of its folder will be taken for one.
+
+    Raises:
+        CorpusError: they do, or the source is prepared itself.
+    """
+    root = catalogue.root
+    if catalogue.prepared is not None:
+        raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
+    below = target != root and target.is_relative_to(root)
+    if root.is_relative_to(target) or (below and not single):
+        raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
+    # To resolve a path asks the system about each of its parts: done for every folder once, and for links among files.
+    inside: dict[str, bool] = {}
+    for video in catalogue.videos:
+        path = root / video.id
+        folder = os.path.dirname(video.id)
+        if folder not in inside:
+            inside[folder] = path.parent.resolve().is_relative_to(target)
+        if inside[folder] or (path.is_symlink() and path.resolve().is_relative_to(target)):
+            raise CorpusError(f"{target}: {video.id} of the source is a link into it; choose another destination")
+
+
+@contextlib.contextmanager
+def locked(target: Path) -> Iterator[None]:
+    """Keeps other processes out of the folder; the system lets go of the lock however this one ends.
+
+    Raises:
+        CorpusError: another process is at work there.
+        OSError: the folder cannot be written to.
+    """
+    with (target / _LOCK_NAME).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CorpusError(f"{target}: another v2v-prepare is at work there; wait for its end") from None
+        yield
+
+
+def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:
+    """The records of all earlier runs, also those set aside, after clearing away what they left unfinished.
+
+    Args:
+        target: the destination.
+        header: what this run asks for.
+        videos: of its source.
+
+    Raises:
+        CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings or
+            from another source.
+        OSError: it cannot be read, or what is unfinished cannot be removed.
+    """
+    if not (target / MANIFEST_NAME).exists():
+        for folder in target.parents:
+            if (folder / MANIFEST_NAME).exists():
+                raise CorpusError(f"{target} lies in the prepared folder {folder}; choose another destination")
+        foreign = sorted(entry.name for entry in target.iterdir() if not entry.name.startswith("."))
+        if foreign:
+            raise CorpusError(
+                f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
+                "empty or a new folder"
+            )
+        return {}
+    manifest = read_manifest(target)
+    if not manifest.header.same_settings(header):
+        # One header holds for all files of a folder, so two settings cannot lie in one; and to make all of them anew
+        # unasked may cost days.
+        made = sum(video.problem is None for records in (manifest.videos, manifest.aside) for video in records.values())
+        raise CorpusError(
+            f"{target} was prepared with {manifest.header.settings()}, and now {header.settings()} is asked for, which "
+            f"its {made} prepared videos are not; choose another folder, or delete this one to have all made anew"
+        )
+    known = manifest.aside | manifest.videos
+    _refuse_other_source(target, manifest.header.source, header.source, known, videos)
+    for partial in target.rglob(f".*{PARTIAL_SUFFIX}"):
+        partial.unlink()
+    return known
+
+
+def _refuse_other_source(
+    target: Path, earlier: str, now: str, known: dict[str, PreparedVideo], videos: Sequence[VideoEntry]
+) -> None:
+    """Another corpus would pass for this one with every video changed or removed, and its files would replace those
+    of the same names, which may have taken days. A source that keeps its name, or some video, is the same one."""
+    if earlier == now or not known:
+        return
+    if any(video.id in known and known[video.id].source_fingerprint == video.fingerprint for video in videos):
+        return
+    raise CorpusError(
+        f"{target} was prepared from a folder called {earlier}, and none of its {len(known)} videos is one of the "
+        f"{len(videos)} of {now}; choose another folder for another corpus. If it is the same one renamed, begin with "
+        "all of its videos, or with its old name"
+    )
+
+
+def standing_files(
+    target: Path, videos: Sequence[VideoEntry], known: dict[str, PreparedVideo]
+) -> Generator[tuple[VideoEntry, bool], None, None]:
+    """Whether the prepared file of each video is there, unchanged, and that of this state of the source; in order.
+
+    Beginning and end of each file are read, many files at a time: what this waits for is the disk.
+
+    Raises:
+        CorpusError: a file is there and cannot be read.
+    """
+    pool = ThreadPoolExecutor(_READERS)
+    try:
+        for start in range(0, len(videos), _AT_A_TIME):
+            some = videos[start : start + _AT_A_TIME]
+            yield from zip(some, pool.map(lambda video: _stands(target, video, known), some), strict=True)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def has_failed(video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
+    """Whether an earlier run could not prepare this state of the source."""
+    record = known.get(video.id)
+    return record is not None and record.problem is not None and record.source_fingerprint == video.fingerprint
+
+
+def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
+    record = known.get(video.id)
+    if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
+        return False
+    try:
+        return fingerprint(target / video.id) == record.fingerprint
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
+            raise CorpusError(
+                f"{target / video.id} {error.reason}, so nobody can tell whether it is still what was prepared, and "
+                "nothing was changed; make it readable, or delete it to have it made anew"
+            ) from error
+        return False

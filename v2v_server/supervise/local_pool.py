@@ -1,0 +1,252 @@
+"""The pool of local worker processes: spawn, watch, restart with backoff, stop. Who spawns also reaps.
+
+Workers are started as programs of their own (never forked), in their own process group so that Ctrl-C in a terminal
+reaches only the server, and die with the server even when it is killed.
+
+A worker that dies is started again after a delay that doubles with every death in a row. When the workers die again and
+again without a single sample being finished, something is wrong that restarting does not mend, and the pool says so.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import psutil
+
+from v2v_protocol.errors import WorkerCrashLoop
+from v2v_protocol.programs import environment
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.worker.logbook import Logbook
+
+_FIRST_BACKOFF_SECONDS = 0.2
+_LONGEST_BACKOFF_SECONDS = 10.0
+_MEMORY_SECONDS = 5.0
+"""After the kernel has killed for want of memory, a worker's SIGKILL is taken for its doing: to end takes a moment."""
+_CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True, slots=True)
+class Death:
+    """A worker process that ended without being asked to, or that the system did not start."""
+
+    identity: bytes
+    loss: Loss
+
+
+@dataclass(slots=True)
+class _Slot:
+    process: subprocess.Popen[bytes] | None = None
+    logbook: Logbook | None = None
+    identity: bytes = b""
+    generation: int = 0
+    given_up: bool = False
+    start_at: float = 0.0
+
+
+class Pool:
+    """Keeps a number of worker processes running.
+
+    Args:
+        workers: how many.
+        root: the corpus folder.
+        address: where the server listens for workers.
+        label: prefix of the workers' names, unique to this server.
+    """
+
+    def __init__(self, workers: int, root: Path, address: str, label: str) -> None:
+        self._slots = [_Slot() for _ in range(workers)]
+        self._root = root
+        self._address = address
+        self._label = label
+        self._deaths_in_a_row = 0
+        self._samples_seen = 0
+        self._memory_kills = _out_of_memory_kills()
+        self._short_of_memory_until = -math.inf
+
+    @property
+    def crash_budget(self) -> int:
+        """Deaths in a row, without any finished sample between them, that are survived."""
+        return 3 * len(self._slots) + 4
+
+    @property
+    def running(self) -> int:
+        """Processes that are alive."""
+        return sum(slot.process is not None and slot.process.poll() is None for slot in self._slots)
+
+    def pids(self) -> list[int]:
+        """Process ids of the workers that are alive."""
+        return [slot.process.pid for slot in self._slots if slot.process is not None and slot.process.poll() is None]
+
+    def watches(self, identity: bytes) -> bool:
+        """Whether :meth:`check` will report how that worker ends: one of this pool's that was not given up."""
+        return any(slot.identity == identity and slot.process is not None and not slot.given_up for slot in self._slots)
+
+    def check(self, now: float, samples: int) -> list[Death]:
+        """Reaps the dead and starts what is due. To be called a few times a second.
+
+        Args:
+            now: the time, seconds.
+            samples: samples finished so far by all workers; any progress forgives earlier deaths.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        if samples > self._samples_seen:
+            self._samples_seen = samples
+            self._deaths_in_a_row = 0
+        deaths = []
+        ended = {number for number, slot in enumerate(self._slots) if slot.process and slot.process.poll() is not None}
+        memory_kills = _out_of_memory_kills()  # counted before its victims are gone, so these are in it
+        if memory_kills > self._memory_kills:
+            self._memory_kills, self._short_of_memory_until = memory_kills, now + _MEMORY_SECONDS
+        for number, slot in enumerate(self._slots):
+            if slot.process is not None and number in ended:
+                at = None if slot.logbook is None else slot.logbook.lease()
+                loss = _post_mortem(slot.process.returncode, short_of_memory=now < self._short_of_memory_until)
+                death = Death(slot.identity, replace(loss, lease=at))
+                self._put_off(slot, death, now)
+                if not slot.given_up:
+                    deaths.append(death)
+            if slot.process is None and now >= slot.start_at:
+                try:
+                    self._start(number, slot)
+                except OSError as error:
+                    # Too many processes, or no memory for one more: that passes, and must not end those that run.
+                    text = f"could not be started: {error.strerror or error}"
+                    deaths.append(Death(slot.identity, Loss(Cause.KILLED, text)))
+                    self._put_off(slot, deaths[-1], now)
+        return deaths
+
+    def _put_off(self, slot: _Slot, death: Death, now: float) -> None:
+        """Lets some time pass before the next process of a slot.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        self._deaths_in_a_row += 1
+        if self._deaths_in_a_row > self.crash_budget:
+            raise WorkerCrashLoop(
+                f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
+                f"{self.crash_budget}); the last one {death.loss.text}. What they printed is above; "
+                f"`v2v-simulate` on one of the videos shows the same in one process"
+            )
+        # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
+        doublings = min(self._deaths_in_a_row - 1, 16)
+        delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
+        slot.process, slot.start_at = None, now + delay
+
+    def give_up(self, identity: bytes, reason: str) -> Loss | None:
+        """Kills a worker that hangs.
+
+        Returns:
+            what its loss means, not to be reported again by :meth:`check`; None when it is none of this pool's.
+        """
+        for slot in self._slots:
+            if slot.identity == identity and slot.process is not None:
+                slot.given_up = True
+                status = _status(slot.process.pid)
+                slot.process.kill()
+                if status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
+                    return Loss(Cause.KILLED, "was stopped from outside and killed")
+                at = None if slot.logbook is None else slot.logbook.lease()
+                if status == psutil.STATUS_DISK_SLEEP:
+                    # A network file system whose server is away holds every worker at whatever clip it has.
+                    return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at)
+                return Loss(Cause.HUNG, reason, at)
+        return None
+
+    def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
+        """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
+        processes = [slot.process for slot in self._slots if slot.process is not None]
+        _wait(processes, join_seconds)
+        for process in processes:
+            if process.poll() is None:
+                process.terminate()
+        _wait(processes, terminate_seconds)
+        for process in processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        for slot in self._slots:
+            slot.process = None
+            if slot.logbook is not None:
+                slot.logbook.close()
+
+    def _start(self, number: int, slot: _Slot) -> None:
+        slot.generation += 1
+        slot.given_up = False
+        name = f"{self._label}-{number}.{slot.generation}"
+        slot.identity = name.encode()
+        if slot.logbook is not None:
+            slot.logbook.close()
+            slot.logbook = None
+        slot.logbook = Logbook()
+        slot.process = subprocess.Popen(
+            [*_command(self._address, self._root, name), "--logbook-fd", str(slot.logbook.descriptor)],
+            stdin=subprocess.DEVNULL,
+            pass_fds=(slot.logbook.descriptor,),
+            env=environment() | _ONE_THREAD,
+            process_group=0,
+        )
+
+
+def _command(address: str, root: Path, name: str) -> list[str]:
+    """The program of one worker."""
+    return [
+        *(sys.executable, "-m", "v2v_server.commands.cli", "worker"),
+        *("--connect", address, "--videos", str(root), "--name", name),
+        *("--parent-pid", str(os.getpid())),
+    ]
+
+
+def _post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
+    """What the end of a worker means that was not asked for."""
+    if returncode >= 0:
+        # An exception nobody foresaw, a broken installation: the trace is on stderr, whose fault it is is not.
+        return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
+    number = -returncode
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    if number in _CRASH_SIGNALS:
+        return Loss(Cause.CRASHED, f"was ended by {name}")
+    if number == signal.SIGKILL and short_of_memory:
+        return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
+    if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        return Loss(Cause.KILLED, f"was ended by {name} from outside")
+    return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
+
+
+def _status(pid: int) -> str:
+    """What a process is at, in psutil's words: stopped, also by a debugger, or in the kernel, waiting for a disk ..."""
+    try:
+        return str(psutil.Process(pid).status())
+    except psutil.NoSuchProcess:
+        return psutil.STATUS_DEAD
+
+
+def _out_of_memory_kills() -> int:
+    """How many processes the kernel of this host has killed for want of memory; 0 where it does not say."""
+    try:
+        for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    except OSError:
+        pass
+    return 0
+
+
+def _wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return

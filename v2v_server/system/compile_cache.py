@@ -1,0 +1,123 @@
+"""Where numba keeps the compiled kernels: a folder of its own for every state of their sources and every processor.
+
+Numba takes compiled code for fresh while the one file that defines the function is unchanged. A kernel of ours holds
+functions and constants of several files, so after a change of one of them numba would go on with the old kernel, and
+with other numbers, without a word. Another digest of all these files is another folder.
+
+Numba numbers the files of compiled code, and its index says which of them is for which processor. Two hosts that share
+a folder and compile at the same time may both take the same number: then the index leads one of them to the code of the
+other, whose instructions it may lack, at every start from then on. So the processor is in the digest too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from itertools import takewhile
+from pathlib import Path
+
+SOURCES = Path(__file__).parents[1] / "simulation"
+"""The folder of every file from which something can get into a kernel."""
+
+PROCESSORS = Path("/proc/cpuinfo")
+"""What Linux says of the processors. Asking LLVM, as numba does, would mean loading it in every process."""
+
+_VARIABLE = "NUMBA_CACHE_DIR"
+_KIND = re.compile(r"(vendor_id|cpu family|model|flags|Features|CPU (implementer|architecture|variant|part)|isa)\s*:")
+_OURS = re.compile(r"numba-[0-9a-f]{12}")
+
+
+def use_compile_cache() -> None:
+    """Makes numba keep what this process compiles in the folder of :func:`choose_compile_cache`."""
+    choose_compile_cache()
+    numba = sys.modules.get("numba")
+    if numba is not None and not _is_users(numba.config.CACHE_DIR):
+        # It has read the environment already.
+        numba.config.CACHE_DIR = os.environ.get(_VARIABLE, "")
+
+
+def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Sets ``NUMBA_CACHE_DIR``, which numba reads when it is imported.
+
+    What the user has set stays, and is the user's to empty. Else it is a folder ``numba-DIGEST`` beside the code if
+    that can be written; below ``V2V_CACHE_DIR``, or the user's cache folder where that is not set; below the folder for
+    temporary files. Numba alone would try the code and the home folder, and refuse to start where neither can be
+    written, as in a hardened container.
+
+    Where nothing can be written it is not set: numba says so, if it is ever needed.
+    """
+    # A folder of ours comes from a parent process, which may have been started before the sources changed.
+    if _is_users(environment.get(_VARIABLE, "")):
+        return
+    try:
+        name = f"numba-{sources_digest()}"
+    except PackageNotFoundError:
+        return  # without numba nothing is compiled
+    for parent in _parents(environment):
+        if _can_be_written(parent / name):
+            environment[_VARIABLE] = str(parent / name)
+            return
+    environment.pop(_VARIABLE, None)
+
+
+def sources_digest(folder: Path = SOURCES) -> str:
+    """Names a state of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
+    digest = hashlib.sha256(version("numba").encode() + _processor())
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:12]
+
+
+def _processor() -> bytes:
+    """What kind of processor this is and which instructions it has, as far as the system tells."""
+    told = [os.uname().machine]
+    with suppress(OSError), PROCESSORS.open(encoding="utf-8", errors="replace") as file:
+        told += filter(_KIND.match, takewhile(str.strip, file))  # the first one ends with an empty line
+    return "\n".join(told).encode()
+
+
+def _is_users(folder: str) -> bool:
+    return bool(folder) and _OURS.fullmatch(Path(folder).name) is None
+
+
+def _parents(environment: Mapping[str, str]) -> Iterator[Path]:
+    yield SOURCES / "__pycache__"
+    if environment.get("V2V_CACHE_DIR"):
+        yield Path(environment["V2V_CACHE_DIR"]).absolute()
+    elif environment.get("XDG_CACHE_HOME"):
+        yield Path(environment["XDG_CACHE_HOME"]).absolute() / "v2v"
+    elif (home := os.path.expanduser("~")) != "~":  # a user without an entry in the list of users has none
+        yield Path(home) / ".cache" / "v2v"
+    try:
+        temporary = Path(tempfile.gettempdir()) / f"v2v-{os.getuid()}"
+    except FileNotFoundError:
+        return  # none can be written
+    # Numba unpickles what it finds, and here anyone could have put it.
+    if _is_private(temporary):
+        yield temporary
+
+
+def _is_private(folder: Path) -> bool:
+    """Makes the folder if need be; whether nobody else can write into it."""
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Makes the folder if need be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)

@@ -1,0 +1,195 @@
+"""A function applied to many jobs in processes of their own, where a crash costs the one job that caused it.
+
+Spawned processes and pipes, nothing else: no lock, queue or shared memory, all of which need a writable ``/dev/shm``,
+and containers exist that have none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, TypeVar
+
+from v2v_server.system.process import die_with_parent
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+_EXIT_SECONDS = 5.0
+_LONGEST_WAIT_SECONDS = 10.0
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, slots=True)
+class Died:
+    """Stands for the result of a job whose process died.
+
+    Attributes:
+        exitcode: as ``multiprocessing`` gives it: the exit status, or minus the number of a signal.
+        overdue_seconds: how long it was waited for before it was ended here; 0 if it died by itself.
+    """
+
+    exitcode: int
+    overdue_seconds: float = 0.0
+
+    @property
+    def how(self) -> str:
+        """``signal SIGSEGV``, ``exit status 1``, ``ended after 60 s without a result``."""
+        if self.overdue_seconds:
+            return f"ended after {self.overdue_seconds:.0f} s without a result"
+        if self.exitcode >= 0:
+            return f"exit status {self.exitcode}"
+        number = -self.exitcode
+        return f"signal {signal.Signals(number).name if number in set(signal.Signals) else number}"
+
+    @property
+    def from_outside(self) -> bool:
+        """Whether it was killed by somebody, or by a kernel short of memory, so that the job is not to blame."""
+        return not self.overdue_seconds and -self.exitcode in _FROM_OUTSIDE
+
+
+def run_isolated(
+    function: Callable[[J], R],
+    jobs: Iterable[J],
+    processes: int,
+    deadline_seconds: Callable[[J], float] | None = None,
+) -> Iterator[tuple[J, R | Died]]:
+    """(job, result) for every job, in order of completion.
+
+    A process takes one job after another; the one that dies is replaced. All are ended with the iterator, and die with
+    this process, however that ends. Ctrl-C reaches only this process.
+
+    Args:
+        function: must be picklable, and return rather than raise: an exception counts as its process's death.
+        jobs: picklable; drawn as processes become free.
+        processes: how many, spawned; 0 runs the jobs in this process, unprotected.
+        deadline_seconds: how long a job may take, its process's start included, before that is killed; None: any time.
+            Only time that is spent waiting here counts, so that nothing is overdue after the whole program was stopped.
+
+    Raises:
+        OSError: no process can be started.
+    """
+    if processes == 0:
+        yield from ((job, function(job)) for job in jobs)
+        return
+    left = iter(jobs)
+    lanes: dict[Connection, _Lane[J, R]] = {}
+    try:
+        for job in left:
+            lane = _Lane(function, deadline_seconds)
+            lanes[lane.connection] = lane
+            lane.begin(job)
+            if len(lanes) == processes:
+                break
+        while lanes:
+            _wait(lanes)
+            for ready in [connection for connection, lane in lanes.items() if connection.poll() or lane.patience <= 0]:
+                lane = lanes[ready]
+                finished = lane.finish() if ready.poll() else lane.give_up()
+                for following in left:
+                    if isinstance(finished[1], Died):
+                        lane = _Lane(function, deadline_seconds)
+                        lanes.pop(ready).end()
+                        lanes[lane.connection] = lane
+                    lane.begin(following)
+                    break
+                else:
+                    lanes.pop(ready).end()
+                yield finished
+    finally:
+        for lane in lanes.values():
+            lane.end()
+
+
+def _wait(lanes: dict[Connection, _Lane[J, R]]) -> None:
+    """Until a result is there or a job overdue, or for a while."""
+    at_most = max(0.0, min(_LONGEST_WAIT_SECONDS, *(lane.patience for lane in lanes.values())))
+    started = time.monotonic()
+    wait(list(lanes), at_most)
+    spent = min(time.monotonic() - started, at_most)
+    for lane in lanes.values():
+        lane.patience -= spent
+
+
+class _Lane(Generic[J, R]):
+    """One process and the job it has.
+
+    Attributes:
+        patience: for how many seconds more its job is waited for.
+    """
+
+    def __init__(self, function: Callable[[J], R], deadline_seconds: Callable[[J], float] | None) -> None:
+        self._deadline_seconds = deadline_seconds
+        self.patience = math.inf
+        context = multiprocessing.get_context("spawn")
+        self.connection, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, function, os.getpid()), daemon=True)
+        # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
+        resource_tracker.ensure_running()
+        try:
+            with _interrupt_held_back():
+                self._process.start()
+        except BaseException:
+            self.connection.close()
+            raise
+        finally:
+            other.close()
+
+    def begin(self, job: J) -> None:
+        self._job = job
+        self._allowed = self.patience = math.inf if self._deadline_seconds is None else self._deadline_seconds(job)
+        try:
+            self.connection.send(job)
+        except OSError:
+            return  # it died before it had the job: finish() finds the end of the pipe
+
+    def finish(self) -> tuple[J, R | Died]:
+        try:
+            return self._job, self.connection.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            return self._job, Died(self._process.exitcode or 0)
+
+    def give_up(self) -> tuple[J, R | Died]:
+        self._process.kill()
+        self._process.join(_EXIT_SECONDS)
+        return self._job, Died(-signal.SIGKILL, self._allowed)
+
+    def end(self) -> None:
+        self.connection.close()
+        self._process.terminate()
+        self._process.join(_EXIT_SECONDS)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._process.close()
+
+
+@contextlib.contextmanager
+def _interrupt_held_back() -> Iterator[None]:
+    """A process started inside inherits that SIGINT waits: Ctrl-C in a terminal, which sends it to all, must not strike
+    before :func:`_serve` can ignore it. In this process it strikes at the end."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int) -> None:
+    die_with_parent(parent_pid)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
+    while True:
+        try:
+            job = connection.recv()
+        except EOFError:
+            return
+        connection.send(function(job))

@@ -1,0 +1,265 @@
+"""From a lease to its samples: decode, view, simulate.
+
+Server workers and `v2v-simulate` both come through here, which is why a sample made by either is the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.messages import Lease
+from v2v_protocol.sample import Layout, Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, new_arrays
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.scene import Scene
+from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.timing import step_seconds
+from v2v_server.simulation.variants import Variant, variants
+from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import DecodedClip, decode_cuts
+from v2v_server.video.fingerprint import check_fingerprint
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.rows import Rows
+from v2v_server.worker.scene_choice import FlowPlan, plan_flow
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """What one sample needs of its clip.
+
+    Attributes:
+        spec: the stream's spec.
+        params: the sample's draw.
+        source: [steps + 1] int64, which decoded frame each position of the clip shows.
+        cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
+        flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
+        plan: what the statistics of the scene say about flow; None where the spec does not ask them.
+    """
+
+    spec: StreamSpec
+    params: SampleParams
+    source: npt.NDArray[np.int64]
+    cut: Cut
+    flow: FlowSettings | None
+    plan: FlowPlan | None
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """The decoded part of a sample."""
+
+    draft: Draft
+    clip: DecodedClip
+
+
+def draft_of(lease: Lease, index: int) -> Draft:
+    """Draws the camera of one of a lease's indices.
+
+    Raises:
+        ProtocolError: the lease does not fit its form.
+    """
+    spec = _spec(lease.spec)
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    params = draw(
+        spec.recipe,
+        seed=lease.seed,
+        epoch=lease.epoch,
+        index=index,
+        picture_height_px=bottom - top,
+        picture_width_px=lease.width_px,
+        video_id=lease.video,
+        video_thresholds=_thresholds(lease.thresholds),
+    )
+    source = params.source_index(spec.recipe.steps)
+    window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
+    core_left_px = window.left_px  # what the view takes is the same with flow and without
+    plan = _plan(lease, spec, params, bottom - top)
+    if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
+        flow = FlowSettings.of(spec)
+        if plan is not None and plan.still:
+            flow = replace(flow, margin_px=0)
+        window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
+    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window, core_left_px), flow, plan)
+
+
+def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:
+    """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
+
+    Args:
+        lease: the work.
+        indices: of ``lease.indices``.
+        root: folder that the catalogue's ids are relative to, on this host.
+
+    Raises:
+        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
+        ProtocolError: the lease does not fit its form.
+    """
+    drafts = [draft_of(lease, index) for index in indices]
+    spec = drafts[0].spec
+    path = _below(root, lease.video)
+    try:
+        check_fingerprint(path, lease.fingerprint)
+        clips = decode_cuts(
+            path,
+            _frame_index(lease, spec.recipe.frames_needed),
+            lease.start_frame,
+            [draft.cut for draft in drafts],
+            stride=spec.recipe.frame_stride,
+            loop_filter=spec.loop_filter,
+        )
+    except VideoError as error:
+        # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
+        raise type(error)(lease.video, error.frame, error.reason) from error
+    return tuple(Decoded(draft, clip) for draft, clip in zip(drafts, clips, strict=True))
+
+
+def sample_layout(lease: Lease) -> Layout:
+    """dtype and shape of each array of a lease's sample.
+
+    Raises:
+        ProtocolError: the lease asks for an array that nobody makes.
+    """
+    try:
+        return _layout(lease.spec, lease.arrays)
+    except UsageError as error:
+        raise ProtocolError(f"lease {lease.lease}: {error}") from error
+
+
+def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
+    """Makes a lease's sample of what was decoded for it: view, flow, simulation.
+
+    Args:
+        lease: the work.
+        decoded: what was decoded for it.
+        into: C-contiguous arrays for the sample, of :func:`sample_layout`; None makes them.
+
+    Raises:
+        VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
+            are beyond what can be simulated.
+        ProtocolError: the lease does not fit its form.
+    """
+    draft, index = decoded.draft, lease.indices[0]
+    params, recipe, source = draft.params, draft.spec.recipe, draft.source
+    frames, flow = decoded.clip.frames, None
+    if draft.flow is not None:
+        plan = () if draft.plan is None else draft.plan.methods
+        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays, plan=plan)
+        frames = view_part(frames, params, recipe, draft.flow.margin_px)
+    view = apply_view(frames, params, recipe)
+    seconds, irregular = None, 0
+    if recipe.needs_seconds:
+        if not lease.frames_per_second:
+            raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe needs seconds")
+        seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
+    if into is None:
+        into = new_arrays(sample_layout(lease))
+    saturated = 0
+    for name, array in into.items():
+        if name == "voxels":
+            try:
+                saturated = simulate_clip(view, params, recipe, draft.spec.voxel_dtype, seconds, array).saturated_bins
+            except UsageError as error:
+                # The recipe was checked; what is left is what the corpus says of the video: thresholds, time stamps.
+                raise VideoError(lease.video, None, f"cannot be simulated: {error}") from error
+        elif name == "frames":
+            # These indices are those of frames that are there; checking them once more would cost a copy.
+            np.take(view, source[list(recipe.target_steps)], axis=0, out=array[:, 0], mode="clip")
+        elif name == "flow" and flow is not None:
+            array[...] = flow.flow
+        elif name == "flow_valid" and flow is not None and flow.valid is not None:
+            array[...] = flow.valid
+    codec = decoded.clip.codec
+    return Sample(
+        arrays=into,
+        provenance=Provenance(
+            id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
+            video=lease.video,
+            fingerprint=lease.fingerprint,
+            start_frame=lease.start_frame,
+            candidate=lease.candidate,
+            refusals=_refusals(lease),
+            params=params,
+            saturated_bins=saturated,
+            irregular_timestamps=irregular,
+            decoder=codec if decoded.clip.bit_exact else f"{codec} (host-dependent)",
+            quarantine=lease.quarantine,
+            scene="" if draft.plan is None else draft.plan.reason,
+        ),
+    )
+
+
+def kernels_of(lease: Lease) -> frozenset[Variant]:
+    """The compiled kernels that a lease's sample may need."""
+    if "voxels" not in lease.arrays:
+        return frozenset()
+    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds)
+
+
+@lru_cache(maxsize=64)
+def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[str, ...]) -> frozenset[Variant]:
+    spec = _spec(canonical)
+    step_seconds = spec.recipe.frame_stride / frames_per_second
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _thresholds(thresholds))
+
+
+@lru_cache(maxsize=16)
+def _spec(canonical: bytes) -> StreamSpec:
+    return StreamSpec.from_dict(json.loads(canonical))
+
+
+@lru_cache(maxsize=16)
+def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
+    spec = _spec(canonical)
+    return array_layout(spec.recipe, spec.voxel_dtype, arrays)
+
+
+def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
+    if spec.scene == "off":
+        return None
+    scene = Scene.from_bytes(lease.scene)
+    return plan_flow(scene, lease.start_frame, params, spec, height_px, lease.width_px)
+
+
+def _thresholds(texts: tuple[str, ...]) -> tuple[float, float] | None:
+    if not texts:
+        return None
+    positive, negative = (float.fromhex(text) for text in texts)
+    return positive, negative
+
+
+def _frame_index(lease: Lease, frames: int) -> FrameIndex:
+    """The index that a lease carries, of which its server may not have looked at a single byte.
+
+    Raises:
+        VideoError: it is damaged.
+    """
+    try:
+        frame_index = FrameIndex.from_bytes(lease.frame_index)
+        frame_index.position(lease.start_frame, frames)
+    except (ProtocolError, UsageError) as error:
+        raise VideoError(lease.video, None, f"the server's index of it is damaged: {error}") from error
+    return frame_index
+
+
+def _refusals(lease: Lease) -> tuple[Refusal, ...]:
+    return tuple(Refusal(**item) for item in lease.refusals["refusals"])
+
+
+def _below(root: Path, video: str) -> Path:
+    """The file of a catalogue id, which may not lead out of the root whatever a message says."""
+    relative = PurePosixPath(video)
+    if relative.is_absolute() or ".." in relative.parts:
+        raise ProtocolError(f"video id {video!r} leads out of the corpus folder")
+    return root.joinpath(relative)

@@ -1,0 +1,147 @@
+"""How much flow a clip needs, from the statistics of its video. Pure.
+
+Each voxel's flow is made by the cheapest method that keeps the tolerance, judged in the tiles of the picture that the
+crop touches and in the segments between the voxel's two frames:
+
+    still     no block changes its mean by more than 1.5 grey levels (0.25 in a dark scene, where the
+              gradations are finer): zero, without looking at a pixel
+    slow      nothing moves half a pixel from one end of the voxel to the other: dis-ultrafast
+    mixed     half of the tiles and segments are slow, or the voxel reaches beyond what was looked at: "auto" looks
+              at the pair itself
+    moving    else: dis-fast-lean
+
+The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.auto`), spared its look. Where
+it would take dis-fast, dis-fast-lean refines three times instead of five, within the tolerance (docs/scene.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.scene import CHANGE, CLIPPED, DARK, FLICKER, LAG_FRAMES, MOTION, NOISE, TILES, Scene
+from v2v_server.flow.auto import SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
+from v2v_server.flow.settings import AUTO
+
+MOVING = "dis-fast-lean"
+TOLERANCE_PX = 0.05
+"""Most that the choice may add to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
+DARK_SHARE = 0.9
+"""A scene is dark where this share of it lies below grey level 16."""
+DARK_STILL_GREY_LEVELS = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class FlowPlan:
+    """What was decided for one sample.
+
+    Attributes:
+        methods: of each voxel of the target sequence; "auto" where the statistics do not decide. Empty where the spec
+            names a method, which is then obeyed.
+        reason: the decision and the figures behind it, for the provenance.
+    """
+
+    methods: tuple[str, ...]
+    reason: str
+
+    @property
+    def still(self) -> bool:
+        """Whether no flow has to be estimated at all."""
+        return bool(self.methods) and all(name == STILL for name in self.methods)
+
+
+def plan_flow(
+    scene: Scene,
+    start_frame: int,
+    params: SampleParams,
+    spec: StreamSpec,
+    picture_height_px: int,
+    picture_width_px: int,
+) -> FlowPlan:
+    """The method of each voxel of one drawn sample.
+
+    Args:
+        scene: statistics of the usable picture; at least of what the sample shows, as far as it was looked at.
+        start_frame: first frame of the sequence.
+        params, spec: the draw and what it was drawn for.
+        picture_height_px, picture_width_px: size of the usable picture before the resize.
+    """
+    recipe = spec.recipe
+    tiles = _tiles(params, recipe, picture_height_px, picture_width_px)
+    source = start_frame + recipe.frame_stride * params.source_index(recipe.steps)
+    span = recipe.bins * recipe.frames_per_bin
+    ends = source[recipe.lead_voxels * span :: span].tolist()
+    methods = tuple(_method(scene, earlier, later, tiles, params.scale) for earlier, later in pairwise(ends))
+    values = scene.values(int(source[0]), int(source[-1]))
+    kind, figures = _kind(methods), _figures(values, tiles)
+    if spec.flow_method != AUTO:
+        return FlowPlan((), f"{kind}; flow {spec.flow_method} as asked; {figures}")
+    return FlowPlan(methods, f"{kind}; flow {_counted(methods)}; {figures}")
+
+
+def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_], scale: float) -> str:
+    if earlier == later:
+        return STILL
+    if later >= scene.end:
+        return AUTO
+    values = scene.values(earlier, later)
+    dark = bool((values[:, DARK] >= DARK_SHARE).any())
+    change = values[:, CHANGE][:, tiles].max() * max(1.0, (later - earlier) / LAG_FRAMES)
+    if change <= (DARK_STILL_GREY_LEVELS if dark else STILL_GREY_LEVELS):
+        return STILL
+    # NaN, a motion that is not known, is not below anything.
+    pace = values[:, MOTION][:, tiles] * scale * (later - earlier)
+    if pace.max() < SLOW_PX:
+        return SLOW
+    return AUTO if np.median(pace) < SLOW_PX else MOVING
+
+
+def _tiles(params: SampleParams, recipe: Recipe, height_px: int, width_px: int) -> npt.NDArray[np.bool_]:
+    """[16] which tiles of the picture the crop touches."""
+    rows = _touched(params.crop_top_px, recipe.crop_height_px, height_px * params.scale)
+    columns = _touched(params.crop_left_px, recipe.crop_width_px, width_px * params.scale)
+    return (rows[:, None] & columns).ravel()
+
+
+def _touched(start_px: int, extent_px: int, side_px: float) -> npt.NDArray[np.bool_]:
+    first = min(TILES - 1, math.floor(start_px * TILES / side_px))
+    end = max(first + 1, math.ceil((start_px + extent_px) * TILES / side_px))
+    numbers = np.arange(TILES)
+    touched: npt.NDArray[np.bool_] = (numbers >= first) & (numbers < end)
+    return touched
+
+
+def _kind(methods: tuple[str, ...]) -> str:
+    """What a clip is called whose most demanding voxel takes that method."""
+    kinds = {MOVING: "moving", AUTO: "mixed", SLOW: "slow", STILL: "still"}
+    return next(kind for name, kind in kinds.items() if name in methods)
+
+
+def _counted(methods: tuple[str, ...]) -> str:
+    counts = Counter(methods)
+    return ", ".join(
+        f"{'none' if name == STILL else name} {counts[name]}" for name in (STILL, SLOW, MOVING, AUTO) if counts[name]
+    )
+
+
+def _figures(values: npt.NDArray[np.float64], tiles: npt.NDArray[np.bool_]) -> str:
+    """The statistics of a clip as text: of its tiles motion and change, of the whole picture the rest."""
+    if not len(values):
+        return "not looked at"
+    motion, noise = values[:, MOTION][:, tiles], values[:, NOISE]
+    known, heard = motion[~np.isnan(motion)], noise[~np.isnan(noise)]
+    pace = f"{np.median(known):.2f} px a frame, at most {known.max():.2f}" if known.size else "unknown"
+    dark = float(values[:, DARK].mean())
+    return (
+        f"motion {pace}; change {values[:, CHANGE][:, tiles].max():.2f}, flicker {values[:, FLICKER].mean():.2f}, "
+        f"noise {heard.mean() if heard.size else 0.0:.2f} grey levels; dark {dark:.1%}"
+        f"{' (a dark scene)' if dark >= DARK_SHARE else ''}, clipped {values[:, CLIPPED].mean():.1%}"
+    )
