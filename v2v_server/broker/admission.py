@@ -1,4 +1,4 @@
-"""Reception: from a consumer's Hello to its session. Pure."""
+"""Admission: from a consumer's Hello to its session. Pure."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Hello, Welcome
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
@@ -37,26 +38,34 @@ def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> 
     return under_way + -(-under_way // 7)
 
 
-class Reception:
+class Admission:
     """Turns what consumers ask for into sessions.
 
     Args:
         catalogue: the corpus.
         default_spec: what a consumer gets that asks for nothing in particular.
         max_credit_bytes: bound on the bytes in flight to one consumer.
+        session_idle_seconds: a session silent for so long is forgotten, whatever it waits for. Its consumer opens it
+            again when it asks next, so the limit only bounds what abandoned consumers cost.
         quarantine: the snapshots.
     """
 
     def __init__(
-        self, catalogue: Catalogue, default_spec: StreamSpec, max_credit_bytes: int, quarantine: Quarantine
+        self,
+        catalogue: Catalogue,
+        default_spec: StreamSpec,
+        max_credit_bytes: int,
+        session_idle_seconds: float,
+        quarantine: Quarantine,
     ) -> None:
         self._catalogue = catalogue
         self._default_spec = default_spec
         self._max_credit_bytes = max_credit_bytes
+        self._session_idle_seconds = session_idle_seconds
         self._quarantine = quarantine
         self._tables: dict[tuple[object, ...], SequenceTable] = {}
 
-    def receive(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
+    def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
         """The session a consumer asks for, and the answer to it.
 
         Args:
@@ -100,7 +109,7 @@ class Reception:
             batch_size=hello.batch_size,
             schedule=schedule,
             credit=min(suggested, MOST_CREDIT, self._max_credit_bytes // layout_bytes(layout)),
-            last_heard=now,
+            liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
             quarantine=quarantine,
         )
         return session, Welcome(

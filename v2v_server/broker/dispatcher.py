@@ -34,7 +34,7 @@ from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
 from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, refusal
-from v2v_server.broker.admission import Reception
+from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters
@@ -82,12 +82,12 @@ class Dispatcher:
         expected_workers: int = 0,
     ) -> None:
         self.counters = Counters()
-        self.sessions = Sessions(session_idle_seconds)
+        self.sessions = Sessions()
         self._expected_workers = expected_workers
         self._catalogue = catalogue
         self._quarantine = quarantine
         self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
-        self._reception = Reception(catalogue, default_spec, max_credit_bytes, quarantine)
+        self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self._leases = LeaseBook(lease_deadline_seconds)
         self._workers = Workers(self._leases)
         self._lone: deque[Task] = deque()
@@ -116,7 +116,7 @@ class Dispatcher:
             return [ToConsumer(identity, self._malformed(error))]
         session = self.sessions.get(identity)
         if session is not None:
-            session.last_heard = now
+            session.liveness.heard(now)
         match message:
             case Hello():
                 return [self._hello(identity, message, now)]
@@ -144,7 +144,7 @@ class Dispatcher:
             return _refuse(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
             workers = max(len(self._workers), self._expected_workers)
-            session, welcome = self._reception.receive(identity, hello, workers, now)
+            session, welcome = self._admission.admit(identity, hello, workers, now)
         except (UsageError, CorpusError) as error:
             return _refuse(identity, ErrorCode.SPEC, str(error))
         self.consumer_lost(identity)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import LimitExceeded
+from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import runs_alone
@@ -37,7 +38,7 @@ class Session:
         spec, seed, arrays, batch_size: what it asked for.
         schedule: the order of its samples.
         credit: most indices it may have asked for and not yet been answered.
-        last_heard: when its last message came, on the caller's clock.
+        liveness: when it was last heard.
         waiting: tasks nobody works on yet, in the order asked.
         unanswered: every (epoch, index) asked for and not yet answered.
         balance_seconds: worker time it has earned and not used.
@@ -53,7 +54,7 @@ class Session:
     batch_size: int
     schedule: Schedule
     credit: int
-    last_heard: float
+    liveness: Liveness
     waiting: deque[Task] = field(default_factory=deque)
     unanswered: set[tuple[int, int]] = field(default_factory=set)
     balance_seconds: float = 0.0
@@ -67,15 +68,9 @@ class Session:
 
 
 class Sessions:
-    """All consumers, and whose turn it is.
+    """All consumers, and whose turn it is."""
 
-    Args:
-        idle_seconds: a session silent for longer is forgotten, whatever it waits for. Its consumer opens it again when
-            it asks next, so the limit only bounds what abandoned consumers cost.
-    """
-
-    def __init__(self, idle_seconds: float) -> None:
-        self._idle_seconds = idle_seconds
+    def __init__(self) -> None:
         self._sessions: dict[bytes, Session] = {}
         self._turns: deque[bytes] = deque()
 
@@ -177,6 +172,4 @@ class Sessions:
 
     def idle(self, now: float) -> list[bytes]:
         """Sessions to forget: silent for too long."""
-        return [
-            session.identity for session in self._sessions.values() if now - session.last_heard > self._idle_seconds
-        ]
+        return [session.identity for session in self._sessions.values() if session.liveness.is_gone(now)]

@@ -24,7 +24,7 @@ from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Verdict
 
 MOST_QUEUED = 512
-"""Messages that wait for one peer before it is taken for deaf; above any credit (``reception.MOST_CREDIT``)."""
+"""Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
 _TICK_SECONDS = 0.1
 _LONGEST_TURN_SECONDS = 1.0
 """Of the loop; what goes beyond is time in which nobody was listened to."""

@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from v2v_protocol.liveness import Liveness
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.leases import LeaseBook
 
@@ -22,7 +23,7 @@ _MOST_STALE = 64
 @dataclass(slots=True)
 class _Worker:
     credit: int
-    last_heard: float
+    liveness: Liveness
     given_up: bool = False
 
 
@@ -55,7 +56,9 @@ class Workers:
 
     def add(self, identity: bytes, credit: int, now: float) -> None:
         """A worker said hello."""
-        self._workers[identity] = _Worker(max(1, min(credit, MOST_WORKER_CREDIT)), now)
+        self._workers[identity] = _Worker(
+            max(1, min(credit, MOST_WORKER_CREDIT)), Liveness(now, gone_seconds=SILENCE_SECONDS)
+        )
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
@@ -69,7 +72,7 @@ class Workers:
         worker = self._workers.get(identity)
         if worker is None:
             return False
-        worker.last_heard = now
+        worker.liveness.heard(now)
         return True
 
     def rest(self, identity: bytes, now: float) -> None:
@@ -94,7 +97,7 @@ class Workers:
         return self._give_up(
             identity
             for identity, worker in self._workers.items()
-            if not self._leases.held_by(identity) and now - worker.last_heard > SILENCE_SECONDS
+            if not self._leases.held_by(identity) and worker.liveness.is_gone(now)
         )
 
     def for_ordinary_task(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:

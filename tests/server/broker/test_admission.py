@@ -1,4 +1,4 @@
-"""Reception: what a Hello is answered with, and which session comes of it."""
+"""Admission: what a Hello is answered with, and which session comes of it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.admission import MOST_BATCH_SIZE, Reception
+from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
 from v2v_server.broker.quarantine import Quarantine, Verdict
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8
 VERDICTS = [Verdict(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
 
 
-def reception(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Reception:
+def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Admission:
     videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    return Reception(videos, SMALL_SPEC, max_credit_bytes, quarantine or Quarantine())
+    return Admission(videos, SMALL_SPEC, max_credit_bytes, 600.0, quarantine or Quarantine())
 
 
 def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **spec: Any) -> Hello:
@@ -28,11 +28,11 @@ def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **s
 
 
 def test_the_session_is_what_the_answer_says() -> None:
-    session, welcome = reception(quarantine=Quarantine(VERDICTS)).receive(b"c", hello(12, 7, 2, shuffle=False), 3, 5.0)
+    session, welcome = admission(quarantine=Quarantine(VERDICTS)).admit(b"c", hello(12, 7, 2, shuffle=False), 3, 5.0)
     spec = StreamSpec.from_dict(welcome.spec)
     assert (session.spec, spec.shuffle, spec.digest) == (spec, False, welcome.spec_digest)
     assert (session.identity, session.seed, session.arrays, session.batch_size) == (b"c", 7, ("voxels",), 12)
-    assert (session.credit, session.quarantine, session.last_heard) == (welcome.credit, 2, 5.0)
+    assert (session.credit, session.quarantine, session.liveness.silence(7.0)) == (welcome.credit, 2, 2.0)
     assert (session.schedule.count, session.waiting, session.unanswered) == (
         welcome.sequences,
         type(session.waiting)(),
@@ -44,59 +44,59 @@ def test_the_session_is_what_the_answer_says() -> None:
 
 @pytest.mark.parametrize(("batch_size", "workers", "credit"), [(12, 0, 24), (12, 12, 24), (12, 20, 40), (1, 0, 2)])
 def test_credit_keeps_batches_and_workers_busy(batch_size: int, workers: int, credit: int) -> None:
-    assert reception().receive(b"c", hello(batch_size), workers, 0.0)[0].credit == credit
+    assert admission().admit(b"c", hello(batch_size), workers, 0.0)[0].credit == credit
 
 
 @pytest.mark.parametrize(("limit", "credit"), [(SAMPLE_BYTES, 1), (10 * SAMPLE_BYTES - 1, 9), (24 * SAMPLE_BYTES, 24)])
 def test_credit_is_bounded_in_bytes(limit: int, credit: int) -> None:
-    assert reception(limit).receive(b"c", hello(12), 1, 0.0)[0].credit == credit
+    assert admission(limit).admit(b"c", hello(12), 1, 0.0)[0].credit == credit
 
 
 def test_a_sample_that_the_credit_cannot_hold_is_refused() -> None:
     with pytest.raises(UsageError, match=f"one sample is {SAMPLE_BYTES} bytes; .* is {SAMPLE_BYTES - 1}: raise it"):
-        reception(SAMPLE_BYTES - 1).receive(b"c", hello(), 1, 0.0)
+        admission(SAMPLE_BYTES - 1).admit(b"c", hello(), 1, 0.0)
 
 
 def test_the_quarantine_is_the_newest_unless_an_older_one_is_asked_for() -> None:
-    at = reception(quarantine=Quarantine(VERDICTS))
-    received = [at.receive(b"c", hello(quarantine=asked), 1, 0.0) for asked in (None, 0, 1, 3)]
+    at = admission(quarantine=Quarantine(VERDICTS))
+    received = [at.admit(b"c", hello(quarantine=asked), 1, 0.0) for asked in (None, 0, 1, 3)]
     assert [session.quarantine for session, _ in received] == [3, 0, 1, 3]
     assert [welcome.quarantine for _, welcome in received] == [3, 0, 1, 3]
     with pytest.raises(CorpusError, match=r"snapshot 4 was asked for, this server has 0 \.\. 3"):
-        at.receive(b"c", hello(quarantine=4), 1, 0.0)
+        at.admit(b"c", hello(quarantine=4), 1, 0.0)
 
 
 def test_a_stream_from_a_server_that_knows_more_verdicts_is_told_what_to_do() -> None:
     """Perhaps the file is another one; perhaps another server has added to it since this one read it."""
-    at = reception(quarantine=Quarantine(VERDICTS[:1]))
+    at = admission(quarantine=Quarantine(VERDICTS[:1]))
     with pytest.raises(CorpusError) as refused:
-        at.receive(b"c", hello(quarantine=3), 1, 0.0)
+        at.admit(b"c", hello(quarantine=3), 1, 0.0)
     for remedy in (
         "v2v-quarantine --videos DIR",
         "start this server again",
         'set "quarantine" of the saved state to None',
     ):
         assert remedy in str(refused.value)
-    assert at.receive(b"c", hello(quarantine=None), 1, 0.0)[1].quarantine == 1
+    assert at.admit(b"c", hello(quarantine=None), 1, 0.0)[1].quarantine == 1
 
 
 @pytest.mark.parametrize("batch_size", [0, MOST_BATCH_SIZE + 1, 2**64 - 1])
 def test_batch_sizes_are_limited(batch_size: int) -> None:
     with pytest.raises(UsageError, match=f"batch_size = {batch_size}: give 1 to {MOST_BATCH_SIZE}"):
-        reception().receive(b"c", hello(batch_size), 1, 0.0)
+        admission().admit(b"c", hello(batch_size), 1, 0.0)
 
 
 def test_one_table_serves_all_specs_of_a_geometry() -> None:
-    at = reception()
-    of = [at.receive(b"c", each, 1, 0.0)[0].schedule._table for each in (hello(), hello(shuffle=False, seed=3))]
-    other = at.receive(b"c", hello(max_sequences_per_video=3), 1, 0.0)[0].schedule._table
+    at = admission()
+    of = [at.admit(b"c", each, 1, 0.0)[0].schedule._table for each in (hello(), hello(shuffle=False, seed=3))]
+    other = at.admit(b"c", hello(max_sequences_per_video=3), 1, 0.0)[0].schedule._table
     assert of[0] is of[1]
     assert (other.count, of[0].count) == (15, 50)
 
 
 def test_a_refused_hello_may_be_followed_by_a_good_one() -> None:
-    at = reception()
+    at = admission()
     for bad in (hello(colour=1), hello(0), hello(quarantine=1), hello(recipe={"bins": 1000})):
         with pytest.raises(V2VError):
-            at.receive(b"c", bad, 1, 0.0)
-    assert at.receive(b"c", hello(), 1, 0.0)[1].sequences == 50
+            at.admit(b"c", bad, 1, 0.0)
+    assert at.admit(b"c", hello(), 1, 0.0)[1].sequences == 50

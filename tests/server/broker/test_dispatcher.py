@@ -528,7 +528,7 @@ def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
     at.hello()
     at.want(0)
     at.begin(b"w1")
-    at.tick(SILENCE_SECONDS)
+    at.tick(SILENCE_SECONDS - 0.1)
     assert at.given_up == []
     at.tick(0.5)
     assert at.given_up == [b"w2"]
@@ -538,7 +538,7 @@ def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
     # Whoever holds a lease may be silent for as long as that lasts; a word counts, whatever it is.
     at.finish(b"w1")
     at.worker_says(b"w1", Ping())
-    at.tick(SILENCE_SECONDS)
+    at.tick(SILENCE_SECONDS - 0.1)
     assert at.given_up == [b"w2"]
 
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from v2v_protocol.errors import LimitExceeded
+from v2v_protocol.liveness import Liveness
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Task
 from v2v_server.broker.session import Session, Sessions
@@ -31,11 +32,13 @@ class Counted:
 
 def session(identity: bytes = b"a", credit: int = 8, last_heard: float = 0.0) -> Session:
     schedule = cast(Schedule, Counted())
-    return Session(identity, StreamSpec(), 0, ("voxels",), 4, schedule, credit, last_heard)
+    return Session(
+        identity, StreamSpec(), 0, ("voxels",), 4, schedule, credit, Liveness(last_heard, gone_seconds=600.0)
+    )
 
 
 def opened(*sessions: Session) -> Sessions:
-    table = Sessions(idle_seconds=600.0)
+    table = Sessions()
     for each in sessions:
         table.open(each)
     return table
@@ -151,9 +154,9 @@ def test_opening_again_replaces() -> None:
 def test_the_silent_are_idle() -> None:
     a, b = session(b"a", last_heard=0.0), session(b"b", last_heard=100.0)
     sessions = opened(a, b)
-    assert sessions.idle(600.0) == []
-    assert sessions.idle(600.5) == [b"a"]
-    b.last_heard = 0.0
+    assert sessions.idle(599.5) == []
+    assert sessions.idle(600.0) == [b"a"]
+    b.liveness.heard(0.0)
     assert sorted(sessions.idle(601.0)) == [b"a", b"b"]
 
 
@@ -267,7 +270,7 @@ class SessionModel(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.sessions = Sessions(600.0)
+        self.sessions = Sessions()
         self.in_work: list[tuple[Task, Session]] = []
 
     @rule(identity=identities, credit=st.integers(1, 6))

@@ -76,7 +76,7 @@ def test_the_second_worker_of_a_slow_sample_is_told_of_none() -> None:
     at.want(20, arena=ARENA, slots=[5])
     at.begin()
     at.join(b"w2")
-    at.tick(DEADLINE / 2)
+    at.tick(DEADLINE / 3)
     (second,) = at.leases[b"w2"]
     assert second.indices == (20,)
     assert (second.arena, second.slot) == ("", NO_SLOT)

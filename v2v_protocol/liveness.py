@@ -1,0 +1,65 @@
+"""Whether a peer is alive: when it was last heard, when to ask, when it is gone. Pure; times are seconds on the
+caller's clock, which never goes back.
+"""
+
+from __future__ import annotations
+
+import math
+
+
+class Liveness:
+    """What is known of one peer.
+
+    Args:
+        now: the time; the peer counts as heard now.
+        gone_seconds: silence after which the peer is gone; infinite: never.
+        ping_seconds: silence after which the peer is asked whether it lives; infinite: it is never asked.
+        longest_ping_seconds: the wait until it is asked again doubles each time, up to this; by default it stays
+            ``ping_seconds``.
+    """
+
+    __slots__ = ("_ask_at", "_gone_seconds", "_heard", "_longest_wait", "_ping_seconds", "_wait")
+
+    def __init__(
+        self,
+        now: float,
+        *,
+        gone_seconds: float = math.inf,
+        ping_seconds: float = math.inf,
+        longest_ping_seconds: float = 0.0,
+    ) -> None:
+        self._gone_seconds = gone_seconds
+        self._ping_seconds = ping_seconds
+        self._longest_wait = max(ping_seconds, longest_ping_seconds)
+        self.heard(now)
+
+    def heard(self, now: float) -> None:
+        """Something came from the peer."""
+        self._heard = now
+        self._wait = self._ping_seconds
+        self._ask_at = now + self._wait
+
+    def leave_out(self, seconds: float) -> None:
+        """For so long nobody listened: it does not count as silence."""
+        self._heard += seconds
+        self._ask_at += seconds
+
+    def silence(self, now: float) -> float:
+        """Seconds since the peer was heard."""
+        return now - self._heard
+
+    def is_gone(self, now: float) -> bool:
+        """Whether it has been silent for too long."""
+        return self.silence(now) >= self._gone_seconds
+
+    def ping_due(self, now: float) -> bool:
+        """Whether to ask the peer now; whoever is told so asks."""
+        if now < self._ask_at:
+            return False
+        self._wait = min(2 * self._wait, self._longest_wait)
+        self._ask_at = now + self._wait
+        return True
+
+    def next_due(self, now: float) -> float:
+        """Seconds until :meth:`ping_due` or :meth:`is_gone` has something to say, at least 0."""
+        return max(0.0, min(self._ask_at, self._heard + self._gone_seconds) - now)
