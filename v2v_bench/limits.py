@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from v2v_bench import plots
-from v2v_bench.jobs import open_jobs, whole_sample
+from v2v_bench.leases import open_leases, whole_sample
 from v2v_bench.records import at_least, parser_of, recipe_of, run, server_flags, show, write
 from v2v_bench.speed.null_service import null_service
 from v2v_bench.speed.routes import Route, travel
@@ -76,15 +76,15 @@ def made_alone(
     warm_up()
     times: dict[str, tuple[int, float, float]] = {}
     spec = StreamSpec(recipe=recipe)
-    with open_jobs(videos, rows, spec) as (root, leases):
+    with open_leases(videos, rows, spec) as (root, leases):
         times["decode"] = repeated((decode_for(lease, lease.indices, root) for lease in leases), seconds)
-    with open_jobs(videos, rows, spec) as (root, leases):
+    with open_leases(videos, rows, spec) as (root, leases):
         clips = [decode_for(lease, lease.indices, root)[0] for lease in islice(leases, batch_size)]
     turns = (kernel(clips[number % batch_size]) for number in range(sys.maxsize))
     times["kernel"] = repeated(turns, seconds)
-    with open_jobs(videos, rows, spec) as (root, leases):
+    with open_leases(videos, rows, spec) as (root, leases):
         samples = [whole_sample(lease, root) for lease in islice(leases, batch_size)]
-    with open_jobs(videos, rows, spec) as (root, leases):
+    with open_leases(videos, rows, spec) as (root, leases):
         times["sample"] = repeated((whole_sample(lease, root) for lease in leases), seconds)
     nbytes = batch_size * sum(array.nbytes for array in samples[0].arrays.values())
     return [

@@ -2,9 +2,9 @@
 `docs/protocol.md`.
 
     consumer -> server     Hello, Want, Ping, Goodbye
-    server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Refused, Pong
-    worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), JobFailed, Ping, Goodbye
-    server -> worker       Lease, Stop, Refused, Pong
+    server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Denied, Pong
+    worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), LeaseFailed, Ping, Goodbye
+    server -> worker       Lease, Stop, Denied, Pong
 
 Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int
 or str, and Mapping (plain values, checked by whoever knows its form).
@@ -19,7 +19,7 @@ from typing import Any
 
 
 class ErrorCode(StrEnum):
-    """Why the server refused a request."""
+    """Why the server denied a request."""
 
     VERSION = "version"
     MALFORMED = "malformed"
@@ -149,8 +149,8 @@ class Unavailable:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
-    """A request was not accepted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
+class Denied:
+    """A request cannot be granted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
 
     code: str
     text: str
@@ -196,7 +196,7 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
-class JobFailed:
+class LeaseFailed:
     """The lease's video could not give what it promised. ``frame`` and ``reason`` are those of VideoError.
 
     Attributes:
@@ -274,6 +274,6 @@ class Stop:
 
 
 Message = (
-    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Refused | Pong
-    | WorkerHello | Begun | Result | JobFailed | Lease | Stop
+    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Denied | Pong
+    | WorkerHello | Begun | Result | LeaseFailed | Lease | Stop
 )  # fmt: skip

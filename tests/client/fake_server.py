@@ -18,7 +18,7 @@ import zmq
 
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import UsageError
-from v2v_protocol.messages import ErrorCode, Goodbye, Hello, Message, Ping, Pong, Refused, Unavailable, Want, Welcome
+from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, Unavailable, Want, Welcome
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -75,7 +75,7 @@ class FakeServer:
         self.catalogue = "catalogue-1"
         self.sequences = sequences
         self.credit = credit
-        self.refusal: Refused | None = None
+        self.refusal: Denied | None = None
         self.shuffled = False
         self.held = False
         self.mute = False
@@ -212,7 +212,7 @@ class FakeServer:
         elif isinstance(message, Ping):
             self._send(identity, encode(Pong()))
         elif session is None:
-            self._send(identity, encode(Refused(ErrorCode.UNKNOWN_SESSION, "say Hello again")))
+            self._send(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "say Hello again")))
         elif isinstance(message, Want):
             self._want(identity, session, message)
 
@@ -222,7 +222,7 @@ class FakeServer:
         try:
             spec = StreamSpec.from_dict(hello.spec, default=self.spec)
         except UsageError as error:
-            return Refused(ErrorCode.SPEC, str(error))
+            return Denied(ErrorCode.SPEC, str(error))
         self._sessions[identity] = _Session(hello, spec)
         return Welcome(spec.to_dict(), spec.digest, self.catalogue, 1, self.sequences, self.credit + self.overstated)
 
@@ -237,13 +237,13 @@ class FakeServer:
                 if self.arenas[-1:] != [arena]:
                     self.arenas.append(arena)
         if any(index >= self.sequences for index in want.indices):
-            self._send(identity, encode(Refused(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
+            self._send(identity, encode(Denied(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
             return
         unanswered = session.unanswered | dict.fromkeys(asked)
         if len(unanswered) > self.credit or (repeats and self.refuse_repeat):
             self.refuse_repeat = False
             self.refused_for_credit += 1
-            self._send(identity, encode(Refused(ErrorCode.CREDIT, f"{len(unanswered)} of {self.credit}")))
+            self._send(identity, encode(Denied(ErrorCode.CREDIT, f"{len(unanswered)} of {self.credit}")))
             return
         session.unanswered = unanswered
         self.most_unanswered = max(self.most_unanswered, len(unanswered))

@@ -27,7 +27,7 @@ from v2v_client import (
 )
 from v2v_client.session.liveness import Patience
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.messages import Refused
+from v2v_protocol.messages import Denied
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.wire import decode, decode_map, encode, encode_map
@@ -529,7 +529,7 @@ def test_nobody_there_is_given_up():
 
 
 def test_a_refusal_says_what_the_server_said(server):
-    server.refusal = Refused("spec", "no video gives 5 frames")
+    server.refusal = Denied("spec", "no video gives 5 frames")
     with pytest.raises(RemoteError, match="no video gives 5 frames") as caught:
         next(iter(dataset(server)))
     assert caught.value.code == "spec"

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests.protocol.wire_messages import MESSAGES, WRONG, example, messages
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.messages import Goodbye, Hello, Lease, Ping, Refused, SampleHeader, Want
+from v2v_protocol.messages import Denied, Goodbye, Hello, Lease, Ping, SampleHeader, Want
 from v2v_protocol.wire import (
     ARRAY_DTYPES,
     LARGEST_ARRAY_BYTES,
@@ -215,7 +215,7 @@ def test_nothing_may_follow_a_message() -> None:
 
 def test_extension_types_and_bad_text_are_refused() -> None:
     for value in (msgpack.Timestamp(1, 2), msgpack.ExtType(5, b"x")):
-        refuse({"v": PROTOCOL_VERSION, "t": "refused", "code": value, "text": ""}, match="code: expected str")
+        refuse({"v": PROTOCOL_VERSION, "t": "denied", "code": value, "text": ""}, match="code: expected str")
         refuse({"v": value, "t": "ping"}, VersionMismatch)
     with pytest.raises(ProtocolError, match="UnicodeDecodeError"):
         decode(V + b"\xa1t\xa2\xff\xfe")
@@ -227,13 +227,13 @@ def test_extension_types_and_bad_text_are_refused() -> None:
 def test_an_oversize_header_is_refused_unread() -> None:
     with pytest.raises(LimitExceeded, match=f"{LARGEST_HEADER_BYTES + 1} bytes; the limit is {LARGEST_HEADER_BYTES}"):
         decode(bytes(LARGEST_HEADER_BYTES + 1))
-    with pytest.raises(LimitExceeded, match=r"a refused header of .* the limit is"):
-        encode(Refused("malformed", "x" * LARGEST_HEADER_BYTES))
+    with pytest.raises(LimitExceeded, match=r"a denied header of .* the limit is"):
+        encode(Denied("malformed", "x" * LARGEST_HEADER_BYTES))
 
 
 def test_the_largest_header_passes() -> None:
-    room = LARGEST_HEADER_BYTES - len(encode(Refused("", "x" * 100_000))[0]) + 100_000
-    message = Refused("", "x" * room)
+    room = LARGEST_HEADER_BYTES - len(encode(Denied("", "x" * 100_000))[0]) + 100_000
+    message = Denied("", "x" * room)
     assert len(encode(message)[0]) == LARGEST_HEADER_BYTES
     assert decode(encode(message)[0]) == message
 

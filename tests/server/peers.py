@@ -13,11 +13,11 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     Hello,
-    JobFailed,
     Lease,
+    LeaseFailed,
     Message,
-    Refused,
     Result,
     SampleHeader,
     Unavailable,
@@ -219,7 +219,7 @@ class Peers:
         self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7, *, here: bool = False
     ) -> Lease:
         lease = self.leases[identity].popleft()
-        self.worker_says(identity, JobFailed(lease.lease, frame, reason, here))
+        self.worker_says(identity, LeaseFailed(lease.lease, frame, reason, here))
         return lease
 
     def die(self, identity: bytes = b"w", cause: Cause = Cause.KILLED, text: str = "died") -> list[Lease]:
@@ -243,8 +243,8 @@ class Peers:
     def unavailable(self, identity: bytes = b"c") -> list[Unavailable]:
         return [message for message in self.heard.get(identity, []) if isinstance(message, Unavailable)]
 
-    def refusals(self, identity: bytes = b"c") -> list[Refused]:
-        return [message for message in self.heard.get(identity, []) if isinstance(message, Refused)]
+    def refusals(self, identity: bytes = b"c") -> list[Denied]:
+        return [message for message in self.heard.get(identity, []) if isinstance(message, Denied)]
 
 
 def peers(

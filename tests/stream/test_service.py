@@ -20,7 +20,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of, server_workers
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_protocol import PROTOCOL_VERSION
-from v2v_protocol.messages import Hello, Ping, Pong, Refused, Want, Welcome
+from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.cli import serve
 
@@ -47,7 +47,7 @@ def test_garbage_on_the_port_disturbs_nobody(raw: tuple[zmq.Socket[bytes], str])
         plain.sendall(os.urandom(4096))
     for frames in ([b""], [b"\xc1" * 50], [random.Random(0).randbytes(1000)], [b"a", b"b", b"c"], [encode(Pong())[0]]):
         answer = _ask(dealer, *map(bytes, frames))
-        assert isinstance(answer, Refused)
+        assert isinstance(answer, Denied)
         assert answer.code == "malformed"
     assert _ask(dealer, bytes(encode(Ping())[0])) == Pong()
     assert len(epoch_of(address)) == 8
@@ -59,7 +59,7 @@ def test_another_protocol_version_is_told_both_numbers(raw: tuple[zmq.Socket[byt
     other = ping.replace(b"\xa1v" + bytes([PROTOCOL_VERSION]), b"\xa1v\x63")
     assert other != ping
     answer = _ask(dealer, other)
-    assert isinstance(answer, Refused)
+    assert isinstance(answer, Denied)
     assert answer.code == "version"
     assert "99" in answer.text
     assert str(PROTOCOL_VERSION) in answer.text
@@ -71,10 +71,10 @@ def test_a_refused_want_changes_nothing(raw: tuple[zmq.Socket[bytes], str]) -> N
     welcome = _ask(dealer, *map(bytes, encode(hello)))
     assert isinstance(welcome, Welcome)
     too_many = _ask(dealer, *map(bytes, encode(Want(0, tuple(range(welcome.credit + 1))))))
-    assert isinstance(too_many, Refused)
+    assert isinstance(too_many, Denied)
     assert too_many.code == "credit"
     outside = _ask(dealer, *map(bytes, encode(Want(0, (welcome.sequences,)))))
-    assert isinstance(outside, Refused)
+    assert isinstance(outside, Denied)
     assert outside.code == "range"
     dealer.send_multipart(encode(Want(0, (0,))))
     assert len(dealer.recv_multipart()) == 2

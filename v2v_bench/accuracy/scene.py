@@ -36,8 +36,8 @@ from v2v_bench.records import Column, Record, recipe_of, say_missed, show, write
 from v2v_protocol.errors import UsageError, V2VError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.look import look
 from v2v_server.flow import FlowSettings, flow_for, view_part
@@ -137,9 +137,9 @@ def measure(catalogue: Catalogue, off: StreamSpec, auto: StreamSpec, most: int) 
         if taken[sequence.video.id] > most:
             continue
         leases = [
-            describe(
-                Task(b"", 0, rank), number=1, sequence=sequence, quarantine=0, catalogue=catalogue, spec=spec, seed=0,
-                arrays=("voxels", "flow"), deadline_seconds=60.0,
+            lease_for(
+                Request(b"", 0, rank), sequence=sequence, catalogue=catalogue, spec=spec, seed=0,
+                arrays=("voxels", "flow"),
             )
             for spec in (off, auto)
         ]  # fmt: skip

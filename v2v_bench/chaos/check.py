@@ -30,8 +30,8 @@ from typing import Any
 from v2v_bench.chaos.consumer import Profile, log_path, profile
 from v2v_bench.chaos.log import BatchLine, Line, OrderVerdict, Sighting, Sightings, check_order, read_log, sighting
 from v2v_protocol.errors import V2VError, VideoError
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
@@ -87,16 +87,13 @@ class StreamOracle:
         Raises:
             VideoError: the candidate cannot give it.
         """
-        lease = describe(
-            Task(b"", epoch, sample.index, sample.candidate, sample.refusals),
-            number=1,
+        lease = lease_for(
+            Request(b"", epoch, sample.index, sample.candidate, sample.refusals, snapshot=sample.quarantine),
             sequence=self.sequence(epoch, sample.index, sample.candidate),
-            quarantine=sample.quarantine,
             catalogue=self._catalogue,
             spec=self._spec,
             seed=self._asked.seed,
             arrays=("voxels", "frames"),
-            deadline_seconds=60.0,
         )
         made = make_sample(lease, decode_for(lease, lease.indices, self._catalogue.root)[0])
         return sighting(made.arrays, made.provenance)

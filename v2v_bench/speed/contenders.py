@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 from torch.utils.data import DataLoader
 
-from v2v_bench.jobs import open_jobs
+from v2v_bench.leases import open_leases
 from v2v_bench.speed.released import ReleasedStyleDataset
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -162,7 +162,7 @@ def _decode(corpus: Corpus, setting: Setting) -> Measured:
 
 
 def _decode_jobs(corpus: Corpus, workers: int, number: int, count: Any, stop: Event) -> None:
-    with open_jobs(corpus.videos, corpus.rows, StreamSpec()) as (root, leases):
+    with open_leases(corpus.videos, corpus.rows, StreamSpec()) as (root, leases):
         for lease in itertools.islice(leases, number, None, workers):
             if stop.is_set():
                 return

@@ -25,13 +25,13 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, V2VError
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     ErrorCode,
     Goodbye,
     Lease,
     Message,
     Ping,
     Pong,
-    Refused,
     Result,
     Stop,
     WorkerHello,
@@ -133,11 +133,11 @@ class NullWorkers:
                 self._poller.unregister(link)
                 del self._names[link]
                 self._leases.pop(link, None)
-            case Refused(ErrorCode.UNKNOWN_SESSION):
+            case Denied(ErrorCode.UNKNOWN_SESSION):
                 self._leases.pop(link, None)
                 self._begun.pop(link, None)
                 self._say_hello(link)
-            case Refused(code, text):
+            case Denied(code, text):
                 raise RemoteError(code, text)
             case _:
                 pass

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_bench import plots
-from v2v_bench.jobs import open_jobs
+from v2v_bench.leases import open_leases
 from v2v_bench.records import parser_of, recipe_of, run, say_missed, server_flags, show, write
 from v2v_bench.speed.null_service import null_service
 from v2v_bench.speed.routes import Route, missing, travel
@@ -74,7 +74,7 @@ _COLUMNS = (
 def some_samples(videos: Path, rows: str, recipe: Recipe, count: int) -> list[Sample]:
     """Samples as the server makes them, at most as many as an epoch has."""
     warm_up()
-    with open_jobs(videos, rows, StreamSpec(recipe=recipe)) as (root, leases):
+    with open_leases(videos, rows, StreamSpec(recipe=recipe)) as (root, leases):
         clips = Clips(root)
         return [make_sample(lease, clips.take(lease)[0]) for lease in itertools.islice(leases, count)]
 

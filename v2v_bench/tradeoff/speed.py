@@ -18,8 +18,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -89,9 +89,9 @@ def leases_of(
     for place in (number * table.count // count for number in range(count)):
         index, *siblings = range(place * VIEWS, (place + 1) * VIEWS)
         made.append(
-            describe(
-                Task(b"", 0, index), number=1, sequence=schedule.candidate(0, 0, index, 0), quarantine=0,
-                catalogue=catalogue, spec=spec, seed=0, arrays=arrays, deadline_seconds=60.0, siblings=tuple(siblings),
+            lease_for(
+                Request(b"", 0, index), sequence=schedule.candidate(0, 0, index, 0),
+                catalogue=catalogue, spec=spec, seed=0, arrays=arrays, siblings=tuple(siblings),
             )
         )  # fmt: skip
     return tuple(made)

@@ -36,13 +36,13 @@ from v2v_client.session.liveness import Due, Liveness, Patience
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.messages import (
+    Denied,
     ErrorCode,
     Goodbye,
     Hello,
     Message,
     Ping,
     Pong,
-    Refused,
     SampleHeader,
     Unavailable,
     Want,
@@ -295,16 +295,16 @@ class Connection:
                 pass
             case Welcome():
                 self._welcomed(message)
-            case Refused(code=ErrorCode.UNKNOWN_SESSION):
+            case Denied(code=ErrorCode.UNKNOWN_SESSION):
                 # Every request that was under way is refused: one Hello answers them all.
                 if self._welcome_due is None:
                     self._begin_hello()
-            case Refused(code=ErrorCode.CREDIT) if self._may_exceed_credit():
+            case Denied(code=ErrorCode.CREDIT) if self._may_exceed_credit():
                 # It makes again what it had sent, on the way to us, when we asked again. What it refused stays asked
                 # for, in our account, and goes out again with the rest when such a sample comes, or when all is quiet.
                 self._credit_refusals += 1
                 self._owed = True
-            case Refused():
+            case Denied():
                 raise RemoteError(message.code, f"{self._address} refused: {message.text}")
             case Unavailable():
                 if message.epoch == self._epoch and message.index in self._asked:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from v2v_protocol.messages import ErrorCode, Refused
+from v2v_protocol.messages import Denied, ErrorCode
 from v2v_protocol.wire import Frames, encode
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict
 
 _LONGEST_TEXT = 2000
-"""Characters of a refusal: it quotes what the peer sent, which may be long, and must itself fit a header."""
+"""Characters of a denial: it quotes what the peer sent, which may be long, and must itself fit a header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,11 @@ class Record:
 
     Attributes:
         verdict: not numbered yet.
-        task: whose candidate it refuses.
+        request: whose candidate it refuses.
     """
 
     verdict: Verdict
-    task: Task
+    request: Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class LookFor:
         video, fingerprint: of the file.
         identity: the worker.
         frame, reason: what the worker said.
-        task: what it was to make of it.
+        request: what it was to make of it.
     """
 
     video: str
@@ -68,12 +68,12 @@ class LookFor:
     identity: bytes
     frame: int | None
     reason: str
-    task: Task
+    request: Request
 
 
 Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor
 
 
-def refusal(code: ErrorCode, text: str) -> Frames:
-    """A Refused message that is short enough whatever the text quotes."""
-    return encode(Refused(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
+def denial(code: ErrorCode, text: str) -> Frames:
+    """A Denied message that is short enough whatever the text quotes."""
+    return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))

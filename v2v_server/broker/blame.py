@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 
 ALONE_AFTER = 2
 """Unexplained deaths after which a sample runs alone."""
@@ -45,19 +45,19 @@ class Loss:
     lease: int | None = None
 
 
-def runs_alone(task: Task) -> bool:
-    """Whether the task must have its worker to itself."""
-    return task.deaths >= ALONE_AFTER
+def runs_alone(request: Request) -> bool:
+    """Whether the request must have its worker to itself."""
+    return request.deaths >= ALONE_AFTER
 
 
-def judged(task: Task, loss: Loss) -> Task | str:
-    """The verdict on a task that was begun when its worker was lost.
+def judged(request: Request, loss: Loss) -> Request | str:
+    """The verdict on a request that was begun when its worker was lost.
 
     Returns:
-        the task to try again, or the reason why its candidate is refused.
+        the request to try again, or the reason why its candidate is refused.
     """
     if loss.cause is Cause.KILLED:
-        return task
-    if loss.cause is Cause.UNEXPLAINED and not runs_alone(task):
-        return replace(task, deaths=task.deaths + 1)
+        return request
+    if loss.cause is Cause.UNEXPLAINED and not runs_alone(request):
+        return replace(request, deaths=request.deaths + 1)
     return f"a worker {loss.text} over it"

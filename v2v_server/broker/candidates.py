@@ -1,7 +1,7 @@
-"""Candidates: which sequence a task is made from, and what moves it on to the next one. No I/O; time is passed in.
+"""Candidates: which sequence a request is made from, and what moves it on to the next one. No I/O; time is passed in.
 
 A candidate is refused because its video failed, because a worker died of it (a verdict, which is written down first),
-or because the quarantine has a verdict already. What was refused travels with the task into the sample's provenance.
+or because the quarantine has a verdict already. What was refused travels with the request into the sample's provenance.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from v2v_protocol.sample import Refusal
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import Instruction, Record, ToConsumer
 from v2v_server.broker.counters import Counters
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import MOST_CANDIDATES
@@ -25,10 +25,10 @@ LONGEST_REASON = 500
 
 
 class Candidates:
-    """Moves tasks from candidate to candidate.
+    """Moves requests from candidate to candidate.
 
     Args:
-        sessions: the consumers; a task of one that is gone needs nothing more.
+        sessions: the consumers; a request of one that is gone needs nothing more.
         quarantine: the snapshots.
         counters: of the dispatcher.
         wall_clock: gives the time for a verdict, ISO 8601.
@@ -48,75 +48,77 @@ class Candidates:
         taken, self._refusals = self._refusals, []
         return taken
 
-    def current(self, task: Task, session: Session) -> Task:
-        """The task under its session's snapshot.
+    def current(self, request: Request, session: Session) -> Request:
+        """The request under its session's snapshot.
 
         Under another snapshot than before others may be passed over: it begins at the first candidate again, as
         whoever makes the sample again does.
         """
-        if task.snapshot == session.quarantine:
-            return task
-        deaths = 0 if task.candidate else task.deaths
-        return replace(task, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
+        if request.snapshot == session.quarantine:
+            return request
+        deaths = 0 if request.candidate else request.deaths
+        return replace(request, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
 
-    def sequence(self, session: Session, task: Task) -> Sequence:
-        """What the task's candidate is made from."""
-        return session.schedule.candidate(session.seed, task.epoch, task.index, task.candidate)
+    def sequence(self, session: Session, request: Request) -> Sequence:
+        """What the request's candidate is made from."""
+        return session.schedule.candidate(session.seed, request.epoch, request.index, request.candidate)
 
-    def quarantined(self, session: Session, task: Task, snapshot: int) -> str | None:
-        """Why the task's candidate is refused under a snapshot; None when it is not."""
-        sequence = self.sequence(session, task)
+    def quarantined(self, session: Session, request: Request, snapshot: int) -> str | None:
+        """Why the request's candidate is refused under a snapshot; None when it is not."""
+        sequence = self.sequence(session, request)
         video = sequence.video
         return self._quarantine.refusal(snapshot, video.id, video.fingerprint, sequence.start_frame)
 
-    def condemn(self, task: Task, reason: str) -> list[Instruction]:
-        """The task's candidate brought its worker down: a verdict, unless there is one already."""
-        session = self._sessions.get(task.session)
+    def condemn(self, request: Request, reason: str) -> list[Instruction]:
+        """The request's candidate brought its worker down: a verdict, unless there is one already."""
+        session = self._sessions.get(request.session)
         if session is None:
             return []
-        if self.quarantined(session, task, self._quarantine.latest) is not None:
-            return self.refuse_condemned(task, reason)
-        sequence = self.sequence(session, task)
+        if self.quarantined(session, request, self._quarantine.latest) is not None:
+            return self.refuse_condemned(request, reason)
+        sequence = self.sequence(session, request)
         video, text = sequence.video, reason[:LONGEST_REASON]
-        return [Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), task)]
+        return [
+            Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), request)
+        ]
 
-    def refuse_condemned(self, task: Task, reason: str) -> list[Instruction]:
-        """On to the next candidate: by the quarantine if the task's snapshot has the verdict, which says the same to
+    def refuse_condemned(self, request: Request, reason: str) -> list[Instruction]:
+        """On to the next candidate: by the quarantine if the request's snapshot has the verdict, which says the same to
         whoever makes the sample again; else by what happened."""
-        session = self._sessions.get(task.session)
+        session = self._sessions.get(request.session)
         if session is None:
             return []
-        if self.quarantined(session, task, session.quarantine) is None:
-            return self.refuse(task, None, reason)
-        self._sessions.put_back(replace(task, deaths=0))
+        if self.quarantined(session, request, session.quarantine) is None:
+            return self.refuse(request, None, reason)
+        self._sessions.put_back(replace(request, deaths=0))
         return []
 
-    def refuse(self, task: Task, frame: int | None, reason: str, *, log: bool = True) -> list[Instruction]:
-        """The task's candidate cannot be used: on to the next, or to the consumer with the whole story."""
-        session = self._sessions.get(task.session)
+    def refuse(self, request: Request, frame: int | None, reason: str, *, log: bool = True) -> list[Instruction]:
+        """The request's candidate cannot be used: on to the next, or to the consumer with the whole story."""
+        session = self._sessions.get(request.session)
         if session is None:
             return []
         self._counters.refused_candidates += 1
-        passed_over = next_candidate(task, self.sequence(session, task).video.id, frame, reason)
+        passed_over = next_candidate(request, self.sequence(session, request).video.id, frame, reason)
         if log:
             self._refusals.append(passed_over.refusals[-1])
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return []
-        if not self._sessions.answered(task, 0.0):
+        if not self._sessions.answered(request, 0.0):
             return []
         self._counters.unavailable += 1
         text = "; ".join(map(str, passed_over.refusals))
-        return [ToConsumer(task.session, encode(Unavailable(task.epoch, task.index, text)))]
+        return [ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
 
 
-def next_candidate(task: Task, video: str, frame: int | None, reason: str) -> Task:
-    """The task at its next candidate.
+def next_candidate(request: Request, video: str, frame: int | None, reason: str) -> Request:
+    """The request at its next candidate.
 
     Args:
-        task: at the one that is refused.
+        request: at the one that is refused.
         video: id of that candidate's video.
         frame, reason: what is wrong with it, see :class:`v2v_protocol.sample.Refusal`.
     """
-    refused = Refusal(task.candidate, video, frame, reason[:LONGEST_REASON])
-    return replace(task, candidate=task.candidate + 1, refusals=(*task.refusals, refused))
+    refused = Refusal(request.candidate, video, frame, reason[:LONGEST_REASON])
+    return replace(request, candidate=request.candidate + 1, refusals=(*request.refusals, refused))

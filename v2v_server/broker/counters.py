@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 
@@ -46,23 +45,3 @@ class Counters:
     def faults(self) -> int:
         """Everything that went wrong and was survived."""
         return self.refused_candidates + self.unavailable + self.workers_lost + self.missing_videos + self.malformed
-
-
-class Rate:
-    """Events a second over the last few seconds.
-
-    Args:
-        window_seconds: how far back it looks.
-    """
-
-    def __init__(self, window_seconds: float) -> None:
-        self._window_seconds = window_seconds
-        self._points: deque[tuple[float, float]] = deque()
-
-    def update(self, now: float, total: float) -> float:
-        """Notes the running total and returns the rate since the window's beginning (0.0 before two notes)."""
-        self._points.append((now, total))
-        while len(self._points) > 2 and now - self._points[0][0] > self._window_seconds:
-            self._points.popleft()
-        (then, before), (_, after) = self._points[0], self._points[-1]
-        return (after - before) / (now - then) if now > then else 0.0

@@ -16,14 +16,14 @@ from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     ErrorCode,
     Goodbye,
     Hello,
-    JobFailed,
+    LeaseFailed,
     Message,
     Ping,
     Pong,
-    Refused,
     Result,
     SampleHeader,
     Stop,
@@ -33,16 +33,15 @@ from v2v_protocol.messages import (
 from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
-from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, refusal
+from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters
-from v2v_server.broker.inspection import inspected
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import LeaseBook, Task
+from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
 from v2v_server.broker.session import Session, Sessions
+from v2v_server.broker.terms import inspected, lease_for
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
 from v2v_server.catalogue.catalogue import Catalogue
 
@@ -90,7 +89,7 @@ class Dispatcher:
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self._leases = LeaseBook(lease_deadline_seconds)
         self._workers = Workers(self._leases)
-        self._lone: deque[Task] = deque()
+        self._lone: deque[Request] = deque()
 
     @property
     def workers(self) -> int:
@@ -106,7 +105,7 @@ class Dispatcher:
         """The candidates that failed since the last call, for the log."""
         return self._candidates.take_refusals()
 
-    # --- consumers ----------------------------------------------------------------------------------------------------
+    # --- consumers ---------------------------------------------------------------------------------------------------
 
     def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Instruction]:
         """A message from the consumers' side."""
@@ -127,7 +126,7 @@ class Dispatcher:
                 return []
             case Want():
                 if session is None:
-                    return [_refuse(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
+                    return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 return self._want(session, message) or self._assign(now)
             case _:
                 stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
@@ -137,16 +136,16 @@ class Dispatcher:
         """The consumer left, or cannot be reached any more."""
         self.sessions.forget(identity)
         self._leases.forget_session(identity)
-        self._lone = deque(task for task in self._lone if task.session != identity)
+        self._lone = deque(request for request in self._lone if request.session != identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float) -> Instruction:
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
-            return _refuse(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
+            return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
             workers = max(len(self._workers), self._expected_workers)
             session, welcome = self._admission.admit(identity, hello, workers, now)
         except (UsageError, CorpusError) as error:
-            return _refuse(identity, ErrorCode.SPEC, str(error))
+            return _deny(identity, ErrorCode.SPEC, str(error))
         self.consumer_lost(identity)
         self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
@@ -161,17 +160,17 @@ class Dispatcher:
                 SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
             self.sessions.want(session, want.epoch, want.indices, slots)
         except LimitExceeded as error:
-            return [_refuse(session.identity, ErrorCode.CREDIT, str(error))]
+            return [_deny(session.identity, ErrorCode.CREDIT, str(error))]
         except (IndexError, UsageError) as error:
-            return [_refuse(session.identity, ErrorCode.RANGE, str(error))]
+            return [_deny(session.identity, ErrorCode.RANGE, str(error))]
         return []
 
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1
         code = ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED
-        return refusal(code, str(error))
+        return denial(code, str(error))
 
-    # --- workers ------------------------------------------------------------------------------------------------------
+    # --- workers -----------------------------------------------------------------------------------------------------
 
     def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Instruction]:
         """A message from the workers' side. The frames behind a Result are passed on as they are."""
@@ -182,15 +181,15 @@ class Dispatcher:
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now)
         if not self._workers.heard(identity, now):
-            return [ToWorker(identity, encode(Refused(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
+            return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
             case Begun(lease):
                 self._leases.begun(lease, identity, now)
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
-            case JobFailed():
-                return self._job_failed(identity, message, now)
+            case LeaseFailed():
+                return self._lease_failed(identity, message, now)
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
             case Goodbye():
@@ -225,7 +224,7 @@ class Dispatcher:
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self._candidates.refuse_condemned(record.task, record.verdict.reason), *self._assign(now)]
+        return [*self._candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
 
     def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Instruction]:
         """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
@@ -236,10 +235,10 @@ class Dispatcher:
             now: the time.
         """
         if not found:
-            return [*self._candidates.refuse(missing.task, missing.frame, missing.reason), *self._assign(now)]
+            return [*self._candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
         self.counters.missing_videos += 1
         self._workers.rest(missing.identity, now)
-        self.sessions.put_back(missing.task)
+        self.sessions.put_back(missing.request)
         return self._assign(now)
 
     def tick(self, now: float) -> list[Instruction]:
@@ -252,12 +251,12 @@ class Dispatcher:
             instructions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
         for identity in self._workers.vanished(now):
             instructions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
-        for task, worker in self._leases.slow(now):
-            second = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone), other_than=worker)
-            if second is not None and not runs_alone(task):
+        for request, worker in self._leases.slow(now):
+            second = self._workers.for_request(keep_one_empty=bool(self._lone), other_than=worker)
+            if second is not None and not runs_alone(request):
                 self.counters.second_leases += 1
-                instructions += self._grant(replace(task, slot=None), second, now)
-        # A consumer that left may have freed a worker that was kept for it, or for its tasks.
+                instructions += self._grant(replace(request, slot=None), second, now)
+        # A consumer that left may have freed a worker that was kept for it, or for its requests.
         return instructions + self._assign(now)
 
     def stop_workers(self) -> list[Instruction]:
@@ -269,49 +268,49 @@ class Dispatcher:
         instructions = self._take_back(identity, again, now) if identity in self._workers else []
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
-            return [ToWorker(identity, encode(Refused(ErrorCode.VERSION, text))), *instructions]
+            return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *instructions]
         if len(self._workers) >= MOST_WORKERS:
             text = f"this server has {MOST_WORKERS} workers, its limit"
-            return [ToWorker(identity, refusal(ErrorCode.BUSY, text)), *instructions]
+            return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *instructions]
         self._workers.add(identity, hello.credit, now)
         return instructions + self._assign(now)
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
-        task = self._leases.task(result.lease, identity)
-        session = None if task is None else self.sessions.get(task.session)
+        request = self._leases.request(result.lease, identity)
+        session = None if request is None else self.sessions.get(request.session)
         instructions: list[Instruction] = []
         decoded = True
-        if task is None or session is None:
+        if request is None or session is None:
             self.counters.late_results += 1
         else:
             try:
-                header = inspected(payload, task, session.form)
+                header = inspected(payload, request, session.form)
             except ProtocolError as error:
                 # No worker of ours does this, and one that did it once would do it again.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
-            if self._count(session, task, header, in_slot=len(payload) == 1):
-                instructions.append(ToConsumer(task.session, payload))
+            if self._count(session, request, header, in_slot=len(payload) == 1):
+                instructions.append(ToConsumer(request.session, payload))
         self._leases.finished(result.lease, identity, now, decoded=decoded)
         self._leases.begun(result.begins, identity, now)
         return instructions + self._assign(now)
 
-    def _job_failed(self, identity: bytes, failed: JobFailed, now: float) -> list[Instruction]:
-        task = self._leases.finished(failed.lease, identity, now)
-        session = None if task is None else self.sessions.get(task.session)
-        if task is None or session is None:
+    def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Instruction]:
+        request = self._leases.finished(failed.lease, identity, now)
+        session = None if request is None else self.sessions.get(request.session)
+        if request is None or session is None:
             return self._assign(now)
         if not failed.here:
-            return [*self._candidates.refuse(task, failed.frame, failed.reason), *self._assign(now)]
+            return [*self._candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
         # The catalogue is of this host's files: if the video is here, other workers can have it too.
-        video = self._candidates.sequence(session, task).video
-        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, task)]
+        video = self._candidates.sequence(session, request).video
+        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
 
-    def _count(self, session: Session, task: Task, header: SampleHeader, *, in_slot: bool) -> bool:
+    def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""
         cpu_seconds = min(max(header.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
-        if not self.sessions.answered(task, cpu_seconds):
+        if not self.sessions.answered(request, cpu_seconds):
             self.counters.late_results += 1
             return False
         self.counters.samples += 1
@@ -327,63 +326,62 @@ class Dispatcher:
         instructions: list[Instruction] = []
         returned = self._leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
-        for task, begun in reversed(returned):
-            verdict = judged(task, loss) if begun else task
-            if isinstance(verdict, Task):
+        for request, begun in reversed(returned):
+            verdict = judged(request, loss) if begun else request
+            if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                instructions += self._candidates.condemn(task, verdict)
+                instructions += self._candidates.condemn(request, verdict)
         return instructions + self._assign(now)
 
-    # --- tasks --------------------------------------------------------------------------------------------------------
+    # --- requests ----------------------------------------------------------------------------------------------------
 
     def _assign(self, now: float) -> list[Instruction]:
-        """Gives waiting tasks to workers, until there is no task or no room."""
+        """Gives waiting requests to workers, until there is no request or no room."""
         instructions: list[Instruction] = []
         while True:
             if self._lone:
-                empty = self._workers.for_lone_task()
+                empty = self._workers.for_lone_request()
                 if empty is not None:
                     instructions += self._give([self._lone.popleft()], empty, now)
                     continue
-            worker = self._workers.for_ordinary_task(keep_one_empty=bool(self._lone))
-            task = self.sessions.next_task() if worker is not None else None
-            if worker is None or task is None:
+            worker = self._workers.for_request(keep_one_empty=bool(self._lone))
+            request = self.sessions.next_request() if worker is not None else None
+            if worker is None or request is None:
                 return instructions
-            if runs_alone(task):
-                self._lone.append(task)
+            if runs_alone(request):
+                self._lone.append(request)
             else:
-                instructions += self._give([task, *self.sessions.take_siblings(task)], worker, now)
+                instructions += self._give([request, *self.sessions.take_siblings(request)], worker, now)
 
-    def _give(self, tasks: list[Task], worker: bytes, now: float) -> list[Instruction]:
-        """Gives a worker the tasks of one clip, except those whose candidate is in quarantine."""
-        session = self.sessions.get(tasks[0].session)
+    def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Instruction]:
+        """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
+        session = self.sessions.get(requests[0].session)
         if session is None:
             return []
         instructions: list[Instruction] = []
-        good: list[Task] = []
-        for task in tasks:
-            current = self._candidates.current(task, session)
+        good: list[Request] = []
+        for request in requests:
+            current = self._candidates.current(request, session)
             quarantined = self._candidates.quarantined(session, current, session.quarantine)
             if quarantined is None:
                 good.append(current)
             else:
                 instructions += self._candidates.refuse(current, None, quarantined, log=False)
-        for place, task in enumerate(good):
-            instructions += self._grant(task, worker, now, tuple(other.index for other in good[place + 1 :]))
+        for place, request in enumerate(good):
+            instructions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
         return instructions
 
-    def _grant(self, task: Task, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Instruction]:
-        session = self.sessions.get(task.session)
+    def _grant(self, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Instruction]:
+        session = self.sessions.get(request.session)
         if session is None:
             return []
-        number = self._leases.grant(task, worker, now)
+        number = self._leases.grant(request, worker, now)
         try:
-            lease = describe(
-                task,
+            lease = lease_for(
+                request,
                 number=number,
-                sequence=self._candidates.sequence(session, task),
-                quarantine=task.snapshot,
+                sequence=self._candidates.sequence(session, request),
                 catalogue=self._catalogue,
                 spec=session.spec,
                 seed=session.seed,
@@ -421,5 +419,5 @@ def _slots(want: Want) -> list[Slot | None]:
     return [Slot(arena, number) if arena else None for arena, number in zip(want.arenas, want.slots, strict=True)]
 
 
-def _refuse(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
-    return ToConsumer(identity, refusal(code, text))
+def _deny(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
+    return ToConsumer(identity, denial(code, text))

@@ -4,9 +4,9 @@
                  ^                                 |                 |
                  `------- returned to its session -+-----------------'   worker lost
 
-A task is one asked sample. Every grant gets a new number, so an answer to a lease that was taken away is recognised by
-its number and dropped. A task that takes much longer than its consumer's others is given to a second worker as well;
-the first answer retires its twin.
+A request is one sample that a consumer asked for. Every grant gives it a lease with a new number, so an answer to a
+lease that was taken away is recognised by its number and dropped. A request that takes much longer than its consumer's
+others is given to a second worker as well; the first answer retires its twin.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _LEAST_REMEMBERED = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """One asked sample on its way.
+class Request:
+    """One sample that a consumer asked for, until it is answered.
 
     Attributes:
         session: routing identity of the consumer.
@@ -53,7 +53,7 @@ class Task:
 
     @property
     def clip(self) -> tuple[bytes, int, int, int]:
-        """What it is made from: tasks of equal clip are made from the same decoded frames."""
+        """What it is made from: requests of equal clip are made from the same decoded frames."""
         return self.session, self.epoch, self.index if self.place is None else self.place, self.candidate
 
     @property
@@ -63,8 +63,8 @@ class Task:
 
 
 @dataclass(slots=True)
-class _Lease:
-    task: Task | None  # None: answered, or its consumer is gone; but the worker still has to get through it
+class _Grant:
+    request: Request | None  # None: answered, or its consumer is gone; but the worker still has to get through it
     worker: bytes
     deadline: float
     begun_at: float | None = None
@@ -79,7 +79,7 @@ class LeaseBook:
 
     def __init__(self, deadline_seconds: float) -> None:
         self.deadline_seconds = deadline_seconds
-        self._leases: dict[int, _Lease] = {}
+        self._leases: dict[int, _Grant] = {}
         self._held: dict[bytes, list[int]] = {}
         self._out: dict[tuple[bytes, int, int], list[int]] = {}
         self._durations: dict[bytes, deque[float]] = {}
@@ -94,33 +94,33 @@ class LeaseBook:
 
         Of those that nobody waits for any more each counts, lest a clip that is asked for anew hides behind an old one.
         """
-        tasks = [self._leases[number].task for number in self._held.get(worker, ())]
-        return len({task.clip for task in tasks if task is not None}) + tasks.count(None)
+        requests = [self._leases[number].request for number in self._held.get(worker, ())]
+        return len({request.clip for request in requests if request is not None}) + requests.count(None)
 
     def take_changed(self) -> set[bytes]:
         """Workers that hold more or less than at the last call, or something that nobody waits for any more."""
         changed, self._changed = self._changed, set()
         return changed
 
-    def tasks_of(self, worker: bytes) -> Iterator[Task]:
-        """The tasks that this worker holds and somebody still waits for."""
+    def requests_of(self, worker: bytes) -> Iterator[Request]:
+        """The requests that this worker holds and somebody still waits for."""
         for number in self._held.get(worker, ()):
-            task = self._leases[number].task
-            if task is not None:
-                yield task
+            request = self._leases[number].request
+            if request is not None:
+                yield request
 
-    def task(self, number: int, worker: bytes) -> Task | None:
+    def request(self, number: int, worker: bytes) -> Request | None:
         """What this worker's lease asks for; None when nobody waits for its answer."""
         lease = self._leases.get(number)
-        return None if lease is None or lease.worker != worker else lease.task
+        return None if lease is None or lease.worker != worker else lease.request
 
-    def grant(self, task: Task, worker: bytes, now: float) -> int:
-        """Gives the task to a worker; returns the number of the lease."""
+    def grant(self, request: Request, worker: bytes, now: float) -> int:
+        """Gives the request to a worker; returns the number of the lease."""
         number = self._next
         self._next += 1
-        self._leases[number] = _Lease(task, worker, now + self.deadline_seconds)
+        self._leases[number] = _Grant(request, worker, now + self.deadline_seconds)
         self._held.setdefault(worker, []).append(number)
-        self._out.setdefault(task.sample, []).append(number)
+        self._out.setdefault(request.sample, []).append(number)
         self._changed.add(worker)
         return number
 
@@ -136,7 +136,7 @@ class LeaseBook:
         for other in self._held[worker]:
             self._leases[other].deadline = now + self.deadline_seconds
 
-    def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Task | None:
+    def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Request | None:
         """The worker answered, well or badly.
 
         Args:
@@ -146,22 +146,22 @@ class LeaseBook:
                 a clip may take.
 
         Returns:
-            the task, or None when nobody waits for this answer: the lease had been taken away from the worker, the
+            the request, or None when nobody waits for this answer: the lease had been taken away from the worker, the
             consumer is gone, or the twin was faster.
         """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker:
             return None
-        task = lease.task
-        if task is not None:
+        request = lease.request
+        if request is not None:
             if lease.begun_at is not None and decoded:
-                remembered = self._durations.setdefault(task.session, deque(maxlen=_REMEMBERED))
+                remembered = self._durations.setdefault(request.session, deque(maxlen=_REMEMBERED))
                 remembered.append(now - lease.begun_at)
-            self._retire(task.sample)
+            self._retire(request.sample)
         self._drop(number)
-        return task
+        return request
 
-    def lost(self, worker: bytes, at: int | None = None) -> list[tuple[Task, bool]]:
+    def lost(self, worker: bytes, at: int | None = None) -> list[tuple[Request, bool]]:
         """The worker is gone.
 
         Args:
@@ -169,40 +169,40 @@ class LeaseBook:
             at: number of the lease it was at by its own record; None goes by what it announced.
 
         Returns:
-            those of its tasks that nobody else is at, oldest first, each with whether it had been begun; without their
-            slots, where this worker may still write.
+            those of its requests that nobody else is at, oldest first, each with whether it had been begun;
+            without their slots, where this worker may still write.
         """
         returned = []
         for number in list(self._held.get(worker, ())):
             lease = self._leases[number]
             self._drop(number)
-            if lease.task is not None and lease.task.sample not in self._out:
+            if lease.request is not None and lease.request.sample not in self._out:
                 begun = lease.begun_at is not None if at is None else number == at
-                returned.append((replace(lease.task, slot=None), begun))
+                returned.append((replace(lease.request, slot=None), begun))
         return returned
 
     def overdue(self, now: float) -> set[bytes]:
         """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
         return {lease.worker for lease in self._leases.values() if now > lease.deadline}
 
-    def slow(self, now: float) -> list[tuple[Task, bytes]]:
-        """For each session its oldest task, with its worker, if it is slow and nobody else is at it.
+    def slow(self, now: float) -> list[tuple[Request, bytes]]:
+        """For each session its oldest request, with its worker, if it is slow and nobody else is at it.
 
-        Counted from when its worker last began something, so that a task queued behind one that hangs is slow too.
+        Counted from when its worker last began something, so that a request queued behind one that hangs is slow too.
         """
-        oldest: dict[bytes, _Lease] = {}
+        oldest: dict[bytes, _Grant] = {}
         for lease in self._leases.values():
-            if lease.task is not None:
-                oldest.setdefault(lease.task.session, lease)
+            if lease.request is not None:
+                oldest.setdefault(lease.request.session, lease)
         found = []
         for session, lease in oldest.items():
             durations = self._durations.get(session, ())
-            if lease.task is None or len(durations) < _LEAST_REMEMBERED:
+            if lease.request is None or len(durations) < _LEAST_REMEMBERED:
                 continue
             limit = max(_LEAST_SLOW_SECONDS, SLOW_FACTOR * statistics.median(durations))
             waited = now - (lease.deadline - self.deadline_seconds)
-            if waited > limit and len(self._out[lease.task.sample]) == 1:
-                found.append((lease.task, lease.worker))
+            if waited > limit and len(self._out[lease.request.sample]) == 1:
+                found.append((lease.request, lease.worker))
         return found
 
     def forget_session(self, session: bytes) -> None:
@@ -217,7 +217,7 @@ class LeaseBook:
 
     def _retire(self, sample: tuple[bytes, int, int]) -> None:
         for number in self._out.pop(sample, ()):
-            self._leases[number].task = None
+            self._leases[number].request = None
             self._changed.add(self._leases[number].worker)
 
     def _drop(self, number: int) -> None:
@@ -227,8 +227,8 @@ class LeaseBook:
         held.remove(number)
         if not held:
             del self._held[lease.worker]
-        if lease.task is not None:
-            out = self._out[lease.task.sample]
+        if lease.request is not None:
+            out = self._out[lease.request.sample]
             out.remove(number)
             if not out:
-                del self._out[lease.task.sample]
+                del self._out[lease.request.sample]

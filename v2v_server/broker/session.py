@@ -23,7 +23,7 @@ from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import runs_alone
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.schedule.epoch import Schedule
 
 _QUANTUM_SECONDS = 0.05
@@ -39,7 +39,7 @@ class Session:
         schedule: the order of its samples.
         credit: most indices it may have asked for and not yet been answered.
         liveness: when it was last heard.
-        waiting: tasks nobody works on yet, in the order asked.
+        waiting: requests nobody works on yet, in the order asked.
         unanswered: every (epoch, index) asked for and not yet answered.
         balance_seconds: worker time it has earned and not used.
         served: samples sent.
@@ -55,7 +55,7 @@ class Session:
     schedule: Schedule
     credit: int
     liveness: Liveness
-    waiting: deque[Task] = field(default_factory=deque)
+    waiting: deque[Request] = field(default_factory=deque)
     unanswered: set[tuple[int, int]] = field(default_factory=set)
     balance_seconds: float = 0.0
     served: int = 0
@@ -120,10 +120,10 @@ class Sessions:
         for index in new:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
-            session.waiting.append(Task(session.identity, epoch, index, place=place, slot=places[index]))
+            session.waiting.append(Request(session.identity, epoch, index, place=place, slot=places[index]))
 
-    def next_task(self) -> Task | None:
-        """The next task to give to a worker, by deficit round robin; None when nobody waits."""
+    def next_request(self) -> Request | None:
+        """The next request to give to a worker, by deficit round robin; None when nobody waits."""
         waiting = [identity for identity in self._turns if self._sessions[identity].waiting]
         if not waiting:
             return None
@@ -140,28 +140,28 @@ class Sessions:
             for identity in waiting:
                 self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
 
-    def take_siblings(self, task: Task) -> list[Task]:
-        """The waiting tasks that are made from the same clip as ``task``; they wait no more."""
-        session = self._sessions.get(task.session)
+    def take_siblings(self, request: Request) -> list[Request]:
+        """The waiting requests that are made from the same clip as ``request``; they wait no more."""
+        session = self._sessions.get(request.session)
         if session is None or session.spec.samples_per_decode == 1:
             return []
-        siblings = [other for other in session.waiting if other.clip == task.clip and not runs_alone(other)]
+        siblings = [other for other in session.waiting if other.clip == request.clip and not runs_alone(other)]
         for sibling in siblings:
             session.waiting.remove(sibling)
         return siblings
 
-    def put_back(self, task: Task) -> None:
-        """A task that comes back unanswered: it is next, because its consumer has waited longest for it."""
-        session = self._sessions.get(task.session)
-        if session is not None and (task.epoch, task.index) in session.unanswered:
-            session.waiting.appendleft(task)
+    def put_back(self, request: Request) -> None:
+        """A request that comes back unanswered: it is next, because its consumer has waited longest for it."""
+        session = self._sessions.get(request.session)
+        if session is not None and (request.epoch, request.index) in session.unanswered:
+            session.waiting.appendleft(request)
 
-    def answered(self, task: Task, worker_seconds: float) -> bool:
-        """The task is answered; returns False when nobody waits for it (the session is gone, or had it already)."""
-        session = self._sessions.get(task.session)
-        if session is None or (task.epoch, task.index) not in session.unanswered:
+    def answered(self, request: Request, worker_seconds: float) -> bool:
+        """The request is answered; returns False when nobody waits for it (the session is gone, or had it already)."""
+        session = self._sessions.get(request.session)
+        if session is None or (request.epoch, request.index) not in session.unanswered:
             return False
-        session.unanswered.remove((task.epoch, task.index))
+        session.unanswered.remove((request.epoch, request.index))
         session.balance_seconds -= worker_seconds
         if not session.unanswered:
             # Nothing is saved up while idle. A debt stays, or asking for one sample at a time would be free of charge;

@@ -100,17 +100,17 @@ class Workers:
             if not self._leases.held_by(identity) and worker.liveness.is_gone(now)
         )
 
-    def for_ordinary_task(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:
+    def for_request(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:
         """The worker that holds least and has room for more.
 
         Args:
-            keep_one_empty: a task that runs alone waits: the worker that holds least is left to work itself empty.
-            other_than: not this one, which is slow at the task.
+            keep_one_empty: a request that runs alone waits: the worker that holds least is left to work itself empty.
+            other_than: not this one, which is slow at the request.
         """
         lightest = self._lightest(2 + keep_one_empty)[keep_one_empty:]
         return next((identity for _, identity in lightest if identity != other_than), None)
 
-    def for_lone_task(self) -> bytes | None:
+    def for_lone_request(self) -> bytes | None:
         """A worker that holds nothing."""
         return next((identity for held, identity in self._lightest(1) if not held), None)
 
@@ -156,5 +156,5 @@ class Workers:
             heapq.heapify(self._heap)
 
     def _is_alone(self, identity: bytes) -> bool:
-        """A task that runs alone leaves no room."""
-        return any(runs_alone(task) for task in self._leases.tasks_of(identity))
+        """A request that runs alone leaves no room."""
+        return any(runs_alone(request) for request in self._leases.requests_of(identity))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections import deque
 from contextlib import suppress
 from typing import TextIO
 
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.counters import Rate
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.sequences import SequenceTable
@@ -61,6 +61,26 @@ def write(stream: TextIO, text: str) -> None:
     with suppress(OSError):
         stream.write(text)
         stream.flush()
+
+
+class Rate:
+    """Events a second over the last few seconds.
+
+    Args:
+        window_seconds: how far back it looks.
+    """
+
+    def __init__(self, window_seconds: float) -> None:
+        self._window_seconds = window_seconds
+        self._points: deque[tuple[float, float]] = deque()
+
+    def update(self, now: float, total: float) -> float:
+        """Notes the running total and returns the rate since the window's beginning (0.0 before two notes)."""
+        self._points.append((now, total))
+        while len(self._points) > 2 and now - self._points[0][0] > self._window_seconds:
+            self._points.popleft()
+        (then, before), (_, after) = self._points[0], self._points[-1]
+        return (after - before) / (now - then) if now > then else 0.0
 
 
 class StatusLine:

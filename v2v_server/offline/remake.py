@@ -14,9 +14,9 @@ from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, Vide
 from v2v_protocol.sample import Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.candidates import next_candidate
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.picture import check_drawable, draw_sample, write_png
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
@@ -63,32 +63,29 @@ def remake(
     if index >= schedule.count:
         raise UsageError(f"index {index}: the epoch has {schedule.count} samples, 0 .. {schedule.count - 1}")
     held = quarantine or Quarantine()
-    task = Task(b"", epoch, index)
+    request = Request(b"", epoch, index, snapshot=snapshot)
     most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
-    while task.candidate < most:
-        sequence = schedule.candidate(seed, epoch, index, task.candidate)
+    while request.candidate < most:
+        sequence = schedule.candidate(seed, epoch, index, request.candidate)
         quarantined = held.refusal(snapshot, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
         if quarantined is not None:
-            task = next_candidate(task, sequence.video.id, None, quarantined)
+            request = next_candidate(request, sequence.video.id, None, quarantined)
             continue
-        lease = describe(
-            task,
-            number=1,
+        lease = lease_for(
+            request,
             sequence=sequence,
-            quarantine=snapshot,
             catalogue=catalogue,
             spec=spec,
             seed=seed,
             arrays=arrays,
-            deadline_seconds=60.0,
         )
         try:
             return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
         except VideoError as error:
             if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                 raise
-            task = next_candidate(task, lease.video, error.frame, error.reason)
-    raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, task.refusals)))
+            request = next_candidate(request, lease.video, error.frame, error.reason)
+    raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, request.refusals)))
 
 
 def _is_left_out(catalogue: Catalogue, video: str) -> bool:

@@ -33,14 +33,14 @@ from v2v_protocol.errors import (
 )
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     ErrorCode,
     Goodbye,
-    JobFailed,
     Lease,
+    LeaseFailed,
     Message,
     Ping,
     Pong,
-    Refused,
     Result,
     Stop,
     WorkerHello,
@@ -180,13 +180,13 @@ class Worker:
                 self._unheard = False
             case Stop():
                 self._stopping = True
-            case Refused(ErrorCode.UNKNOWN_SESSION) if self._unheard:
+            case Denied(ErrorCode.UNKNOWN_SESSION) if self._unheard:
                 pass  # what it refuses was said before; another hello would take back the leases that this one brings
-            case Refused(ErrorCode.UNKNOWN_SESSION):
+            case Denied(ErrorCode.UNKNOWN_SESSION):
                 # The server was restarted, or had given us up: what we hold has been given to others.
                 self._leases.clear()
                 self._say_hello()
-            case Refused(code, text):
+            case Denied(code, text):
                 raise RemoteError(code, text)
             case _:
                 pass
@@ -267,7 +267,7 @@ class Worker:
             sample = make_sample(lease, clip, room.arrays)
         except VideoError as error:
             here = isinstance(error, VideoChanged | VideoUnreadable)
-            self._send(encode(JobFailed(lease.lease, error.frame, error.reason, here)))
+            self._send(encode(LeaseFailed(lease.lease, error.frame, error.reason, here)))
             return None
         cpu_seconds = time.process_time() - started
         return sample_message(

@@ -13,9 +13,8 @@ from v2v_bench.usage import consume, peak_rss_bytes
 from v2v_client import V2VStreamDataset
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode_map, decode_sample
-from v2v_server.broker.inspection import inspected
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
+from v2v_server.broker.terms import inspected, lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 
@@ -24,14 +23,14 @@ from v2v_server.schedule.sequences import SequenceTable
 def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ...]) -> None:
     catalogue = corpus(video("a.mp4"), video("b.mp4"))
     schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
-    task = Task(b"consumer", 3, 1, snapshot=2)
-    lease = describe(
-        task, number=7, sequence=schedule.candidate(5, 3, 1, 0), quarantine=2, catalogue=catalogue, spec=SMALL_SPEC,
-        seed=5, arrays=arrays, deadline_seconds=60.0,
+    request = Request(b"consumer", 3, 1, snapshot=2)
+    lease = lease_for(
+        request, number=7, sequence=schedule.candidate(5, 3, 1, 0), catalogue=catalogue, spec=SMALL_SPEC,
+        seed=5, arrays=arrays,
     )  # fmt: skip
     frames = answer(lease, "null-1")
     layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
-    header = inspected(frames, task, Form.of(layout))
+    header = inspected(frames, request, Form.of(layout))
     found = decode_sample(header, frames[1:])
     assert {name: (array.dtype.name, array.shape) for name, array in found.items()} == layout
     assert all(np.all(array == 1) for array in found.values())

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 from v2v_server.broker.blame import ALONE_AFTER, Cause, Loss, judged, runs_alone
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 
-TASK = Task(b"consumer", 3, 7, candidate=2)
+REQUEST = Request(b"consumer", 3, 7, candidate=2)
 
 
-def after(deaths: int) -> Task:
-    return replace(TASK, deaths=deaths)
+def after(deaths: int) -> Request:
+    return replace(REQUEST, deaths=deaths)
 
 
 REFUSED = "a worker did something over it"
@@ -36,7 +36,7 @@ REFUSED = "a worker did something over it"
         (Cause.KILLED, 2, after(2)),
     ],
 )
-def test_verdicts(cause: Cause, deaths: int, verdict: Task | str) -> None:
+def test_verdicts(cause: Cause, deaths: int, verdict: Request | str) -> None:
     assert judged(after(deaths), Loss(cause, "did something")) == verdict
 
 

@@ -21,15 +21,15 @@ from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, 
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     ErrorCode,
     Goodbye,
     Hello,
-    JobFailed,
     Lease,
+    LeaseFailed,
     Message,
     Ping,
     Pong,
-    Refused,
     Result,
     SampleHeader,
     Stop,
@@ -52,7 +52,7 @@ from v2v_server.video.frame_index import FrameIndex
 def refused(replies: list[Message], code: ErrorCode) -> str:
     """The text of the one reply, which must be a refusal of that kind."""
     (reply,) = replies
-    assert isinstance(reply, Refused)
+    assert isinstance(reply, Denied)
     assert reply.code == code
     return reply.text
 
@@ -299,7 +299,7 @@ def test_work_of_a_dead_worker_is_done_by_another_once(cause: Cause) -> None:
     at.work_off(b"w2")
     assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2)]
     # What the dead one still had in the post is told that nobody knows it.
-    assert [type(message) for message in at.told[b"w1"]] == [Refused]
+    assert [type(message) for message in at.told[b"w1"]] == [Denied]
     assert at.dispatcher.counters.workers_lost == 1
     assert at.dispatcher.counters.returned_leases == 2
 
@@ -328,7 +328,7 @@ def test_a_worker_cannot_answer_anothers_lease() -> None:
     at.join(b"w2")
     (lease,) = at.leases[b"w1"]
     at.worker_says(b"w2", Result(lease.lease), *sample_frames(0, 0))
-    at.worker_says(b"w2", JobFailed(lease.lease, None, "mine"))
+    at.worker_says(b"w2", LeaseFailed(lease.lease, None, "mine"))
     assert at.samples() == []
     at.work_off(b"w1")
     assert at.samples() == [(0, 0)]
@@ -589,7 +589,7 @@ def test_a_worker_of_other_numerics_is_refused_with_both_numbers() -> None:
     at.want(0)
     at.worker_says(b"w", WorkerHello("w", "host", 1, NUMERICS_VERSION + 1, 2))
     (reply,) = at.told[b"w"]
-    assert isinstance(reply, Refused)
+    assert isinstance(reply, Denied)
     assert reply.code == ErrorCode.VERSION
     assert f"{NUMERICS_VERSION + 1}" in reply.text
     assert f"{NUMERICS_VERSION}" in reply.text
@@ -751,7 +751,7 @@ def test_garbage_is_counted_and_answered(frames: list[bytes]) -> None:
     at.carry_out(at.dispatcher.from_worker(b"stranger", frames, 0.0))
     assert at.dispatcher.counters.malformed == 4
     for answer in (at.refusals(b"c")[0], at.refusals(b"stranger")[0], at.told[b"w"][0], at.told[b"stranger"][0]):
-        assert isinstance(answer, Refused)
+        assert isinstance(answer, Denied)
         assert answer.code in (ErrorCode.MALFORMED, ErrorCode.VERSION)
     still_serves(at)
 
@@ -762,7 +762,7 @@ def test_another_protocol_version_is_refused_as_such_on_both_sides() -> None:
     at.carry_out(at.dispatcher.from_consumer(b"c", frames, 0.0))
     at.carry_out(at.dispatcher.from_worker(b"w", frames, 0.0))
     for answer in (at.refusals()[0], at.told[b"w"][0]):
-        assert isinstance(answer, Refused)
+        assert isinstance(answer, Denied)
         assert answer.code == ErrorCode.VERSION
         assert str(PROTOCOL_VERSION) in answer.text
 
@@ -838,7 +838,7 @@ def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (b"a", b"b", b"c"):
         at.join(name)
     (refused,) = at.told[b"c"]
-    assert isinstance(refused, Refused)
+    assert isinstance(refused, Denied)
     assert (refused.code, refused.text) == (ErrorCode.BUSY, "this server has 2 workers, its limit")
     at.join(b"a")  # one that is known says hello again
     assert at.dispatcher.workers == 2
@@ -856,7 +856,7 @@ def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_it
     counters = at.dispatcher.counters
     assert (counters.malformed, counters.workers_lost, at.dispatcher.workers) == (1, 1, 0)
     (reply,) = at.told[b"w"]
-    assert isinstance(reply, Refused)
+    assert isinstance(reply, Denied)
     assert reply.code == ErrorCode.MALFORMED
     # Whatever else it says, nobody knows it any more.
     at.worker_says(b"w", Result(lease.lease + 1), *sample_frames(0, 1))
@@ -887,7 +887,7 @@ _near = st.one_of(
     ),
     st.builds(Begun, lease=st.integers(0, 20)),
     st.builds(Result, lease=st.integers(0, 20), begins=st.integers(0, 20)),
-    st.builds(JobFailed, lease=st.integers(0, 20), frame=st.none(), reason=st.text(), here=st.booleans()),
+    st.builds(LeaseFailed, lease=st.integers(0, 20), frame=st.none(), reason=st.text(), here=st.booleans()),
     st.builds(
         WorkerHello,
         name=st.text(),

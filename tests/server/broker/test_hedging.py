@@ -8,7 +8,7 @@ import pytest
 
 from tests.server.corpus import SMALL_SPEC
 from tests.server.peers import DEADLINE, Peers, peers
-from v2v_protocol.messages import JobFailed, Lease, Result
+from v2v_protocol.messages import Lease, LeaseFailed, Result
 from v2v_server.broker.blame import ALONE_AFTER, Cause
 
 
@@ -76,7 +76,7 @@ def test_a_failure_answers_for_both() -> None:
     assert at.samples() == before
     at.finish(b"fast")
     assert at.samples() == [*before, (0, 20)]
-    at.worker_says(b"slow", JobFailed(first.lease, None, "late"))
+    at.worker_says(b"slow", LeaseFailed(first.lease, None, "late"))
     at.worker_says(b"slow", Result(first.lease), b"late")
     assert at.samples() == [*before, (0, 20)]
     assert len(at.dispatcher._leases) == 0
@@ -191,7 +191,7 @@ def test_a_twin_does_not_take_the_worker_that_a_lone_task_waits_for() -> None:
     at.join(b"empties", credit=2)
     at.finish(b"empties")
     at.die(b"busy", Cause.KILLED)
-    # The one in work is all that stands between the lone task and its worker, and nothing is added to it.
+    # The one in work is all that stands between the lone request and its worker, and nothing is added to it.
     at.tick(2.0)
     assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"third"]
     at.finish(b"empties")

@@ -14,7 +14,17 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
 from v2v_client.memory.slots import Answer, Slots
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
-from v2v_protocol.messages import ErrorCode, Goodbye, JobFailed, Lease, Ping, Refused, Result, SampleHeader, Unavailable
+from v2v_protocol.messages import (
+    Denied,
+    ErrorCode,
+    Goodbye,
+    Lease,
+    LeaseFailed,
+    Ping,
+    Result,
+    SampleHeader,
+    Unavailable,
+)
 from v2v_protocol.wire import decode_map
 from v2v_server.broker.blame import Cause, runs_alone
 
@@ -82,7 +92,7 @@ class Interleaving(RuleBasedStateMachine):
                 self.late += [(identity, lease) for lease in self.at.leases.pop(identity, ())]
         for identity, told in self.at.told.items():
             for message in told:
-                if isinstance(message, Refused) and identity in self.at.leases:
+                if isinstance(message, Denied) and identity in self.at.leases:
                     assert message.code == ErrorCode.UNKNOWN_SESSION
                     self.at.join(identity)
             told.clear()
@@ -236,7 +246,7 @@ class Interleaving(RuleBasedStateMachine):
         """An answer that was given already, or is to a lease that was taken away."""
         identity, lease = self.late[which % len(self.late)]
         if failed:
-            self.at.worker_says(identity, JobFailed(lease.lease, None, "late"))
+            self.at.worker_says(identity, LeaseFailed(lease.lease, None, "late"))
         else:
             self.at.worker_says(identity, Result(lease.lease), *sample_frames(0, lease.indices[0]))
         self._listen()
@@ -267,13 +277,13 @@ class Interleaving(RuleBasedStateMachine):
         assert at.dispatcher.waiting <= sum(map(len, self.owed.values()))
 
     @invariant()
-    def a_lone_task_is_alone(self) -> None:
+    def a_lone_request_is_alone(self) -> None:
         at = getattr(self, "at", None)
         if at is None:
             return
         book = at.dispatcher._leases
         for identity in at.dispatcher._workers.identities():
-            lonely = any(runs_alone(task) for task in book.tasks_of(identity))
+            lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 
     def teardown(self) -> None:
@@ -456,9 +466,9 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         _, move = draw.choices(list(moves.values()), weights)[0]
         move()
         model.bounded()
-        model.a_lone_task_is_alone()
+        model.a_lone_request_is_alone()
         book = model.at.dispatcher._leases
-        seen["lone at work"] += any(map(runs_alone, (task for name in names for task in book.tasks_of(name))))
+        seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
         seen["lone waiting"] += bool(model.at.dispatcher._lone)
     seen["twins"] = model.at.dispatcher.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)

@@ -1,4 +1,4 @@
-"""The lease book against a model that keeps, for every task, the one place where it is."""
+"""The lease book against a model that keeps, for every request, the one place where it is."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 
-from v2v_server.broker.leases import LeaseBook, Task
+from v2v_server.broker.leases import LeaseBook, Request
 
 DEADLINE = 60.0
 A, B = b"worker a", b"worker b"
-TASK = Task(b"consumer", 0, 0)
+REQUEST = Request(b"consumer", 0, 0)
 
 
-def numbered(index: int, session: bytes = b"consumer") -> Task:
-    return Task(session, 0, index)
+def numbered(index: int, session: bytes = b"consumer") -> Request:
+    return Request(session, 0, index)
 
 
 def overdue_workers(book: LeaseBook, now: float) -> list[bytes]:
@@ -29,11 +29,11 @@ def overdue_workers(book: LeaseBook, now: float) -> list[bytes]:
 
 def test_an_answer_returns_the_task_once() -> None:
     book = LeaseBook(DEADLINE)
-    number = book.grant(TASK, A, 0.0)
+    number = book.grant(REQUEST, A, 0.0)
     assert (len(book), book.held_by(A), book.held_by(B)) == (1, 1, 0)
     assert book.finished(number, B, 0.0) is None
     assert book.finished(number + 1, A, 0.0) is None
-    assert book.finished(number, A, 0.0) is TASK
+    assert book.finished(number, A, 0.0) is REQUEST
     assert book.finished(number, A, 0.0) is None
     assert (len(book), book.held_by(A)) == (0, 0)
 
@@ -45,7 +45,7 @@ def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_susp
     assert book.finished(numbers[0], A, 0.0) == numbered(0)
     book.begun(numbers[1], A, 1.0)
     book.begun(numbers[2], B, 1.0)
-    assert (book.task(numbers[1], A), book.task(numbers[1], B), book.task(0, A)) == (numbered(1), None, None)
+    assert (book.request(numbers[1], A), book.request(numbers[1], B), book.request(0, A)) == (numbered(1), None, None)
     assert book.lost(A) == [(numbered(1), True), (numbered(2), False)]
     assert book.lost(A) == []
     assert book.finished(numbers[1], A, 0.0) is None
@@ -54,13 +54,13 @@ def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_susp
 
 def test_a_late_answer_finds_nothing_even_when_the_task_went_back_to_the_same_worker() -> None:
     book = LeaseBook(DEADLINE)
-    first = book.grant(TASK, A, 0.0)
+    first = book.grant(REQUEST, A, 0.0)
     book.lost(A)
-    second = book.grant(TASK, A, 1.0)
+    second = book.grant(REQUEST, A, 1.0)
     assert second != first
     book.begun(first, A, 2.0)
     assert book.finished(first, A, 0.0) is None
-    assert book.lost(A) == [(TASK, False)]
+    assert book.lost(A) == [(REQUEST, False)]
 
 
 def test_the_deadline_counts_from_the_grant_and_from_each_beginning() -> None:
@@ -105,7 +105,7 @@ def test_a_worker_lost_over_forgotten_leases_returns_nothing() -> None:
 def test_a_lease_begins_once() -> None:
     """A worker that says so again and again must not put off its deadline for ever."""
     book = LeaseBook(DEADLINE)
-    number = book.grant(TASK, A, 0.0)
+    number = book.grant(REQUEST, A, 0.0)
     for second in range(2 * int(DEADLINE)):
         book.begun(number, A, float(second))
     assert overdue_workers(book, DEADLINE) == []
@@ -119,12 +119,12 @@ def test_a_lease_begins_once() -> None:
 def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
     """Whether it is a sample or a failure: the book cannot tell, and both answer for the two of them."""
     book = LeaseBook(DEADLINE)
-    numbers = {A: book.grant(TASK, A, 0.0), B: book.grant(TASK, B, 5.0)}
+    numbers = {A: book.grant(REQUEST, A, 0.0), B: book.grant(REQUEST, B, 5.0)}
     slow = B if fast == A else A
-    assert book.finished(numbers[fast], fast, 6.0) is TASK
-    assert book.task(numbers[slow], slow) is None
+    assert book.finished(numbers[fast], fast, 6.0) is REQUEST
+    assert book.request(numbers[slow], slow) is None
     # The slower one does not know: it is still at it, fills its worker, and may be overdue.
-    assert (len(book), book.held_by(slow), list(book.tasks_of(slow))) == (1, 1, [])
+    assert (len(book), book.held_by(slow), list(book.requests_of(slow))) == (1, 1, [])
     assert overdue_workers(book, DEADLINE + 5.5) == [slow]
     assert book.finished(numbers[slow], slow, 7.0) is None
     assert (len(book), book.held_by(A), book.held_by(B)) == (0, 0, 0)
@@ -134,29 +134,29 @@ def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
 def test_losing_one_of_two_returns_nothing_and_losing_both_returns_it_once(first: bytes) -> None:
     book = LeaseBook(DEADLINE)
     for worker in (A, B):
-        book.begun(book.grant(TASK, worker, 0.0), worker, 0.0)
+        book.begun(book.grant(REQUEST, worker, 0.0), worker, 0.0)
     assert book.lost(first) == []
-    assert book.lost(B if first == A else A) == [(TASK, True)]
+    assert book.lost(B if first == A else A) == [(REQUEST, True)]
     assert len(book) == 0
 
 
 def test_a_retired_twin_returns_nothing_when_its_worker_is_lost() -> None:
     book = LeaseBook(DEADLINE)
-    number = book.grant(TASK, A, 0.0)
-    book.begun(book.grant(TASK, B, 0.0), B, 0.0)
-    assert book.finished(number, A, 1.0) is TASK
+    number = book.grant(REQUEST, A, 0.0)
+    book.begun(book.grant(REQUEST, B, 0.0), B, 0.0)
+    assert book.finished(number, A, 1.0) is REQUEST
     assert book.lost(B) == []
     assert len(book) == 0
 
 
 def test_a_forgotten_consumer_forgets_both() -> None:
     book = LeaseBook(DEADLINE)
-    numbers = [book.grant(TASK, worker, 0.0) for worker in (A, B)]
-    book.forget_session(TASK.session)
+    numbers = [book.grant(REQUEST, worker, 0.0) for worker in (A, B)]
+    book.forget_session(REQUEST.session)
     assert [book.finished(number, worker, 1.0) for number, worker in zip(numbers, (A, B), strict=True)] == [None, None]
     # What is asked again afterwards has nothing to do with them.
-    again = book.grant(TASK, A, 2.0)
-    assert book.finished(again, A, 3.0) is TASK
+    again = book.grant(REQUEST, A, 2.0)
+    assert book.finished(again, A, 3.0) is REQUEST
 
 
 # --- the slow ---------------------------------------------------------------------------------------------------------
@@ -184,12 +184,12 @@ def practised(seconds: float, samples: int = 8, session: bytes = b"consumer") ->
 )
 def test_slow_is_three_times_the_median_and_a_second(seconds: float, samples: int, limit: float | None) -> None:
     book = practised(seconds, samples)
-    book.begun(book.grant(TASK, A, 100.0), A, 100.0)
+    book.begun(book.grant(REQUEST, A, 100.0), A, 100.0)
     if limit is None:
         assert book.slow(100.0 + DEADLINE) == []
     else:
         assert book.slow(100.0 + limit) == []
-        assert book.slow(100.001 + limit) == [(TASK, A)]
+        assert book.slow(100.001 + limit) == [(REQUEST, A)]
 
 
 def test_the_median_is_of_the_last_samples_and_of_the_consumer_itself() -> None:
@@ -198,11 +198,11 @@ def test_the_median_is_of_the_last_samples_and_of_the_consumer_itself() -> None:
         number = book.grant(numbered(1), B, 0.0)
         book.begun(number, B, 0.0)
         book.finished(number, B, 10.0)
-    book.begun(book.grant(TASK, A, 100.0), A, 100.0)
+    book.begun(book.grant(REQUEST, A, 100.0), A, 100.0)
     assert book.slow(130.0) == []
-    assert book.slow(130.5) == [(TASK, A)]
+    assert book.slow(130.5) == [(REQUEST, A)]
     book.grant(numbered(0, b"a consumer of one sample"), b"worker c", 100.0)
-    assert book.slow(130.5) == [(TASK, A)]
+    assert book.slow(130.5) == [(REQUEST, A)]
 
 
 def test_only_the_oldest_of_a_consumer_is_slow_and_only_while_one_is_at_it() -> None:
@@ -235,7 +235,7 @@ def test_a_task_queued_behind_one_that_hangs_is_slow() -> None:
 def test_what_was_usual_goes_with_the_consumer() -> None:
     book = practised(1.0)
     book.forget_session(b"consumer")
-    book.grant(TASK, A, 0.0)
+    book.grant(REQUEST, A, 0.0)
     assert book.slow(50.0) == []
 
 
@@ -244,7 +244,7 @@ def test_what_was_usual_goes_with_the_consumer() -> None:
 
 @dataclass
 class Place:
-    task: Task
+    request: Request
     worker: bytes
     begun: bool
     deadline: float
@@ -252,8 +252,8 @@ class Place:
 
 
 class LeaseModel(RuleBasedStateMachine):
-    """Every lease is with one worker until that answers or is lost. A task may be out twice: it comes back once, by the
-    first answer, or when the last worker at it is lost; a forgotten one never."""
+    """Every lease is with one worker until that answers or is lost. A request may be out twice: it comes back once, by
+    the first answer, or when the last worker at it is lost; a forgotten one never."""
 
     numbers = Bundle("numbers")
     workers = st.sampled_from((A, B, b"worker c"))
@@ -264,33 +264,33 @@ class LeaseModel(RuleBasedStateMachine):
         self.book = LeaseBook(DEADLINE)
         self.out: dict[int, Place] = {}
         self.now = 0.0
-        self.tasks = 0
+        self.requests = 0
         self.ever: set[int] = set()
 
-    def _granted(self, task: Task, worker: bytes) -> int:
-        number = self.book.grant(task, worker, self.now)
+    def _granted(self, request: Request, worker: bytes) -> int:
+        number = self.book.grant(request, worker, self.now)
         assert number not in self.ever
         self.ever.add(number)
-        self.out[number] = Place(task, worker, False, self.now + DEADLINE, False)
+        self.out[number] = Place(request, worker, False, self.now + DEADLINE, False)
         return number
 
-    def _retire(self, task: Task) -> None:
+    def _retire(self, request: Request) -> None:
         for place in self.out.values():
-            place.retired |= place.task == task
+            place.retired |= place.request == request
 
     @rule(target=numbers, worker=workers, session=sessions)
     def grant(self, worker: bytes, session: bytes) -> int:
-        self.tasks += 1
-        return self._granted(Task(session, 0, self.tasks), worker)
+        self.requests += 1
+        return self._granted(Request(session, 0, self.requests), worker)
 
     @rule(target=numbers, number=numbers, worker=workers)
     def twin(self, number: int, worker: bytes) -> object:
         place = self.out.get(number)
         if place is None or place.retired:
             return multiple()
-        if worker in {other.worker for other in self.out.values() if other.task == place.task}:
-            return multiple()  # nobody is given a task that it has
-        return self._granted(place.task, worker)
+        if worker in {other.worker for other in self.out.values() if other.request == place.request}:
+            return multiple()  # nobody is given a request that it has
+        return self._granted(place.request, worker)
 
     @rule(number=numbers, worker=workers)
     def begun(self, number: int, worker: bytes) -> None:
@@ -305,32 +305,32 @@ class LeaseModel(RuleBasedStateMachine):
     @rule(number=numbers, worker=workers)
     def finished(self, number: int, worker: bytes) -> None:
         place = self.out.get(number)
-        asked = self.book.task(number, worker)
-        task = self.book.finished(number, worker, self.now)
-        assert task == asked
+        asked = self.book.request(number, worker)
+        request = self.book.finished(number, worker, self.now)
+        assert request == asked
         if place is None or place.worker != worker:
-            assert task is None
+            assert request is None
             return
-        assert task == (None if place.retired else place.task)
+        assert request == (None if place.retired else place.request)
         del self.out[number]
-        self._retire(place.task)
+        self._retire(place.request)
 
     @rule(worker=workers)
     def lost(self, worker: bytes) -> None:
         mine = [place for place in self.out.values() if place.worker == worker]
         self.out = {number: place for number, place in self.out.items() if place.worker != worker}
-        elsewhere = {place.task for place in self.out.values()}
-        expected: dict[Task, bool] = {}
+        elsewhere = {place.request for place in self.out.values()}
+        expected: dict[Request, bool] = {}
         for place in mine:
-            if not place.retired and place.task not in elsewhere:
-                expected[place.task] = place.begun
+            if not place.retired and place.request not in elsewhere:
+                expected[place.request] = place.begun
         assert self.book.lost(worker) == list(expected.items())
 
     @rule(session=sessions)
     def forget(self, session: bytes) -> None:
         self.book.forget_session(session)
         for place in self.out.values():
-            place.retired |= place.task.session == session
+            place.retired |= place.request.session == session
 
     @rule(seconds=st.floats(0.0, 2 * DEADLINE))
     def time_passes(self, seconds: float) -> None:
@@ -341,9 +341,9 @@ class LeaseModel(RuleBasedStateMachine):
         assert len(self.book) == len(self.out)
         for worker in (A, B, b"worker c"):
             mine = [place for place in self.out.values() if place.worker == worker]
-            clips = {place.task.clip for place in mine if not place.retired}
+            clips = {place.request.clip for place in mine if not place.retired}
             assert self.book.held_by(worker) == len(clips) + sum(place.retired for place in mine)
-            assert list(self.book.tasks_of(worker)) == [place.task for place in mine if not place.retired]
+            assert list(self.book.requests_of(worker)) == [place.request for place in mine if not place.retired]
 
     @invariant()
     def overdue_is_what_the_clock_says(self) -> None:
@@ -351,8 +351,8 @@ class LeaseModel(RuleBasedStateMachine):
 
     @invariant()
     def the_slow_are_out_once(self) -> None:
-        for task, worker in self.book.slow(self.now):
-            assert [place.worker for place in self.out.values() if place.task == task] == [worker]
+        for request, worker in self.book.slow(self.now):
+            assert [place.worker for place in self.out.values() if place.request == request] == [worker]
 
 
 TestLeaseModel = LeaseModel.TestCase

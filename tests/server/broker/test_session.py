@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import Schedule
 
@@ -44,11 +44,11 @@ def opened(*sessions: Session) -> Sessions:
     return table
 
 
-def take(sessions: Sessions) -> Task:
-    task = sessions.next_task()
-    if task is None:
+def take(sessions: Sessions) -> Request:
+    request = sessions.next_request()
+    if request is None:
         raise AssertionError("nobody waits")
-    return task
+    return request
 
 
 # --- asking -----------------------------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def test_samples_are_handed_out_in_the_order_asked() -> None:
     sessions = opened(a)
     sessions.want(a, 3, [5, 2, 9])
     assert [take(sessions).index for _ in range(3)] == [5, 2, 9]
-    assert sessions.next_task() is None
+    assert sessions.next_request() is None
 
 
 def test_what_is_waited_for_already_is_not_made_twice() -> None:
@@ -68,12 +68,12 @@ def test_what_is_waited_for_already_is_not_made_twice() -> None:
     sessions.want(a, 0, [1, 1, 2])
     taken = take(sessions)
     sessions.want(a, 0, [2, 1, 3, 3])
-    assert [task.index for task in a.waiting] == [2, 3]
+    assert [request.index for request in a.waiting] == [2, 3]
     sessions.want(a, 1, [1])
     assert len(a.unanswered) == 4
     assert sessions.answered(taken, 0.0)
     sessions.want(a, 0, [1])
-    assert [(task.epoch, task.index) for task in a.waiting] == [(0, 2), (0, 3), (1, 1), (0, 1)]
+    assert [(request.epoch, request.index) for request in a.waiting] == [(0, 2), (0, 3), (1, 1), (0, 1)]
 
 
 def test_a_request_beyond_the_credit_takes_nothing() -> None:
@@ -102,15 +102,15 @@ def test_credit_is_free_again_after_the_answer_and_not_before() -> None:
     a = session(credit=1)
     sessions = opened(a)
     sessions.want(a, 0, [0])
-    task = take(sessions)
+    request = take(sessions)
     with pytest.raises(LimitExceeded):
         sessions.want(a, 0, [1])
-    sessions.put_back(task)
+    sessions.put_back(request)
     with pytest.raises(LimitExceeded):
         sessions.want(a, 0, [1])
-    assert take(sessions) == task
-    assert sessions.answered(task, 0.1)
-    assert not sessions.answered(task, 0.1)
+    assert take(sessions) == request
+    assert sessions.answered(request, 0.1)
+    assert not sessions.answered(request, 0.1)
     sessions.want(a, 0, [1])
 
 
@@ -130,18 +130,18 @@ def test_nothing_comes_back_to_a_session_that_is_gone_or_was_opened_again() -> N
     old = session()
     sessions = opened(old)
     sessions.want(old, 0, [0])
-    task = take(sessions)
+    request = take(sessions)
     sessions.forget(b"a")
     sessions.forget(b"a")
     assert sessions.get(b"a") is None
-    assert not sessions.answered(task, 1.0)
-    sessions.put_back(task)
-    assert sessions.next_task() is None
+    assert not sessions.answered(request, 1.0)
+    sessions.put_back(request)
+    assert sessions.next_request() is None
     new = session()
     sessions.open(new)
-    sessions.put_back(task)
-    assert not sessions.answered(task, 1.0)
-    assert sessions.next_task() is None
+    sessions.put_back(request)
+    assert not sessions.answered(request, 1.0)
+    assert sessions.next_request() is None
     assert len(sessions) == 1
 
 
@@ -173,7 +173,7 @@ def serve(
     """
     sessions = opened(*(session(identity, (credits or {}).get(identity, 16)) for identity in costs))
     asked = dict.fromkeys(costs, 0)
-    in_work: list[Task] = []
+    in_work: list[Request] = []
     got: Counter[bytes] = Counter()
     for _ in range(samples):
         for each in sessions:
@@ -183,9 +183,9 @@ def serve(
             asked[each.identity] += room
         while len(in_work) < workers:
             in_work.append(take(sessions))
-        task = in_work.pop(0)
-        assert sessions.answered(task, costs[task.session])
-        got[task.session] += 1
+        request = in_work.pop(0)
+        assert sessions.answered(request, costs[request.session])
+        got[request.session] += 1
     return got
 
 
@@ -229,10 +229,10 @@ def test_a_consumer_in_debt_that_waits_alone_is_served_at_once() -> None:
     sessions = opened(a, b)
     sessions.want(a, 0, [0, 1, 2])
     for cost in (1e-9, 0.05, 1e6):
-        task = take(sessions)
-        assert task.session == b"a"
-        sessions.want(a, 1, [task.index])
-        assert sessions.answered(task, cost)
+        request = take(sessions)
+        assert request.session == b"a"
+        sessions.want(a, 1, [request.index])
+        assert sessions.answered(request, cost)
 
 
 def test_the_largest_debt_that_is_accepted_does_not_stall() -> None:
@@ -271,7 +271,7 @@ class SessionModel(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.sessions = Sessions()
-        self.in_work: list[tuple[Task, Session]] = []
+        self.in_work: list[tuple[Request, Session]] = []
 
     @rule(identity=identities, credit=st.integers(1, 6))
     def open(self, identity: bytes, credit: int) -> None:
@@ -302,38 +302,38 @@ class SessionModel(RuleBasedStateMachine):
             assert len(asking.waiting) == len(queue) + len(after) - len(before)
 
     @rule()
-    def next_task(self) -> None:
+    def next_request(self) -> None:
         waiting = {each.identity for each in self.sessions if each.waiting}
-        task = self.sessions.next_task()
-        assert (task is None) == (not waiting)
-        if task is not None:
-            owner = self.sessions.get(task.session)
+        request = self.sessions.next_request()
+        assert (request is None) == (not waiting)
+        if request is not None:
+            owner = self.sessions.get(request.session)
             assert owner is not None
-            assert task.session in waiting
-            self.in_work.append((task, owner))
+            assert request.session in waiting
+            self.in_work.append((request, owner))
 
     @precondition(lambda self: self.in_work)
     @rule(which=st.integers(0, 100), cost=st.floats(0.0, 86_400.0))
     def answered(self, which: int, cost: float) -> None:
-        task, owner = self.in_work.pop(which % len(self.in_work))
-        alive = self.sessions.get(task.session) is owner
+        request, owner = self.in_work.pop(which % len(self.in_work))
+        alive = self.sessions.get(request.session) is owner
         if alive:
-            assert self.sessions.answered(task, cost)
-            assert not self.sessions.answered(task, cost)
+            assert self.sessions.answered(request, cost)
+            assert not self.sessions.answered(request, cost)
 
     @precondition(lambda self: self.in_work)
     @rule(which=st.integers(0, 100))
     def put_back(self, which: int) -> None:
-        task, owner = self.in_work.pop(which % len(self.in_work))
-        if self.sessions.get(task.session) is owner:
-            self.sessions.put_back(task)
-            assert owner.waiting[0] == task
+        request, owner = self.in_work.pop(which % len(self.in_work))
+        if self.sessions.get(request.session) is owner:
+            self.sessions.put_back(request)
+            assert owner.waiting[0] == request
 
     @invariant()
     def one_place_each(self) -> None:
         for each in self.sessions:
-            queued = [(task.epoch, task.index) for task in each.waiting]
-            working = [(task.epoch, task.index) for task, owner in self.in_work if owner is each]
+            queued = [(request.epoch, request.index) for request in each.waiting]
+            working = [(request.epoch, request.index) for request, owner in self.in_work if owner is each]
             assert sorted(queued + working) == sorted(each.unanswered)
             assert len(each.unanswered) <= each.credit
 

@@ -17,12 +17,12 @@ from v2v_server.broker import sockets as broker_module
 from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict
 from v2v_server.broker.sockets import Broker
 
 VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
-RECORD = Record(VERDICT, Task(b"c", 0, 0))
+RECORD = Record(VERDICT, Request(b"c", 0, 0))
 HUNG = Loss(Cause.HUNG, "slept")
 
 
@@ -103,7 +103,7 @@ def test_a_record_is_written_and_reported_before_what_follows() -> None:
 
 @pytest.mark.parametrize("found", [True, False])
 def test_what_is_looked_for_is_reported(found: bool) -> None:
-    missing = LookFor("a.mp4" if found else "b.mp4", "f", b"w", None, "cannot be read", Task(b"c", 0, 0))
+    missing = LookFor("a.mp4" if found else "b.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
     assert carried(Scripted([missing])) == [("looked for", missing, found)]
 
 

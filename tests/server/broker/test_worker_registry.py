@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v2v_server.broker.blame import ALONE_AFTER, runs_alone
-from v2v_server.broker.leases import LeaseBook, Task
+from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
 
 DEADLINE = 60.0
@@ -18,16 +18,16 @@ class Table:
     def __init__(self, **credit: int) -> None:
         self.book = LeaseBook(DEADLINE)
         self.workers = Workers(self.book)
-        self.tasks = 0
+        self.requests = 0
         for name, offered in credit.items():
             self.workers.add(name.encode(), offered, 0.0)
 
     def load(self, name: str, *, deaths: int = 0, session: bytes = b"c", now: float = 0.0) -> int:
-        self.tasks += 1
-        return self.book.grant(Task(session, 0, self.tasks, deaths=deaths), name.encode(), now)
+        self.requests += 1
+        return self.book.grant(Request(session, 0, self.requests, deaths=deaths), name.encode(), now)
 
     def next(self, *, keep_one_empty: bool = False, other_than: bytes | None = None) -> bytes | None:
-        return self.workers.for_ordinary_task(keep_one_empty=keep_one_empty, other_than=other_than)
+        return self.workers.for_request(keep_one_empty=keep_one_empty, other_than=other_than)
 
 
 def test_who_holds_least_is_next_until_nobody_has_room() -> None:
@@ -50,7 +50,7 @@ def test_credit_is_at_least_one_and_limited() -> None:
 
 def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
     table = Table()
-    assert (len(table.workers), table.next(), table.workers.for_lone_task()) == (0, None, None)
+    assert (len(table.workers), table.next(), table.workers.for_lone_request()) == (0, None, None)
     table.workers.add(b"a", 1, 0.0)
     assert (len(table.workers), b"a" in table.workers, table.workers.identities()) == (1, True, [b"a"])
     table.workers.remove(b"a")
@@ -109,7 +109,7 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
         )
         assert table.workers._lightest(99) == expected
         names = [identity for _, identity in expected]
-        assert table.workers.for_lone_task() == next((name for held, name in expected if not held), None)
+        assert table.workers.for_lone_request() == next((name for held, name in expected if not held), None)
         for kept in (False, True):
             assert table.next(keep_one_empty=kept) == next(iter(names[kept:]), None)
             others = [name for name in names[kept:] if name != identity]
@@ -130,29 +130,29 @@ def test_those_who_came_and_went_are_not_kept_in_mind() -> None:
 
 
 def lonely(table: Table, identity: bytes) -> bool:
-    return any(runs_alone(task) for task in table.book.tasks_of(identity))
+    return any(runs_alone(request) for request in table.book.requests_of(identity))
 
 
-# --- tasks that run alone ---------------------------------------------------------------------------------------------
+# --- requests that run alone ----------------------------------------------------------------------------------------
 
 
 def test_a_lone_task_needs_a_worker_that_holds_nothing() -> None:
     table = Table(a=2, b=2)
     numbers = [table.load(name) for name in ("a", "b")]
-    assert table.workers.for_lone_task() is None
+    assert table.workers.for_lone_request() is None
     # Not even a lease whose consumer is gone: the worker still has to get through it.
     table.book.forget_session(b"c")
-    assert table.workers.for_lone_task() is None
+    assert table.workers.for_lone_request() is None
     table.book.finished(numbers[1], b"b", 1.0)
-    assert table.workers.for_lone_task() == b"b"
+    assert table.workers.for_lone_request() == b"b"
 
 
 def test_a_worker_at_a_lone_task_gets_nothing_else() -> None:
     table = Table(a=8)
     number = table.load("a", deaths=ALONE_AFTER)
-    assert (table.next(), table.workers.for_lone_task()) == (None, None)
+    assert (table.next(), table.workers.for_lone_request()) == (None, None)
     table.book.finished(number, b"a", 1.0)
-    assert (table.next(), table.workers.for_lone_task()) == (b"a", b"a")
+    assert (table.next(), table.workers.for_lone_request()) == (b"a", b"a")
     table.load("a", deaths=ALONE_AFTER - 1)
     assert table.next() == b"a"
 
@@ -167,23 +167,23 @@ def test_while_a_lone_task_waits_one_worker_works_itself_empty_and_the_others_go
         if held[name]:
             table.book.finished(held[name].pop(0), name.encode(), 0.0)
             served += 1
-        if table.workers.for_lone_task() is not None:
+        if table.workers.for_lone_request() is not None:
             break
         while (free := table.next(keep_one_empty=True)) is not None:
             held[free.decode()].append(table.load(free.decode()))
-    assert table.workers.for_lone_task() is not None
+    assert table.workers.for_lone_request() is not None
     assert served <= 4
 
 
-def test_a_single_worker_is_kept_for_the_lone_task() -> None:
+def test_a_single_worker_is_kept_for_the_lone_request() -> None:
     table = Table(a=2)
     number = table.load("a")
     assert (table.next(keep_one_empty=False), table.next(keep_one_empty=True)) == (b"a", None)
     table.book.finished(number, b"a", 0.0)
-    assert table.workers.for_lone_task() == b"a"
+    assert table.workers.for_lone_request() == b"a"
 
 
-# --- twins ------------------------------------------------------------------------------------------------------------
+# --- twins ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_twin_goes_to_somebody_else_with_room() -> None:
@@ -191,7 +191,7 @@ def test_a_twin_goes_to_somebody_else_with_room() -> None:
     table.load("b")
     assert table.next(other_than=b"a") == b"b"
     assert table.next(other_than=b"b") == b"a"
-    # Nor does a twin take the worker that a lone task waits for.
+    # Nor does a twin take the worker that a lone request waits for.
     assert table.next(other_than=b"b", keep_one_empty=True) is None
     table.load("b")
     assert table.next(other_than=b"a") is None
@@ -203,14 +203,14 @@ def test_nobody_is_added_to_a_lone_task_as_a_twin() -> None:
     assert table.next(other_than=b"a") is None
 
 
-# --- those whose storage fails ----------------------------------------------------------------------------------------
+# --- those whose storage fails --------------------------------------------------------------------------------------
 
 
 def test_who_rests_gets_nothing_until_it_wakes() -> None:
     table = Table(a=2, b=2)
     table.workers.rest(b"a", 5.0)
     table.workers.rest(b"stranger", 5.0)
-    assert (table.next(), table.next(other_than=b"b"), table.workers.for_lone_task()) == (b"b", None, b"b")
+    assert (table.next(), table.next(other_than=b"b"), table.workers.for_lone_request()) == (b"b", None, b"b")
     table.workers.wake(5.0 + REST_SECONDS - 0.1)
     assert table.next(other_than=b"b") is None
     table.workers.wake(5.0 + REST_SECONDS)
@@ -222,7 +222,7 @@ def test_who_rests_gets_nothing_until_it_wakes() -> None:
     assert table.next() == b"a"
 
 
-# --- the hopeless -----------------------------------------------------------------------------------------------------
+# --- the hopeless ---------------------------------------------------------------------------------------------------
 
 
 def test_a_hanging_worker_is_reported_once_and_gets_nothing_more() -> None:
@@ -258,7 +258,7 @@ def test_the_silent_have_vanished_unless_they_are_at_work() -> None:
     assert table.workers.vanished(SILENCE_SECONDS + 0.5) == [b"a"]
     assert table.workers.vanished(SILENCE_SECONDS + 0.6) == []
     assert table.workers.vanished(SILENCE_SECONDS + 1.5) == [b"c"]
-    assert table.workers.for_lone_task() is None
+    assert table.workers.for_lone_request() is None
     table.book.finished(number, b"b", 40.0)
     assert table.workers.heard(b"b", 40.0)
     assert table.workers.vanished(39.9 + SILENCE_SECONDS) == []

@@ -11,9 +11,9 @@ import pytest
 from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from tests.server.peers import peers
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.counters import Counters, Rate
+from v2v_server.broker.counters import Counters
 from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
-from v2v_server.console.status import StatusLine, summary
+from v2v_server.console.status import Rate, StatusLine, summary
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 

@@ -10,7 +10,7 @@ import pytest
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
-from v2v_protocol.messages import Begun, ErrorCode, Goodbye, Hello, Lease, Refused
+from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Lease
 from v2v_protocol.sample import Refusal, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import ALONE_AFTER, Cause
@@ -210,7 +210,7 @@ def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> Non
     at.want(*range(40), identity=b"busy")
     for worker in (b"w1", b"w2"):
         at.join(worker)
-    # The lone task went first; once it is tried again there is no empty worker any more.
+    # The lone request went first; once it is tried again there is no empty worker any more.
     at.begin(b"w1")
     at.die(b"w1", Cause.KILLED)
     assert all(lease.reply_to == b"busy" for lease in at.leases[b"w2"])
@@ -443,7 +443,7 @@ def test_a_crash_under_an_older_snapshot_moves_only_that_sample() -> None:
 def test_a_snapshot_of_the_future_is_refused() -> None:
     at = peers(quarantine=Quarantine([in_quarantine()]))
     (reply,) = at.consumer_says(b"c", Hello({}, ("voxels",), 4, 0, 2))
-    assert isinstance(reply, Refused)
+    assert isinstance(reply, Denied)
     assert reply.code == ErrorCode.SPEC
     assert "snapshot 2 was asked for, this server has 0 .. 1" in reply.text
     assert len(at.dispatcher.sessions) == 0

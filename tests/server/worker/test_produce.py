@@ -16,9 +16,9 @@ from tests.clips import panned_luma, write_clip
 from tests.server.corpus import SMALL_SPEC
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.commands.cli import simulate
 from v2v_server.offline.remake import remake
@@ -42,16 +42,13 @@ def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
 @pytest.fixture
 def lease(catalogue: Catalogue) -> Lease:
     schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
-    return describe(
-        Task(b"", 0, 2),
-        number=1,
+    return lease_for(
+        Request(b"", 0, 2),
         sequence=schedule.candidate(0, 0, 2, 0),
-        quarantine=0,
         catalogue=catalogue,
         spec=SMALL_SPEC,
         seed=0,
         arrays=("voxels", "frames"),
-        deadline_seconds=60.0,
     )
 
 

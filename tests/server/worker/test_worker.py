@@ -22,13 +22,13 @@ from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import CorpusError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (
     Begun,
+    Denied,
     ErrorCode,
     Goodbye,
-    JobFailed,
     Lease,
+    LeaseFailed,
     Message,
     Ping,
-    Refused,
     Result,
     Stop,
     WorkerHello,
@@ -167,7 +167,7 @@ def test_after_a_failure_the_next_lease_is_begun_by_itself(server: Server) -> No
     assert server.heard() == Begun(1)
     server.lease(2)
     server.lets_it_finish(after_post=True, error=VideoError("a.mp4", 7, "cut short"))
-    assert server.heard() == JobFailed(1, 7, "cut short")
+    assert server.heard() == LeaseFailed(1, 7, "cut short")
     assert server.heard() == Begun(2)
     server.lets_it_finish()
     assert server.heard() == Result(2, begins=0)
@@ -178,7 +178,7 @@ def test_what_its_host_lacks_is_not_called_the_videos_fault(server: Server, kind
     server.lease(1)
     assert server.heard() == Begun(1)
     server.lets_it_finish(error=kind("a.mp4", None, "cannot be read"))
-    assert server.heard() == JobFailed(1, None, "cannot be read", here=True)
+    assert server.heard() == LeaseFailed(1, None, "cannot be read", here=True)
 
 
 def test_a_corpus_that_cannot_be_looked_at_is_said() -> None:
@@ -210,7 +210,7 @@ def test_a_sample_for_a_server_that_was_restarted_is_dropped(server: Server) -> 
     """Its lease is unknown there, or is somebody else's."""
     server.lease(1)
     assert server.heard() == Begun(1)
-    server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you?"))
+    server.says(Denied(ErrorCode.UNKNOWN_SESSION, "who are you?"))
     server.lets_it_finish(after_post=True)
     assert isinstance(server.heard(), WorkerHello)
     server.lease(1)
@@ -224,12 +224,12 @@ def test_a_server_that_knows_us_no_more_is_greeted_once_whatever_it_refuses(serv
     server.lease(1)
     assert server.heard() == Begun(1)
     for _ in range(9):
-        server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you?"))
+        server.says(Denied(ErrorCode.UNKNOWN_SESSION, "who are you?"))
     server.lets_it_finish(after_post=True)
     assert isinstance(server.heard(), WorkerHello)
     server.lease(1)
     assert server.heard() == Begun(1)
-    server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you now?"))
+    server.says(Denied(ErrorCode.UNKNOWN_SESSION, "who are you now?"))
     server.lets_it_finish(after_post=True)
     assert isinstance(server.heard(), WorkerHello)
 
@@ -260,7 +260,7 @@ def test_a_server_of_another_version_ends_the_worker(tmp_path: Path) -> None:
         worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
         worker._say_hello()
         name, _ = router.recv_multipart()
-        refusal = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "refused", "code": "version", "text": "", "more": 0})
+        refusal = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "denied", "code": "version", "text": "", "more": 0})
         router.send_multipart([name, refusal])
         with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
             worker.run()
@@ -372,7 +372,7 @@ class TestSiblings:
         server.lets_it_finish(held=2)
         server.lets_it_finish()
         server.waits_for_its_start(3)
-        server.says(Refused(ErrorCode.UNKNOWN_SESSION, "who are you?"))
+        server.says(Denied(ErrorCode.UNKNOWN_SESSION, "who are you?"))
         server.lets_it_finish(after_post=True)
         assert isinstance(server.heard(), WorkerHello)
         server.lease(1)
@@ -418,7 +418,7 @@ class TestSiblings:
     def test_that_are_done_are_announced_when_the_next_fails(self, server: Server) -> None:
         server.lets_it_finish(held=2)
         server.lets_it_finish(error=VideoError("a.mp4", 7, "cut short"))
-        assert server.heard() == JobFailed(2, 7, "cut short")
+        assert server.heard() == LeaseFailed(2, 7, "cut short")
         assert server.heard() == Result(1, begins=3)
 
     def test_that_are_done_are_announced_by_a_worker_that_leaves(

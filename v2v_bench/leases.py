@@ -11,8 +11,8 @@ from v2v_protocol.errors import CorpusError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.jobs import describe
-from v2v_server.broker.leases import Task
+from v2v_server.broker.leases import Request
+from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -21,7 +21,7 @@ from v2v_server.worker.produce import decode_for, make_sample
 
 
 @contextmanager
-def open_jobs(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Path, Iterator[Lease]]]:
+def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Path, Iterator[Lease]]]:
     """The leases of seed 0, one sample each, epoch after epoch, without end; each names the siblings still to come.
 
     Args:
@@ -49,10 +49,9 @@ def open_jobs(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Path,
                 epoch, index = divmod(number, schedule.count)
                 view = index // spacing % spec.samples_per_decode
                 siblings = tuple(index + spacing * more for more in range(1, spec.samples_per_decode - view))
-                yield describe(
-                    Task(b"", epoch, index), number=1, sequence=schedule.candidate(0, epoch, index, 0), quarantine=0,
-                    catalogue=catalogue, spec=spec, seed=0, arrays=DEFAULT_ARRAYS, deadline_seconds=60.0,
-                    siblings=siblings,
+                yield lease_for(
+                    Request(b"", epoch, index), sequence=schedule.candidate(0, epoch, index, 0), catalogue=catalogue,
+                    spec=spec, seed=0, arrays=DEFAULT_ARRAYS, siblings=siblings,
                 )  # fmt: skip
 
         yield catalogue.root, leases()

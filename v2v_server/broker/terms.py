@@ -1,0 +1,115 @@
+"""The terms of a lease: what it asks of a worker, and what the answer must be. Pure.
+
+A lease says everything that a worker on any host needs, and nothing else. Its answer is inspected before it is passed
+on: a consumer trusts its server, but the server does not trust a worker, which may be another version, broken or
+hostile. The small header is read; the arrays are only measured, and not even that where they lie in a slot of the
+consumer's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import abc
+from typing import Any
+
+from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.errors import ProtocolError
+from v2v_protocol.messages import Lease, SampleHeader
+from v2v_protocol.sample import Form
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import decode
+from v2v_server.broker.leases import Request
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.schedule.sequences import Sequence
+
+
+def lease_for(
+    request: Request,
+    *,
+    sequence: Sequence,
+    catalogue: Catalogue,
+    spec: StreamSpec,
+    seed: int,
+    arrays: tuple[str, ...],
+    number: int = 1,
+    deadline_seconds: float = 60.0,
+    siblings: tuple[int, ...] = (),
+) -> Lease:
+    """The lease for one request.
+
+    Args:
+        request: which sample, and what was tried before.
+        sequence: what the request's candidate is made from.
+        catalogue, spec, seed: of the sample's identity.
+        arrays: to be sent.
+        number: of the lease.
+        deadline_seconds: see :class:`v2v_protocol.messages.Lease`.
+        siblings: indices that are made from the same clip and follow in leases of their own.
+
+    Raises:
+        CorpusError: the catalogue's index can no longer be read.
+    """
+    video = sequence.video
+    thresholds: tuple[str, ...] = ()
+    if video.threshold_pos is not None and video.threshold_neg is not None:
+        thresholds = (video.threshold_pos.hex(), video.threshold_neg.hex())
+    scene = b""
+    if spec.scene != "off":
+        scene = catalogue.scene(video.id).slice(sequence.start_frame, spec.recipe.frames_needed).to_bytes()
+    return Lease(
+        lease=number,
+        reply_to=request.session,
+        spec=spec.canonical(),
+        spec_digest=spec.digest,
+        catalogue_digest=catalogue.digest_under(spec.scene),
+        seed=seed,
+        epoch=request.epoch,
+        indices=(request.index, *siblings),
+        arrays=arrays,
+        video=video.id,
+        fingerprint=video.fingerprint,
+        rows=str(catalogue.rows),
+        width_px=video.width_px,
+        height_px=video.height_px,
+        frames_per_second=0.0 if math.isnan(video.frames_per_second) else video.frames_per_second,
+        thresholds=thresholds,
+        start_frame=sequence.start_frame,
+        frame_index=catalogue.frame_index_bytes(video.id, sequence.start_frame, spec.recipe.frames_needed),
+        candidate=request.candidate,
+        quarantine=request.snapshot,
+        refusals={"refusals": [dataclasses.asdict(refusal) for refusal in request.refusals]},
+        deadline_seconds=deadline_seconds,
+        scene=scene,
+        arena="" if request.slot is None else request.slot.arena,
+        slot=NO_SLOT if request.slot is None else request.slot.number,
+    )
+
+
+def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
+    """The header of a sample that its consumer will be able to read.
+
+    Args:
+        payload: the frames behind the worker's Result: a whole SampleHeader message.
+        request: what was asked.
+        form: of the sample.
+
+    Raises:
+        ProtocolError: it must not be passed on.
+    """
+    if not payload:
+        raise ProtocolError("nothing follows it")
+    header = decode(bytes(payload[0]))
+    if not isinstance(header, SampleHeader) or (header.epoch, header.index) != (request.epoch, request.index):
+        raise ProtocolError("its header is that of another sample, or of none")
+    if (header.names, header.dtypes) != (form.names, form.dtypes):
+        raise ProtocolError(f"it has {list(header.names)!r:.100} of {list(header.dtypes)!r:.100}")
+    if header.quarantine != request.snapshot:
+        raise ProtocolError(f"it was made under quarantine snapshot {header.quarantine}, not {request.snapshot}")
+    slot = NO_SLOT if request.slot is None else request.slot.number
+    if header.slot != slot:
+        raise ProtocolError(f"it names slot {header.slot}, slot {slot} was lent")
+    in_slot = slot != NO_SLOT and len(payload) == 1
+    if header.shapes != form.shapes or not (in_slot or tuple(map(len, payload[1:])) == form.sizes):
+        raise ProtocolError("its arrays have other shapes or sizes than were asked")
+    return header
