@@ -15,11 +15,13 @@ from pathlib import Path
 from examples.demo_training import judge
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_server.offline.picture import Row, draw_rows, write_png
+from v2v_pictures.camera import Camera
+from v2v_pictures.files import write_png
+from v2v_pictures.sheet import draw_sheet
 
 _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2
-_SHOWN = 6
+_SHOWN = 4
 _VOXELS_PER_CLIP = 10
 _CONFIGURATION = "tiny-cpu"
 
@@ -74,21 +76,17 @@ def _stream(address: str, seconds: float, workers: int, picture: Path) -> None:
         f"first {_WARMUP_BATCHES} batches left out"
     )
     with_flow = V2VStreamDataset(address, _SHOWN, ("voxels", "frames", "flow"), recipe)
-    write_png(picture, draw_rows(_rows(next(iter(with_flow)))))
+    cameras = _cameras(next(iter(with_flow)))
+    write_png(picture, draw_sheet(cameras, f"{len(cameras)} samples of the stream, each seen by a camera of its own"))
     print(f"picture: {picture}")
 
 
-def _rows(batch: Batch) -> list[Row]:
-    """For the picture: of each sample the voxel grid with most events that still shows the scene."""
-    rows = []
+def _cameras(batch: Batch) -> list[Camera]:
     arrays = {name: tensor.numpy() for name, tensor in batch.arrays.items()}
-    for number in range(len(batch)):
-        voxels, frames = arrays["voxels"][number], arrays["frames"][number]
-        pick = int(abs(voxels.astype("int32")).sum(axis=(1, 2, 3)).argmax())
-        rows.append(
-            Row(frames[pick, 0], voxels[pick], batch.provenance[number], f"voxel {pick}", arrays["flow"][number, pick])
-        )
-    return rows
+    return [
+        Camera.of({name: array[number] for name, array in arrays.items()}, batch.provenance[number], "")
+        for number in range(len(batch))
+    ]
 
 
 if __name__ == "__main__":

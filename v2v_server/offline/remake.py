@@ -10,6 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from v2v_pictures.camera import Camera, check_drawable
+from v2v_pictures.files import write_png
+from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.sample import Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -18,11 +21,13 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.picture import check_drawable, draw_sample, write_png
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
+
+_MOMENTS = 4
+"""Voxel grids that a picture shows."""
 
 
 def remake(
@@ -149,7 +154,8 @@ def simulate_to_file(
     try:
         np.savez_compressed(out, **content)
         if picture is not None:
-            write_png(picture, draw_sample(sample))
+            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe.frames_per_bin)
+            write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
     except OSError as error:
         raise UsageError(f"{error.filename or out}: {error.strerror}") from error
     params = sample.provenance.params

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2v_server.flow.colour import draw_flow, draw_wheel
+from v2v_pictures.colours import draw_flow, draw_wheel
 
-RED = (0, 0, 255)  # BGR
+RED = (255, 0, 0)
 
 
 def one(x: float, y: float, largest: float = 1.0) -> tuple[int, ...]:
@@ -16,13 +16,13 @@ def one(x: float, y: float, largest: float = 1.0) -> tuple[int, ...]:
 
 def test_directions_have_their_colours() -> None:
     assert one(1, 0) == RED
-    blue, green, red = one(0, 1)  # down: yellow
+    red, green, blue = one(0, 1)  # down: yellow
     assert blue == 0
     assert min(green, red) > 200
-    blue, green, red = one(-1, 0)  # left: between cyan and blue
+    red, green, blue = one(-1, 0)  # left: between cyan and blue
     assert blue == 255
     assert red == 0
-    blue, green, red = one(0, -1)  # up: violet
+    red, green, blue = one(0, -1)  # up: violet
     assert blue == 255
     assert green == 0
     assert red > 50
@@ -30,8 +30,8 @@ def test_directions_have_their_colours() -> None:
 
 def test_length_is_saturation_and_too_long_is_darker() -> None:
     assert one(0, 0) == (255, 255, 255)
-    assert one(0.5, 0) == (128, 128, 255)
-    assert one(2, 0) == (0, 0, 191)
+    assert one(0.5, 0) == (255, 128, 128)
+    assert one(2, 0) == (191, 0, 0)
     greens = [one(length, 0)[1] for length in np.linspace(0, 1, 11)]
     assert greens == sorted(greens, reverse=True)
 
@@ -40,7 +40,7 @@ def test_full_colour_is_the_longest_or_one_pixel() -> None:
     field = np.zeros((2, 1, 2), np.float16)
     field[0, 0] = (8.0, 4.0)
     assert tuple(draw_flow(field)[0, 0]) == RED
-    assert tuple(draw_flow(field)[0, 1]) == (128, 128, 255)
+    assert tuple(draw_flow(field)[0, 1]) == (255, 128, 128)
     assert tuple(draw_flow(field / np.float16(80))[0, 0]) != RED
     assert draw_flow(np.zeros((2, 0, 5))).shape == (0, 5, 3)
 

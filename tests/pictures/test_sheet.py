@@ -1,0 +1,227 @@
+"""Pages and films of cameras: what is known must be found at its place, in its colour."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image as Pictures
+
+from tests.protocol.test_sample import PARAMS, PROVENANCE
+from v2v_pictures.camera import Camera
+from v2v_pictures.canvas import Canvas, shortened, text_width
+from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
+from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
+from v2v_pictures.film import draw_film
+from v2v_pictures.sheet import draw_sheet
+from v2v_protocol.errors import UsageError
+
+WHITE = (255, 255, 255)
+
+
+def camera(
+    voxels: npt.NDArray[Any],
+    *,
+    pauses: tuple[tuple[int, int], ...] = (),
+    flow: npt.NDArray[Any] | None = None,
+    lead: int = 0,
+) -> Camera:
+    provenance = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, pauses=pauses))
+    count, height, width = len(voxels), *voxels.shape[2:]
+    frames = np.full((count - lead, 1, height, width), 90, np.uint8)
+    arrays = {"voxels": voxels, "frames": frames} | ({} if flow is None else {"flow": flow})
+    return Camera.of(arrays, provenance, "paper")
+
+
+def has(image: npt.NDArray[np.uint8], colour: tuple[int, ...]) -> int:
+    return int((image == colour).all(axis=-1).sum())
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.float32])
+def test_colours_of_known_events(dtype: type[np.generic]) -> None:
+    counts = np.zeros((12, 12), dtype)
+    counts[:, :4], counts[:, 8:] = 4, -4
+    image = draw_events(counts, 4.0)
+    assert (image[:, :4] == BRIGHTER).all()
+    assert (image[:, 4:8] == WHITE).all()
+    assert (image[:, 8:] == DARKER).all()
+    assert np.argmax(BRIGHTER) == 0
+    assert np.argmax(DARKER) == 2
+
+
+def test_the_least_count_of_int8_does_not_wrap() -> None:
+    """|-128| is no int8: its colour must not turn."""
+    counts = np.full((12, 12), -128, np.int8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (draw_events(counts, full_colour([counts])) == DARKER).all()
+
+
+@given(st.lists(st.integers(-128, 127), min_size=1, max_size=50))
+def test_more_events_are_never_paler(values: list[int]) -> None:
+    counts = np.sort(np.abs(np.array([values], np.int16)))
+    green = draw_events(counts, full_colour([counts]))[0, :, 1].astype(int)
+    assert (np.diff(green) <= 0).all()
+
+
+def test_full_colour_is_no_outliers() -> None:
+    counts = np.full(1000, 3, np.int8)
+    counts[0] = 127
+    assert full_colour([counts, np.zeros(5, np.int8)]) == 3.0
+    assert full_colour([np.zeros(5, np.int8)]) == 1.0
+    assert full_colour([]) == 1.0
+
+
+def test_grey_is_shown_as_it_is() -> None:
+    frame = np.array([[0, 255], [7, 200]], np.uint8)
+    assert (draw_grey(frame)[..., 1] == frame).all()
+    assert (draw_grey(frame / 255) == draw_grey(frame)).all()
+    assert draw_grey(np.array([[-1.0, 2.0]])).tolist() == [[[0, 0, 0], [255, 255, 255]]]
+
+
+def test_rates_are_events_a_pixel_of_each_sign() -> None:
+    voxels = np.zeros((2, 3, 4, 5), np.int8)
+    voxels[1, 2, 0, :] = 2
+    voxels[0, 1, 0, 0] = -128
+    rates = camera(voxels).rates
+    assert rates.shape == (2, 6)
+    assert rates[0].tolist() == [0, 0, 0, 0, 0, 0.5]
+    assert rates[1].tolist() == [0, 6.4, 0, 0, 0, 0]
+
+
+@given(st.data())
+def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> None:
+    """Against the definition, frame by frame: what the draw says of each position."""
+    grids, bins, per_bin, lead = (data.draw(st.integers(low, 4)) for low in (1, 1, 1, 0))
+    steps = (grids + lead) * bins * per_bin
+    still = data.draw(st.lists(st.booleans(), min_size=steps, max_size=steps))
+    edges = np.flatnonzero(np.diff([False, *still, False]))
+    pauses = tuple((int(start) + 1, int(end - start)) for start, end in zip(edges[::2], edges[1::2], strict=True))
+    shown = dataclasses.replace(
+        camera(np.zeros((grids + lead, bins, 2, 2), np.int8), pauses=pauses, lead=lead), frames_per_bin=per_bin
+    )
+    source = shown.provenance.params.source_index(steps)
+    expected = [
+        all(source[step + 1] == source[step] for step in range(first, first + per_bin))
+        for first in range(lead * bins * per_bin, steps, per_bin)
+    ]
+    assert shown.paused.tolist() == expected
+
+
+def test_moments_are_active_and_not_paused() -> None:
+    voxels = np.ones((20, 5, 4, 4), np.int8)
+    voxels[0] = 100  # the beginning, when every pixel waits for its first event
+    voxels[7], voxels[12] = 50, 40
+    chosen = camera(voxels, pauses=((7 * 5 + 1, 5),)).moments(1)
+    assert chosen == [12]
+    assert camera(voxels).moments(2) == [7, 12]
+    assert camera(voxels[:1]).moments(3) == [0]
+
+
+@given(st.integers(1, 30), st.integers(1, 8))
+def test_moments_are_in_order_and_different(grids: int, count: int) -> None:
+    chosen = camera(np.ones((grids, 2, 2, 2), np.int8)).moments(count)
+    assert chosen == sorted(set(chosen))
+    assert 1 <= len(chosen) <= count
+    assert all(0 <= moment < grids for moment in chosen)
+
+
+def test_lead_frames_and_voxels_stand_in_front() -> None:
+    frames = (10 * np.arange(5, dtype=np.uint8))[:, None, None, None] * np.ones((1, 1, 4, 4), np.uint8)
+    voxels = np.arange(5, dtype=np.int8)[:, None, None, None] * np.ones((1, 2, 4, 4), np.int8)
+    for arrays in ({"frames": frames, "voxels": voxels[1:]}, {"frames": frames[1:], "voxels": voxels}):
+        shown = Camera.of(arrays, PROVENANCE, "")
+        assert shown.frames[:, 0, 0].tolist() == [10, 20, 30, 40]
+        assert shown.voxels[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("name", ["voxels", "frames"])
+def test_both_arrays_are_needed(name: str) -> None:
+    with pytest.raises(UsageError, match="voxels,frames"):
+        Camera.of({name: np.zeros((2, 1, 8, 8), np.uint8)}, PROVENANCE, "")
+
+
+def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
+    voxels = np.zeros((10, 3, 32, 32), np.int8)
+    voxels[5, 0], voxels[5, 2] = 4, -4
+    sheet = draw_sheet([camera(voxels)], "title", tile_px=64)
+    assert sheet.dtype == np.uint8
+    assert has(sheet, BRIGHTER) >= 64 * 64
+    assert has(sheet, DARKER) >= 64 * 64
+    pale = voxels.copy()
+    pale[5] = np.where(pale[5] > 0, 1, 0)
+    both = draw_sheet([camera(voxels), camera(pale)], "title", tile_px=64)
+    assert has(both, BRIGHTER) < 2 * 64 * 64  # the second camera's single events are paler: it has no scale of its own
+
+
+def test_pauses_are_hatched_and_named() -> None:
+    from v2v_pictures.canvas import PAUSED
+
+    voxels = np.ones((10, 5, 16, 16), np.int8)
+    assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED) > has(
+        draw_sheet([camera(voxels)], "t"), PAUSED
+    )
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 300), (300, 1), (128, 128), (300, 200)])
+def test_a_panel_keeps_the_shape_of_its_picture(height: int, width: int) -> None:
+    page = Canvas(200, 200)
+    page.panel(10, 10, np.full((height, width, 3), BRIGHTER, np.uint8), 168, 168)
+    filled = (page.image() == BRIGHTER).all(axis=2)
+    assert max(filled.any(axis=1).sum(), filled.any(axis=0).sum()) == 168
+    assert filled.any(axis=1).sum() == max(1, round(height * 168 / max(height, width)))
+
+
+def test_a_film_has_a_picture_for_each_bin() -> None:
+    voxels = np.zeros((3, 2, 16, 16), np.int8)
+    voxels[1, 1] = 1
+    flow = np.ones((3, 2, 16, 16), np.float16)
+    film = list(draw_film([camera(voxels, flow=flow), camera(voxels, flow=flow)], "t", tile_px=32))
+    assert len(film) == 6
+    assert len({picture.shape for picture in film}) == 1
+    busiest = [has(picture, BRIGHTER) for picture in film]
+    assert busiest.index(max(busiest)) == 3
+
+
+def test_nothing_at_all_is_drawn_without_a_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")
+
+
+def test_files_read_back(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (31, 40, 3)).astype(np.uint8)
+    write_png(tmp_path / "picture.png", image)
+    assert np.array_equal(np.asarray(Pictures.open(tmp_path / "picture.png")), image)
+    film = [np.full((31, 40, 3), value, np.uint8) for value in (0, 120, 250)]
+    with av.open(io.BytesIO(mp4_bytes(film, 10.0))) as container:
+        greys = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(video=0)]
+    assert greys == pytest.approx([0, 120, 250], abs=3)
+    assert Pictures.open(io.BytesIO(gif_bytes(film, 10.0))).n_frames == 3
+    page = html_page("a <b> & c", image, film, 10.0)
+    assert "a &lt;b&gt; &amp; c" in page
+    assert "data:video/mp4;base64," in page
+    with pytest.raises(UsageError, match=r"picture\.png: No such file or directory"):
+        write_png(tmp_path / "nowhere" / "picture.png", image)
+
+
+def test_a_long_name_keeps_its_end() -> None:
+    name = "folder/" * 40 + "clip.mp4"
+    short = shortened(name, 200)
+    assert short.endswith("clip.mp4")
+    assert text_width(short) <= 200
+    assert shortened("clip.mp4", 200) == "clip.mp4"
+
+
+def test_png_of_a_view_that_is_not_contiguous() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    assert png_bytes(image[:, ::2]) == png_bytes(image[:, ::2].copy())

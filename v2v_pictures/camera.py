@@ -1,0 +1,123 @@
+"""One simulated clip as its virtual camera saw it: what to write beside it, when much happened, when it stood still."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import Provenance
+
+_SETTLED_SHARE = 0.1
+"""Moments are chosen behind this share of a clip: at its beginning every pixel still waits for its first event."""
+
+
+def check_drawable(arrays: Collection[str]) -> None:
+    """Refuses arrays that a picture cannot be made of.
+
+    Raises:
+        UsageError: voxels or frames are not among them.
+    """
+    if not {"voxels", "frames"} <= set(arrays):
+        raise UsageError("a picture needs both arrays: voxels,frames")
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A clip and its camera.
+
+    Attributes:
+        voxels: [T, bins, H, W], signed event counts.
+        frames: [T, H, W] uint8; frame t closes voxel grid t.
+        flow: [T, 2, H, W], px, or None.
+        title: for instance the recipe's name.
+        provenance: where the clip came from, and the draw.
+        frames_per_bin: of the recipe; a pause is a run of repeated frames.
+        lead_voxels: voxel grids of the clip in front of the first one here.
+    """
+
+    voxels: npt.NDArray[Any]
+    frames: npt.NDArray[np.uint8]
+    flow: npt.NDArray[Any] | None
+    title: str
+    provenance: Provenance
+    frames_per_bin: int = 1
+    lead_voxels: int = 0
+
+    @classmethod
+    def of(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], provenance: Provenance, title: str, frames_per_bin: int = 1
+    ) -> Camera:
+        """From the arrays of one sample. Lead frames and lead voxels, which stand in front, are left out.
+
+        Raises:
+            UsageError: voxels or frames are not among the arrays.
+        """
+        check_drawable(arrays)
+        voxels, frames, flow = arrays["voxels"], arrays["frames"][:, 0], arrays.get("flow")
+        count = min(len(array) for array in (voxels, frames, flow) if array is not None)
+        return cls(
+            np.asarray(voxels[len(voxels) - count :]),
+            np.asarray(frames[len(frames) - count :]),
+            None if flow is None else np.asarray(flow[len(flow) - count :]),
+            title,
+            provenance,
+            frames_per_bin,
+            len(voxels) - count,
+        )
+
+    @property
+    def rates(self) -> npt.NDArray[np.float64]:
+        """[2, T * bins]: events a pixel in each bin, brighter and darker. A signed bin counts with its sign alone."""
+        flat = self.voxels.reshape(-1, *self.voxels.shape[2:])
+        brighter = [np.maximum(each, 0).mean(dtype=np.float64) for each in flat]
+        darker = [np.maximum(-each.astype(np.float32), 0).mean(dtype=np.float64) for each in flat]
+        return np.array([brighter, darker])
+
+    @property
+    def paused(self) -> npt.NDArray[np.bool_]:
+        """[T * bins]: whether the camera stood still: every frame of the bin repeats the one before."""
+        grids, bins = self.voxels.shape[:2]
+        still = np.zeros(((self.lead_voxels + grids) * bins, self.frames_per_bin), np.bool_)
+        for first, length in self.provenance.params.pauses:
+            still.reshape(-1)[first - 1 : first - 1 + length] = True  # positions count from 1
+        still_bins: npt.NDArray[np.bool_] = np.all(still, axis=1)
+        return still_bins[self.lead_voxels * bins :]
+
+    def moments(self, count: int) -> list[int]:
+        """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled."""
+        bins = self.voxels.shape[1]
+        activity = self.rates.sum(axis=0).reshape(-1, bins).sum(axis=1)
+        moving = ~self.paused.reshape(-1, bins).any(axis=1)
+        first = min(round(len(activity) * _SETTLED_SHARE), len(activity) - 1)
+        edges = np.linspace(first, len(activity), min(count, len(activity) - first) + 1).round().astype(int)
+        score = np.where(moving, activity, activity - activity.max(initial=0.0) - 1)
+        return [int(start + np.argmax(score[start:end])) for start, end in pairwise(edges)]
+
+    def describe(self) -> str:
+        """The draw in one line."""
+        params = self.provenance.params
+        parts = [
+            f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}",
+            f"noise {params.noise_sigma:.3f}",
+            f"{params.hot_pixel_count} hot pixels",
+        ]
+        if params.scale != 1.0:
+            parts.append(f"resized by {params.scale:.2f}")
+        if params.flip:
+            parts.append("mirrored")
+        if params.contrast:
+            parts.append(f"contrast {params.contrast:.2f}")
+        effects = params.to_dict().get("effects", {})
+        parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in effects.items() if value]
+        return "   ".join(parts)
+
+    @property
+    def source(self) -> str:
+        """Video and first frame."""
+        return f"{self.provenance.video}, from frame {self.provenance.start_frame}"

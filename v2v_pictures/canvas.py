@@ -1,0 +1,115 @@
+"""A page to draw on: text, panels with a border, bars, arrows, hatching. Positions are px from the top left corner."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+from PIL import Image as Pictures
+from PIL import ImageDraw, ImageFont
+
+from v2v_pictures.colours import Image
+
+Colour = tuple[int, int, int]
+
+PAPER: Colour = (255, 255, 255)
+INK: Colour = (28, 30, 34)
+SOFT: Colour = (104, 108, 116)
+LINE: Colour = (186, 190, 198)
+SHADE: Colour = (241, 242, 245)
+MARK: Colour = (224, 150, 0)
+PAUSED: Colour = (206, 209, 216)
+
+TITLE_PT, HEADING_PT, TEXT_PT = 22, 16, 13
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)  # Pillow carries it, so that a page looks alike on every host
+
+
+class Canvas:
+    """A white page.
+
+    Args:
+        width_px, height_px: its size.
+    """
+
+    def __init__(self, width_px: int, height_px: int) -> None:
+        self.width_px, self.height_px = width_px, height_px
+        self._page = Pictures.new("RGB", (width_px, height_px), PAPER)
+        self._draw = ImageDraw.Draw(self._page)
+
+    def text(
+        self, x: float, y: float, text: str, *, size: int = TEXT_PT, colour: Colour = INK, anchor: str = "la"
+    ) -> float:
+        """Writes one line and returns where it ends. ``anchor`` is Pillow's: "la" left top, "ma" middle top, "ra"."""
+        self._draw.text((x, y), text, fill=colour, font=_font(size), anchor=anchor)
+        return x + text_width(text, size)
+
+    def panel(self, x: int, y: int, image: Image, width_px: int, height_px: int) -> None:
+        """A picture with a thin border, scaled into the given size with its shape kept, on a shade where it is less."""
+        height, width = image.shape[:2]
+        scale = min(width_px / width, height_px / height)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        whole = max(1, math.ceil(scale))
+        # Enlarged by a whole factor first, so that every pixel gets the same area whatever the scale.
+        enlarged = np.ascontiguousarray(image.repeat(whole, axis=0).repeat(whole, axis=1))
+        scaled = Pictures.fromarray(enlarged).resize(size, Pictures.Resampling.BOX)
+        self.box(x, y, x + width_px, y + height_px, SHADE)
+        self._page.paste(scaled, (x + (width_px - size[0]) // 2, y + (height_px - size[1]) // 2))
+        self._draw.rectangle((x - 1, y - 1, x + width_px, y + height_px), outline=LINE)
+
+    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
+        """A filled rectangle up to but without right and bottom; nothing where that is no whole pixel."""
+        left, top, right, bottom = map(round, (left, top, right, bottom))
+        if right > left and bottom > top:
+            self._draw.rectangle((left, top, right - 1, bottom - 1), fill=colour)
+
+    def frame(self, left: float, top: float, right: float, bottom: float, colour: Colour = LINE) -> None:
+        """A rectangle's outline."""
+        self._draw.rectangle((left, top, right, bottom), outline=colour)
+
+    def line(self, x0: float, y0: float, x1: float, y1: float, colour: Colour = LINE, width_px: int = 1) -> None:
+        """A straight line."""
+        self._draw.line((x0, y0, x1, y1), fill=colour, width=width_px)
+
+    def arrow(self, x0: float, y: float, x1: float, colour: Colour = SOFT) -> None:
+        """A horizontal arrow to the right."""
+        self._draw.line((x0, y, x1 - 5, y), fill=colour)
+        self._draw.polygon(((x1, y), (x1 - 8, y - 4), (x1 - 8, y + 4)), fill=colour)
+
+    def pointer(self, x: float, y: float, colour: Colour = MARK) -> None:
+        """A small triangle whose tip points down at (x, y)."""
+        self._draw.polygon(((x, y), (x - 5, y - 8), (x + 5, y - 8)), fill=colour)
+
+    def hatch(self, left: float, top: float, right: float, bottom: float) -> None:
+        """The sign of a paused camera: slanted lines on a shade."""
+        if right - left < 1:
+            return
+        self.box(left, top, right, bottom, SHADE)
+        height = round(bottom - top)
+        stripes = Pictures.new("RGB", (max(1, round(right - left)), height), SHADE)
+        pen = ImageDraw.Draw(stripes)
+        for start in range(-height, stripes.width, 7):
+            pen.line((start, height, start + height, 0), fill=PAUSED, width=2)
+        self._page.paste(stripes, (round(left), round(top)))
+
+    def image(self) -> Image:
+        """The page: [height, width, 3] uint8 RGB."""
+        return np.asarray(self._page, np.uint8).copy()
+
+
+def text_width(text: str, size: int = TEXT_PT) -> float:
+    """px that a line takes."""
+    return float(_font(size).getlength(text))
+
+
+def shortened(text: str, width_px: float, size: int = TEXT_PT) -> str:
+    """The text, or as much of its end as fits behind three dots."""
+    if text_width(text, size) <= width_px:
+        return text
+    while text and text_width("..." + text, size) > width_px:
+        text = text[1:]
+    return "..." + text

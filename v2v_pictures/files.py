@@ -1,0 +1,89 @@
+"""Pictures and films as files. The ending of the name says which."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from PIL import Image as Pictures
+
+from v2v_pictures.colours import Image
+from v2v_protocol.errors import UsageError
+
+_GIF_COLOURS = 96
+_QUALITY = "20"  # x264's rate factor: no visible loss of thin red and blue lines
+
+
+def png_bytes(image: Image) -> bytes:
+    """[h, w, 3] uint8 RGB as PNG."""
+    file = io.BytesIO()
+    Pictures.fromarray(np.ascontiguousarray(image)).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def gif_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
+    """A film as GIF, of few colours, so that it fits a page."""
+    pages = [Pictures.fromarray(np.ascontiguousarray(image)) for image in film]
+    few_pages = [np.asarray(pages[number]) for number in {0, len(pages) // 2, len(pages) - 1}]
+    palette = Pictures.fromarray(np.concatenate(few_pages)).quantize(_GIF_COLOURS)
+    few = [page.quantize(palette=palette, dither=Pictures.Dither.NONE) for page in pages]
+    file = io.BytesIO()
+    milliseconds = round(1000 / frames_per_second)
+    few[0].save(file, "GIF", save_all=True, append_images=few[1:], duration=milliseconds, loop=0, optimize=True)
+    return file.getvalue()
+
+
+def mp4_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
+    """A film as H.264 in MP4, which every browser and projector plays."""
+    file = io.BytesIO()
+    height, width = (side // 2 * 2 for side in film[0].shape[:2])  # 4:2:0 wants even sides
+    with av.open(file, "w", format="mp4") as container:
+        rate = Fraction(frames_per_second).limit_denominator(1000)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": _QUALITY, "preset": "medium"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for image in film:
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    return file.getvalue()
+
+
+def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second: float) -> str:
+    """One HTML file that holds the sheet and the film, and needs nothing else."""
+    picture = base64.b64encode(png_bytes(sheet)).decode()
+    movie = base64.b64encode(mp4_bytes(film, frames_per_second)).decode() if film else ""
+    video = f'<video controls loop autoplay muted src="data:video/mp4;base64,{movie}"></video>' if movie else ""
+    return (
+        f'<!doctype html><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        "<style>body{font-family:sans-serif;margin:2rem auto;max-width:1600px;padding:0 1rem;background:#fff}"
+        "img,video{max-width:100%;height:auto;display:block;margin:1rem 0}</style>"
+        f"<h1>{html.escape(title)}</h1>{video}"
+        f'<img alt="frames, event bins and flow of each virtual camera" src="data:image/png;base64,{picture}">\n'
+    )
+
+
+def write(path: Path, content: bytes | str) -> None:
+    """Writes a file.
+
+    Raises:
+        UsageError: the folder is missing or cannot be written.
+    """
+    try:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Writes a picture as PNG.
+
+    Raises:
+        UsageError: the folder is missing or cannot be written.
+    """
+    write(path, png_bytes(image))

@@ -1,0 +1,134 @@
+"""`v2v-preview`: what a recipe makes of a video, to look at, without a server.
+
+One clip for each virtual camera, made by the very functions that a server's worker uses, so what is shown is what a
+trainer gets. A video too short or too small for the recipe is shown with shorter clips or smaller crops, and said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from v2v_pictures.camera import Camera
+from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write
+from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
+from v2v_pictures.sheet import draw_sheet
+from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.remake import remake
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+
+KINDS = (".png", ".mp4", ".gif", ".html")
+_SMALLEST_CROP_PX = 16
+_GIF_EVERY = 2  # every other bin: half the size
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One camera of a preview.
+
+    Attributes:
+        title: written beside it.
+        recipe: fields or a preset's name.
+        seed: of the sample.
+    """
+
+    title: str
+    recipe: Any
+    seed: int
+
+
+def preview(
+    source: str,
+    out: Path,
+    looks: Sequence[Look],
+    spec: Mapping[str, Any],
+    *,
+    title: str,
+    list_file: str | None = None,
+    rows: str = "full",
+    with_flow: bool = True,
+    moments: int = 1,
+    cache_dir: str | None = None,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Makes the cameras' clips, draws them, writes the file.
+
+    Args:
+        source, list_file, rows: the corpus, as for a server.
+        out: .png (a sheet), .mp4 or .gif (a film), or .html (both in one file).
+        looks: the cameras.
+        spec: other fields of the StreamSpec; None in any takes the default.
+        title: of the page.
+        with_flow: show optical flow too.
+        moments: voxel grids to show of each camera on a sheet.
+        cache_dir: folder of the catalogue index; None: the user's cache.
+        say: takes each line for the user.
+
+    Raises:
+        UsageError: an ending that is none of these, a wrong recipe, or a file that cannot be written.
+        CorpusError: no video can be used, even with short clips and small crops.
+        SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
+    """
+    if out.suffix not in KINDS:
+        raise UsageError(f"--out {out}: give a name that ends in {', '.join(KINDS)}")
+    write(out, b"")  # before any work: whether it can be written
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), cache_dir=cache_dir)
+    try:
+        cameras = [_camera(catalogue, look, spec, with_flow, say) for look in looks]
+    finally:
+        catalogue.close()
+    write(out, _content(out.suffix, cameras, title, moments))
+    say(f"{out}: {len(cameras)} cameras")
+
+
+def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
+    if kind == ".png":
+        return png_bytes(draw_sheet(cameras, title, moments=moments))
+    film = list(draw_film(cameras, title))
+    if kind == ".mp4":
+        return mp4_bytes(film, FRAMES_PER_SECOND)
+    if kind == ".gif":
+        return gif_bytes(film[::_GIF_EVERY], FRAMES_PER_SECOND / _GIF_EVERY)
+    return html_page(title, draw_sheet(cameras, title, moments=moments), film, FRAMES_PER_SECOND)
+
+
+def _camera(
+    catalogue: Catalogue, look: Look, spec: Mapping[str, Any], with_flow: bool, say: Callable[[str], None]
+) -> Camera:
+    stream = StreamSpec.from_dict({**spec, "recipe": look.recipe})
+    fitted = _fitted(catalogue, stream)
+    if fitted != stream.recipe:
+        say(
+            f"{look.title}: shown with {fitted.voxels_per_clip} voxel grids of {fitted.crop_width_px} x "
+            f"{fitted.crop_height_px} instead of {stream.recipe.voxels_per_clip} of {stream.recipe.crop_width_px} x "
+            f"{stream.recipe.crop_height_px}: no video here is long and large enough for more"
+        )
+        stream = StreamSpec.from_dict({**spec, "recipe": fitted})
+    arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
+    sample = remake(catalogue, stream, seed=look.seed, epoch=0, index=0, arrays=arrays)
+    return Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin)
+
+
+def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
+    """The recipe, with clips as long and crops as large as the videos admit, if they admit less."""
+    recipe = stream.recipe
+    while True:
+        table = SequenceTable(catalogue.videos, catalogue.rows, stream)
+        if table.count:
+            return recipe
+        longest = max(rejection.voxels_per_clip for rejection in table.rejections)
+        if longest:
+            recipe = recipe.replace(voxels_per_clip=longest)
+        elif min(recipe.crop_height_px, recipe.crop_width_px) * 3 // 4 >= _SMALLEST_CROP_PX:
+            smaller = (side * 3 // 4 for side in (recipe.crop_height_px, recipe.crop_width_px))
+            recipe = recipe.replace(**dict(zip(("crop_height_px", "crop_width_px"), smaller, strict=True)))
+        else:
+            first = table.rejections[0]
+            raise CorpusError(f"no video can be shown: {first.video}: {first.reason}")
+        stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": recipe})
