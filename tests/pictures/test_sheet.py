@@ -18,7 +18,7 @@ from PIL import Image as Pictures
 
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import Canvas, shortened, text_width
+from v2v_pictures.canvas import PAUSED, Canvas, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
@@ -164,7 +164,6 @@ def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
 
 
 def test_pauses_are_hatched_and_named() -> None:
-    from v2v_pictures.canvas import PAUSED
 
     voxels = np.ones((10, 5, 16, 16), np.int8)
     assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED) > has(
