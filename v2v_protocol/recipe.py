@@ -21,7 +21,6 @@ equations and sources are in ``docs/effects.md``.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,11 +28,27 @@ from typing import Any
 
 from v2v_protocol.errors import RecipeError
 from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
-from v2v_protocol.recipe_fields import check_limits, coerced
+from v2v_protocol.settings import (
+    Setting,
+    check_settings,
+    nearest,
+    number,
+    require_known,
+    settings_of,
+    shown,
+    span,
+    switch,
+    whole,
+    word,
+)
 
 Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""
 
+LARGEST_SIDE_PX = 16_384
+LARGEST_SCALE = 100.0
+EFFECTS = "Effects beyond the paper's model; zero is off"
+"""The group of fields that switch on an effect where the upper end of their range is above zero."""
 _LARGEST_FRAMES = 1_000_001
 SMALLEST_THRESHOLD_SHARE = 0.25
 """No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
@@ -47,94 +62,76 @@ LARGEST_EVENTS = 2.0**49
 class Recipe:
     """Ranges of one virtual camera. Frozen, hashable, validated on construction.
 
-    Clip
-        voxels_per_clip: T, voxel grids of a clip.
-        bins: B, bins of one voxel grid.
-        frames_per_bin: steps between video frames that fall into one bin.
-        lead_frames: 1 puts the frame before the first target frame in front (flow networks), else 0.
-        lead_voxels: 1 puts one more voxel grid in front (ERAFT), else 0.
-        frame_stride: n uses every n-th frame, as if the video had been recorded at 1/n of its rate.
-
-    View
-        crop_height_px, crop_width_px: size of the random crop, pixels.
-        resize_scale: scale of the picture before the crop; raised where the crop would not fit otherwise, as far as
-            the upper end allows.
-        flip_probability: chance of a horizontal flip.
-        pause_probability: chance, per frame, that a running camera stops (the frame repeats).
-        pause_stay_probability: chance, per frame, that a stopped camera stays so.
-        contrast_probability: chance that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up.
-        contrast_scale: range of s.
-
-    Intensity
-        gamma: exponent of the reverse gamma correction.
-        log_eps: epsilon inside the logarithm.
-
-    Pixel
-        threshold: smaller of the two contrast thresholds, log-intensity units.
-        threshold_ratio: the other one, as a multiple; a coin says which of the two is the positive one.
-        threshold_source: "sample" draws thresholds afresh for every sample; "video" once per video for ever (taken
-            from the list file where it states them).
-        noise_sigma: standard deviation of the noise, log units per frame, or per square root of a second.
-        noise_scales_with_threshold: True multiplies noise_sigma by the drawn positive threshold.
-        hot_pixel_share: share of the crop's pixels that are hot.
-        hot_pixel_sigma: standard deviation of a hot pixel's constant drift, log units per frame, or per second.
-        noise_unit: "frame" or "second": the time base of noise_sigma and hot_pixel_sigma.
-
-    Effects beyond the paper's model; zero is off
-        threshold_mismatch_sigma: standard deviation of each pixel's thresholds, as a share of the nominal ones.
-        shot_noise_hz: noise events of a black pixel, a second, both polarities together; a white one has a quarter.
-        leak_hz: positive events a second that every pixel fires by itself.
-        refractory_seconds: how long a pixel is blind after an event.
-        photoreceptor_hz: corner frequency of a white pixel's low-pass; 0 is none at all, so no range begins there.
-        dead_pixel_share: share of the crop's pixels that never fire.
-
     Raises:
         RecipeError: a value is outside its limits; the message names the field, the value and the limit.
     """
 
-    voxels_per_clip: int = 40
-    bins: int = 5
-    frames_per_bin: int = 1
-    lead_frames: int = 0
-    lead_voxels: int = 0
-    frame_stride: int = 1
+    voxels_per_clip: int = whole(40, 1, 1_000_000, "T, voxel grids of a clip", group="Clip")
+    bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
+    frames_per_bin: int = whole(1, 1, 1024, "steps between video frames that fall into one bin")
+    lead_frames: int = whole(0, 0, 1, "1 puts the frame before the first target frame in front (flow networks)")
+    lead_voxels: int = whole(0, 0, 1, "1 puts one more voxel grid in front (ERAFT)")
+    frame_stride: int = whole(1, 1, 1000, "n uses every n-th frame, as if the video's rate were 1/n of what it is")
 
-    crop_height_px: int = 128
-    crop_width_px: int = 128
-    resize_scale: Range = (1.0, 1.0)
-    flip_probability: float = 0.5
-    pause_probability: float = 0.0102
-    pause_stay_probability: float = 0.9791
-    contrast_probability: float = 0.0
-    contrast_scale: Range = (1.0, 3.0)
+    crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
+    crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
+    resize_scale: Range = span(
+        (1.0, 1.0), 0.01, LARGEST_SCALE,
+        "scale of the picture before the crop; raised, as far as the upper end allows, where the crop would not fit",
+    )  # fmt: skip
+    flip_probability: float = number(0.5, 0.0, 1.0, "chance of a horizontal flip")
+    pause_probability: float = number(
+        0.0102, 0.0, 1.0, "chance, per frame, that a running camera stops (the frame repeats)"
+    )
+    pause_stay_probability: float = number(0.9791, 0.0, 1.0, "chance, per frame, that a stopped camera stays so")
+    contrast_probability: float = number(
+        0.0, 0.0, 1.0, "chance that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up"
+    )
+    contrast_scale: Range = span((1.0, 3.0), 0.0, 100.0, "range of s in contrast_probability")
 
-    gamma: float = 2.2
-    log_eps: float = 0.001
+    gamma: float = number(2.2, 0.05, 20.0, "exponent of the reverse gamma correction", group="Intensity")
+    log_eps: float = number(0.001, 1e-12, 1.0, "epsilon inside the logarithm")
 
-    threshold: Range = (0.05, 2.0)
-    threshold_ratio: Range = (1.0, 1.5)
-    threshold_source: str = "sample"
-    noise_sigma: Range = (0.0, 0.1)
-    noise_scales_with_threshold: bool = False
-    hot_pixel_share: Range = (0.0, 0.001)
-    hot_pixel_sigma: Range = (0.0, 10.0)
-    noise_unit: str = "frame"
+    threshold: Range = span(
+        (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
+    )
+    threshold_ratio: Range = span(
+        (1.0, 1.5), 1e-6, 1e6, "the other threshold, as a multiple; a coin says which of the two is the positive one"
+    )
+    threshold_source: str = word(
+        "sample", ("sample", "video"),
+        "sample draws thresholds afresh for every sample; video once per video for ever (those of the list file, if it "
+        "states any)",
+    )  # fmt: skip
+    noise_sigma: Range = span(
+        (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
+        unit="log units",
+    )  # fmt: skip
+    noise_scales_with_threshold: bool = switch(False, "multiply noise_sigma by the drawn positive threshold")
+    hot_pixel_share: Range = span((0.0, 0.001), 0.0, 1.0, "share of the crop's pixels that are hot")
+    hot_pixel_sigma: Range = span(
+        (0.0, 10.0), 0.0, 1e9, "standard deviation of a hot pixel's constant drift, per frame, or per second",
+        unit="log units",
+    )  # fmt: skip
+    noise_unit: str = word("frame", ("frame", "second"), "the time base of noise_sigma and hot_pixel_sigma")
 
-    threshold_mismatch_sigma: Range = (0.0, 0.0)
-    shot_noise_hz: Range = (0.0, 0.0)
-    leak_hz: Range = (0.0, 0.0)
-    refractory_seconds: Range = (0.0, 0.0)
-    photoreceptor_hz: Range = (0.0, 0.0)
-    dead_pixel_share: Range = (0.0, 0.0)
+    threshold_mismatch_sigma: Range = span(
+        (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
+        group=EFFECTS,
+    )  # fmt: skip
+    shot_noise_hz: Range = span(
+        (0.0, 0.0), 0.0, 1e4, "noise events of a black pixel, both polarities together; a white one has a quarter",
+        unit="Hz",
+    )  # fmt: skip
+    leak_hz: Range = span((0.0, 0.0), 0.0, 1e4, "positive events that every pixel fires by itself", unit="Hz")
+    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "how long a pixel is blind after an event", unit="s")
+    photoreceptor_hz: Range = span(
+        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass", unit="Hz", off=True
+    )
+    dead_pixel_share: Range = span((0.0, 0.0), 0.0, 1.0, "share of the crop's pixels that never fire")
 
     def __post_init__(self) -> None:
-        values = {
-            field.name: coerced(field.name, getattr(self, field.name), field.default)
-            for field in dataclasses.fields(self)
-        }
-        check_limits(values)
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        check_settings(self, "recipe {}".format, RecipeError)
         if self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
@@ -151,12 +148,14 @@ class Recipe:
     @property
     def has_effects(self) -> bool:
         """True where a draw may switch on an effect beyond the paper's model."""
-        return self.timed_effects or self.threshold_mismatch_sigma[1] > 0.0 or self.dead_pixel_share[1] > 0.0
+        return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
 
     @property
     def timed_effects(self) -> bool:
         """True where a draw may switch on an effect that is stated in Hz or seconds."""
-        return max(self.shot_noise_hz[1], self.leak_hz[1], self.refractory_seconds[1], self.photoreceptor_hz[1]) > 0.0
+        return any(
+            getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in ("Hz", "s")
+        )
 
     @property
     def needs_seconds(self) -> bool:
@@ -245,11 +244,13 @@ class Recipe:
         Raises:
             RecipeError: an unknown key or a bad value.
         """
-        known = [field.name for field in dataclasses.fields(self)]
-        for key in changes:
-            if key not in known:
-                raise RecipeError(f"unknown recipe key {key!r}{_nearest(key, known)}; known: {', '.join(known)}")
+        require_known(changes, settings_of(Recipe), "recipe key", RecipeError)
         return dataclasses.replace(self, **changes)
+
+
+def effect_settings() -> dict[str, Setting]:
+    """The fields of a recipe that switch on an effect beyond the paper's model."""
+    return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
 
 
 def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
@@ -285,11 +286,6 @@ def preset(name: object) -> Recipe:
         RecipeError: no such preset; the message lists them.
     """
     if not isinstance(name, str) or name not in PRESETS:
-        raise RecipeError(f"unknown recipe preset {name!r}{_nearest(str(name), list(PRESETS))}; "
-                          f"known: {', '.join(PRESETS)}")  # fmt: skip
+        near, known = nearest(name, PRESETS), ", ".join(PRESETS)
+        raise RecipeError(f"unknown recipe preset {shown(name)}{near}; known: {known}")
     return PRESETS[name]
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

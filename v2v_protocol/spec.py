@@ -8,23 +8,29 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
+from v2v_protocol.settings import check_settings, nearest, require_known, settings_of, shown, switch, whole, word
 
-FLOW_METHODS = (
+VoxelDtype = Literal["int8", "int16", "float32"]
+OnBadVideo = Literal["substitute", "raise"]
+LoopFilter = Literal["exact", "skip-unreferenced", "skip"]
+FlowMethod = Literal[
     "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-lean", "dis-fast-1",
     "dis-fast-1-stride-6", "dis-medium", "dis-medium-0",
     "farneback", "sparse-to-dense", "deepflow",
-)  # fmt: skip
-FLOW_DIRECTIONS = ("forward", "backward")
-LARGEST_FLOW_MARGIN_PX = 16_384
+]  # fmt: skip
+FlowDirection = Literal["forward", "backward"]
+SceneChoice = Literal["off", "auto"]
+VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
+LOOP_FILTERS: tuple[LoopFilter, ...] = get_args(LoopFilter)
+FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
+ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
+FLOW_DIRECTIONS: tuple[FlowDirection, ...] = get_args(FlowDirection)
+SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
 MOST_SAMPLES_PER_DECODE = 32
-SCENES = ("off", "auto")
-VOXEL_DTYPES = ("int8", "int16", "float32")
-LOOP_FILTERS = ("exact", "skip-unreferenced", "skip")
-ON_BAD_VIDEO = ("substitute", "raise")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,59 +42,69 @@ class StreamSpec:
 
     Attributes:
         recipe: the virtual cameras and views to draw from.
-        voxel_dtype: "int8" saturates at -127 .. 127 and counts the saturated bins in the provenance; "int16"
-            saturates at -32767 .. 32767 likewise; "float32" is exact up to 2**24 events a bin.
-        shuffle: False streams the sequences in catalogue order in every epoch.
-        max_sequences_per_video: most sequences one video contributes to an epoch (paper: 10).
-        on_bad_video: "substitute" serves the next candidate of an index whose video fails, and says so in the
-            provenance; "raise" makes the consumer raise SampleUnavailable.
-        loop_filter: "exact" decodes as the standard says; "skip-unreferenced" leaves out the deblocking of frames that
-            no other frame refers to, "skip" that of all frames: faster where the decoder knows how (H.264, HEVC, VP8,
-            VP9), at the price of visible blocks.
-        samples_per_decode: K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its
-            own. They are no more alike in their cameras than any others, but they show the same scene. An epoch has K
-            samples of every sequence.
-        sibling_spacing: how far apart in the epoch those K are (``v2v_server.schedule.epoch``); 0 where K = 1. A
-            consumer that leaves it 0 with K > 1 gets its own stride from batch to batch, so that no batch holds two.
-        flow_method: how flow is estimated where it is asked for; "auto" chooses for each step by how much moves.
-        flow_direction: "forward", on the grid of a step's earlier frame, or "backward", on that of the later one.
-        flow_from: flow of the voxels before this one is not computed but zero.
-        flow_margin_px: flow is estimated on the crop and this much of the picture around it; -1: on all of it.
-        scene: "off" treats all clips alike; "auto" leaves out sequences with a cut or with nothing to see, and chooses
-            the flow of each step where ``flow_method`` is "auto", both by statistics that the catalogue must have.
+
+    The K samples of one decode (``samples_per_decode``) are no more alike in their cameras than any others, but they
+    show the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart
+    (``v2v_server.schedule.epoch``).
 
     Raises:
         UsageError: a value outside its choices or limits.
     """
 
     recipe: Recipe = dataclasses.field(default_factory=Recipe)
-    voxel_dtype: str = "int8"
-    shuffle: bool = True
-    max_sequences_per_video: int = 10
-    on_bad_video: str = "substitute"
-    loop_filter: str = "exact"
-    samples_per_decode: int = 1
-    sibling_spacing: int = 0
-    flow_method: str = "auto"
-    flow_direction: str = "forward"
-    flow_from: int = 0
-    flow_margin_px: int = 64
-    scene: str = "off"
+    voxel_dtype: VoxelDtype = word(
+        "int8", VoxelDtype,
+        "int8 saturates at -127 .. 127 and int16 at -32767 .. 32767, and saturated bins are counted in the provenance; "
+        "float32 is exact up to 2**24 events a bin",
+        group="Stream",
+    )  # fmt: skip
+    shuffle: bool = switch(True, "another order in every epoch; false is the catalogue's order")
+    max_sequences_per_video: int = whole(10, 1, 1_000_000, "most sequences that one video contributes to an epoch")
+    on_bad_video: OnBadVideo = word(
+        "substitute", OnBadVideo,
+        "what becomes of a sample whose video fails: substitute makes it from the next candidate and says so in the "
+        "provenance; raise makes the consumer raise SampleUnavailable",
+    )  # fmt: skip
+    loop_filter: LoopFilter = word(
+        "exact", LoopFilter, "deblocking: of all frames, not of those that no other refers to, or of none"
+    )
+    samples_per_decode: int = whole(
+        1, 1, MOST_SAMPLES_PER_DECODE,
+        "K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its own",
+    )  # fmt: skip
+    sibling_spacing: int = whole(
+        0,
+        0,
+        2**40,
+        "how far apart in the epoch those K samples are; 0: a batch of the consumer, so that none holds two",
+    )
+    flow_method: FlowMethod = word(
+        "auto", FlowMethod,
+        "how flow is estimated where it is asked for; auto chooses for each step by how much moves",
+        group="Flow",
+    )  # fmt: skip
+    flow_direction: FlowDirection = word(
+        "forward", FlowDirection, "on the grid of a step's earlier frame (forward) or of its later one (backward)"
+    )
+    flow_from: int = whole(0, 0, 1_000_000, "flow of the voxels before this one is not computed but zero")
+    flow_margin_px: int = whole(
+        64, -1, LARGEST_SIDE_PX, "flow is estimated on the crop and this much of the picture around it; -1: on all",
+        unit="px",
+    )  # fmt: skip
+    scene: SceneChoice = word(
+        "off", SceneChoice,
+        "auto decodes all videos once, leaves out sequences with a cut or with nothing to see, and spares flow where "
+        "nothing moves (if flow_method is auto)",
+        group="Scene",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
-        _choose("voxel_dtype", self.voxel_dtype, VOXEL_DTYPES)
-        _choose("on_bad_video", self.on_bad_video, ON_BAD_VIDEO)
-        _choose("loop_filter", self.loop_filter, LOOP_FILTERS)
-        _choose("flow_method", self.flow_method, FLOW_METHODS)
-        _choose("flow_direction", self.flow_direction, FLOW_DIRECTIONS)
-        _choose("scene", self.scene, SCENES)
-        _whole("flow_from", self.flow_from, 0, self.recipe.voxels_per_clip)
-        _whole("flow_margin_px", self.flow_margin_px, -1, LARGEST_FLOW_MARGIN_PX)
-        if not isinstance(self.shuffle, bool):
-            raise UsageError(f"spec shuffle = {self.shuffle!r}: give true or false")
-        _whole("max_sequences_per_video", self.max_sequences_per_video, 1, 1_000_000)
-        _whole("samples_per_decode", self.samples_per_decode, 1, MOST_SAMPLES_PER_DECODE)
-        _whole("sibling_spacing", self.sibling_spacing, 0, 2**40)
+        check_settings(self, "spec {}".format)
+        if self.flow_from > self.recipe.voxels_per_clip:
+            raise UsageError(
+                f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
+                f"= {self.recipe.voxels_per_clip}"
+            )
         if self.samples_per_decode == 1 and self.sibling_spacing:
             raise UsageError(
                 f"spec sibling_spacing = {self.sibling_spacing} says how far apart the samples of one decode are, and "
@@ -126,14 +142,10 @@ class StreamSpec:
         base = cls() if default is None else default
         if values.get("preset") is not None:
             base = speed_preset(values["preset"], base)
-        known = [field.name for field in dataclasses.fields(cls)]
-        changes: dict[str, Any] = {}
-        for key, value in values.items():
-            if key == "preset" or value is None:
-                continue
-            if key not in known:
-                raise UsageError(f"unknown spec key {key!r}; known: preset, {', '.join(known)}")
-            changes[key] = _recipe(value, base.recipe) if key == "recipe" else value
+        require_known(values, SPEC_KEYS, "spec key")
+        changes = {key: value for key, value in values.items() if key != "preset" and value is not None}
+        if "recipe" in changes:
+            changes["recipe"] = _recipe(changes["recipe"], base.recipe)
         if changes.get("samples_per_decode") == 1:
             changes.setdefault("sibling_spacing", 0)
         return dataclasses.replace(base, **changes)
@@ -146,6 +158,10 @@ class StreamSpec:
     def digest(self) -> str:
         """32 hexadecimal digits that name this spec."""
         return _digest(self)
+
+
+SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))
+"""What :meth:`StreamSpec.from_dict` takes."""
 
 
 # Asked for with every lease, and a spec never changes.
@@ -174,7 +190,8 @@ def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
         UsageError: no such preset.
     """
     if not isinstance(name, str) or name not in SPEED_PRESETS:
-        raise UsageError(f"unknown preset {name!r}: choose one of {', '.join(SPEED_PRESETS)}")
+        near, known = nearest(name, SPEED_PRESETS), ", ".join(SPEED_PRESETS)
+        raise UsageError(f"unknown preset {shown(name)}{near}; known: {known}")
     return dataclasses.replace(base, sibling_spacing=0, **SPEED_PRESETS[name])
 
 
@@ -185,15 +202,3 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         named = {str(key): item for key, item in value.items()}
         return Recipe.from_dict(named) if "preset" in named else base.replace(**named)
     return preset(value)
-
-
-def _whole(name: str, value: object, low: int, high: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise UsageError(f"spec {name} = {value!r}: give a whole number from {low} to {high}")
-
-
-def _choose(name: str, value: object, words: tuple[str, ...]) -> None:
-    if value not in words:
-        # scene: off in a YAML file, of which the message would show nothing that was written.
-        hint = " (YAML reads off as a truth value: put it in quotes)" if value is False and "off" in words else ""
-        raise UsageError(f"spec {name} = {value!r}: choose one of {', '.join(words)}{hint}")

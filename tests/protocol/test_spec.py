@@ -160,7 +160,7 @@ def test_odd_recipe_keys_are_refused_as_such(recipe: Any) -> None:
         ({b"shuffle": True}, "unknown spec key"),
         ({"voxel_dtype": "int32"}, "voxel_dtype = 'int32': choose one of int8, int16, float32"),
         ({"voxel_dtype": ["int8"]}, "voxel_dtype"),
-        ({"scene": False}, "scene = False: choose one of off, auto .YAML reads off as a truth value"),
+        ({"scene": False}, "scene = False: choose one of off, auto .YAML reads off, on, no and yes as truth values"),
         ({"on_bad_video": "skip"}, "on_bad_video = 'skip': choose one of substitute, raise"),
         ({"shuffle": 1}, "shuffle = 1: give true or false"),
         ({"max_sequences_per_video": 0}, "max_sequences_per_video = 0"),

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from v2v_bench.tradeoff.forms import ENCODINGS, SOURCE
-from v2v_protocol.spec import LOOP_FILTERS
+from v2v_protocol.spec import LOOP_FILTERS, LoopFilter
 
 SAMPLES_PER_DECODE = (1, 2, 4)
 
@@ -25,7 +25,7 @@ class Setting:
     """
 
     form: str = SOURCE
-    loop_filter: str = "exact"
+    loop_filter: LoopFilter = "exact"
     samples_per_decode: int = 1
 
     @property

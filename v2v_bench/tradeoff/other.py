@@ -31,14 +31,14 @@ from v2v_bench.tradeoff.errors import Tally, common_bins, compare
 from v2v_bench.tradeoff.noise import cheap_kernel, run_kernel
 from v2v_bench.tradeoff.speed import Work, leases_of, make, making
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import FlowMethod, StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.view import apply_view
 
 BASE, KERNEL = "exact sample", "kernel"
-FLOW_METHODS = ("dis-ultrafast-1", "dis-fast-1", "auto", "dis-medium")
+FLOW_METHODS: tuple[FlowMethod, ...] = ("dis-ultrafast-1", "dis-fast-1", "auto", "dis-medium")
 _EVERY_PAIR = 5
 
 Compressor = Callable[[bytes], bytes]
@@ -180,8 +180,9 @@ def _clipped_share(samples: Sequence[Sample]) -> float:
 def _flows(catalogue: Catalogue, spec: StreamSpec, places: int) -> dict[str, Knob]:
     every = known_motion.scenes(flow.textures(None), flow.HEIGHT_PX, flow.WIDTH_PX, every=_EVERY_PAIR)
     made = {}
-    for name, estimate in flow.estimators(FLOW_METHODS, None).items():
-        records = flow.accuracy(name, estimate, every)
+    estimators = flow.estimators(FLOW_METHODS, None)
+    for name in FLOW_METHODS:
+        records = flow.accuracy(name, estimators[name], every)
         error = next(record["error_mean_px"] for record in records if record["context"] == "margin 64")
         leases = leases_of(catalogue, dataclasses.replace(spec, flow_method=name), places, (*DEFAULT_ARRAYS, "flow"))
         made[f"flow {name}"] = Knob(making(catalogue.root, leases), figures={"endpoint_error_px": error})

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from itertools import accumulate, islice
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
-from v2v_protocol.recipe_fields import LARGEST_SCALE
+from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import VideoEntry
 from v2v_server.simulation.draw import admits, smallest_scale

@@ -28,6 +28,7 @@ Everything here is sums, products and correctly rounded roots: every host comes 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -35,8 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS
-from v2v_protocol.recipe_fields import LIMITS_OF_EFFECTS, SMALLEST_PHOTORECEPTOR_HZ
+from v2v_protocol.recipe import LARGEST_EVENTS, effect_settings
 from v2v_protocol.sample import Effects
 
 AUTO = "auto"
@@ -91,15 +91,10 @@ def check_effects(effects: Effects, pixels: int) -> None:
     Raises:
         UsageError: one is; the message names it, the value and the limits.
     """
-    for name, (low, high) in LIMITS_OF_EFFECTS.items():
-        value = getattr(effects, name)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
-            raise UsageError(f"{name} = {value!r}: give a number from {low} to {high}")
-    if 0.0 < effects.photoreceptor_hz < SMALLEST_PHOTORECEPTOR_HZ:
-        raise UsageError(
-            f"photoreceptor_hz = {effects.photoreceptor_hz!r}: give 0 for no low-pass, or "
-            f"{SMALLEST_PHOTORECEPTOR_HZ} or more"
-        )
+    for name, setting in effect_settings().items():
+        value = getattr(effects, name, 0.0)  # dead pixels are a share in a recipe, and a count here
+        one = dataclasses.replace(setting, kind="number")
+        one.check(name, float(value) if isinstance(value, np.number) else value)
     count = effects.dead_pixel_count
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= pixels:
         raise UsageError(f"dead_pixel_count = {count!r}: give a whole number from 0 to {pixels}")

@@ -1,0 +1,112 @@
+"""Settings: what a field's one statement promises."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.settings import (
+    check_settings,
+    number,
+    require_known,
+    settings_of,
+    shown,
+    span,
+    switch,
+    text,
+    whole,
+    word,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Toy:
+    size: int = whole(3, 1, 10, "how large", unit="px", group="Shape")
+    share: float = number(0.5, 0.0, 1.0, "how much")
+    corner: tuple[float, float] = span((0.0, 0.0), 0.5, 8.0, "from when", unit="Hz", off=True, group="Time")
+    is_on: bool = switch(False, "whether")
+    kind: Literal["a", "b"] = word("a", Literal["a", "b"], "which")
+    name: str = text("", "of whom")
+    plain: int = 7
+
+    def __post_init__(self) -> None:
+        check_settings(self, "toy {}".format, RecipeError)
+
+
+def test_a_field_is_known_by_its_statement() -> None:
+    known = settings_of(Toy)
+    assert list(known) == ["size", "share", "corner", "is_on", "kind", "name"]
+    assert [setting.group for setting in known.values()] == ["Shape", "Shape", "Time", "Time", "Time", "Time"]
+    assert [setting.default for setting in known.values()] == [3, 0.5, (0.0, 0.0), False, "a", ""]
+    assert known["kind"].words == ("a", "b")
+
+
+def test_values_take_the_type_of_their_field() -> None:
+    toy = Toy(share=1, corner=2)  # type: ignore[arg-type]
+    assert (toy.share, type(toy.share), toy.corner) == (1.0, float, (2.0, 2.0))
+    assert math.copysign(1.0, Toy(share=-0.0).share) == 1.0
+    assert Toy(corner=[1, 2]).corner == (1.0, 2.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("size", 0, "toy size = 0: give a whole number from 1 to 10 px"),
+        ("size", 2.0, "toy size = 2.0: give a whole number from 1 to 10 px"),
+        ("size", True, "toy size = True: give a whole number from 1 to 10 px"),
+        ("share", 1.5, "toy share = 1.5: give a number from 0 to 1"),
+        ("share", math.nan, "toy share = nan: give a number from 0 to 1"),
+        ("share", "1e-3", "toy share = '1e-3': give a number from 0 to 1 (1e-3 is text in YAML: write 1.0e-3)"),
+        (
+            "corner", [0.0, 4.0],
+            "toy corner = [0.0, 4.0]: give one number, or a pair [lowest, highest], from 0.5 to 8 Hz, or 0 for off",
+        ),
+        ("corner", (4.0, 2.0), "toy corner = [4.0, 2.0]: the lowest value comes first"),
+        ("is_on", 1, "toy is_on = 1: give true or false"),
+        ("kind", "c", "toy kind = 'c': choose one of a, b"),
+        (
+            "kind", False,
+            "toy kind = False: choose one of a, b (YAML reads off, on, no and yes as truth values: put it in quotes)",
+        ),
+        ("name", None, "toy name = None: give text"),
+    ],
+)  # fmt: skip
+def test_a_refusal_names_key_value_limit_and_remedy(field: str, value: Any, message: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        Toy(**{field: value})
+    assert str(caught.value) == message
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner, max_size=2),
+)
+
+
+@given(st.sampled_from(sorted(settings_of(Toy))), anything)
+def test_whatever_comes_is_taken_or_refused(field: str, value: Any) -> None:
+    try:
+        toy = Toy(**{field: value})
+    except UsageError:
+        return
+    checked = getattr(toy, field)
+    assert Toy(**{field: checked}) == toy
+    hash(toy)
+
+
+def test_an_unknown_key_is_refused_with_the_nearest_known_one() -> None:
+    with pytest.raises(UsageError, match=r"^unknown toy key 'sise' \(did you mean 'size'\?\); known: size, share,"):
+        require_known(["share", "sise"], settings_of(Toy), "toy key")
+    with pytest.raises(UsageError, match=r"^unknown toy key 7; known"):
+        require_known([7], settings_of(Toy), "toy key")
+
+
+def test_a_message_shows_no_page_of_a_value() -> None:
+    assert len(shown("x" * 10_000)) < 300
+    assert shown((0.1, 1e-6)) == "[0.1, 1e-06]"

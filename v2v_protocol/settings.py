@@ -1,0 +1,223 @@
+"""A setting, stated once.
+
+    bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
+
+is a field of a frozen dataclass. From this line follow its check, its command-line flag
+(:mod:`v2v_protocol.command`), its key in a YAML file or a message, and its line in ``docs/reference/keys.md``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any, Literal
+
+from v2v_protocol.errors import UsageError
+
+_SETTING = "v2v setting"
+_LONGEST_SHOWN = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is known of one field.
+
+    Attributes:
+        kind: "range" is a pair (lowest, highest) of a uniform draw; one number stands for both ends.
+        default: of the field.
+        help: one line for people, without a full stop.
+        low, high: limits of a number, both allowed.
+        off: 0 stands for "off", although ``low`` is above it; a range may not begin at 0 and end above it.
+        words: the choices of a word.
+        unit: of a number, as in "px" or "Hz".
+        group: heading under which help and the reference page show it.
+        is_hidden: a program's own business: no line in help or on the reference page.
+    """
+
+    kind: Literal["whole", "number", "range", "switch", "word", "text"]
+    default: Any
+    help: str
+    low: float = -math.inf
+    high: float = math.inf
+    off: bool = False
+    words: tuple[str, ...] = ()
+    unit: str = ""
+    group: str = ""
+    is_hidden: bool = False
+
+    @property
+    def expected(self) -> str:
+        """What to do, for a message: "give a whole number from 1 to 1024"."""
+        if self.kind == "word":
+            return f"choose one of {', '.join(self.words)}"
+        plain = {
+            "whole": "give a whole number", "number": "give a number", "switch": "give true or false",
+            "range": "give one number, or a pair [lowest, highest],", "text": "give text",
+        }[self.kind]  # fmt: skip
+        if self.low == -math.inf:
+            return plain.removesuffix(",")
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{plain} from {_limit(self.low)} to {_limit(self.high)}{unit}" + (", or 0 for off" if self.off else "")
+
+    def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:
+        """``value`` in the field's own type: a float for a number, two for a range.
+
+        Args:
+            name: what the message calls it.
+            error: the kind of error to raise.
+
+        Raises:
+            UsageError: it has another type or is outside the limits.
+        """
+        checked = self._converted(value)
+        if checked is None:
+            raise error(f"{name} = {shown(value)}: {self.expected}{self._hint(value)}")
+        if self.kind == "range" and checked[0] > checked[1]:
+            raise error(f"{name} = {shown(value)}: the lowest value comes first")
+        return checked
+
+    def _converted(self, value: object) -> Any:
+        """None where it is not what was expected."""
+        if self.kind == "switch":
+            return value if isinstance(value, bool) else None
+        if self.kind == "text":
+            return value if isinstance(value, str) else None
+        if self.kind == "word":
+            return value if isinstance(value, str) and value in self.words else None
+        if self.kind == "whole":
+            is_whole = isinstance(value, int) and not isinstance(value, bool)
+            return value if is_whole and self._allows(value) else None  # type: ignore[arg-type]
+        if self.kind == "number":
+            return self._number(value)
+        ends = tuple(value) if isinstance(value, list | tuple) else (value, value)
+        low, high = map(self._number, ends) if len(ends) == 2 else (None, None)
+        if low is None or high is None or (self.off and low == 0.0 < high):
+            return None
+        return low, high
+
+    def _number(self, value: object) -> float | None:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return None
+        try:
+            # Minus zero equals zero, but would not give the same digest.
+            number = float(value) + 0.0
+        except OverflowError:
+            return None
+        return number if self._allows(number) else None
+
+    def _allows(self, number: float) -> bool:
+        return (self.low <= number <= self.high and math.isfinite(number)) or (self.off and number == 0)
+
+    def _hint(self, value: object) -> str:
+        if self.kind in ("number", "range") and any(
+            isinstance(item, str) and _is_number(item) for item in (value if isinstance(value, list) else [value])
+        ):
+            return " (1e-3 is text in YAML: write 1.0e-3)"
+        # scene: off, say, of which the message would show nothing that was written.
+        if self.kind in ("word", "text") and isinstance(value, bool):
+            return " (YAML reads off, on, no and yes as truth values: put it in quotes)"
+        return ""
+
+
+def whole(default: int, low: int, high: int, help: str, **more: Any) -> Any:
+    """A field for a whole number. ``more``: other attributes of :class:`Setting`, here and below."""
+    return _field(Setting("whole", default, help, low, high, **more))
+
+
+def number(default: float, low: float, high: float, help: str, **more: Any) -> Any:
+    """A field for a finite number."""
+    return _field(Setting("number", default, help, low, high, **more))
+
+
+def span(default: tuple[float, float], low: float, high: float, help: str, **more: Any) -> Any:
+    """A field for the range of a draw."""
+    return _field(Setting("range", default, help, low, high, **more))
+
+
+def switch(default: bool, help: str, **more: Any) -> Any:
+    """A field that is true or false."""
+    return _field(Setting("switch", default, help, **more))
+
+
+def word(default: str, choices: Any, help: str, **more: Any) -> Any:
+    """A field for one of some words; ``choices`` is a ``Literal``, or the words."""
+    return _field(Setting("word", default, help, words=typing.get_args(choices) or tuple(choices), **more))
+
+
+def text(default: str, help: str, **more: Any) -> Any:
+    """A field for any text."""
+    return _field(Setting("text", default, help, **more))
+
+
+def _field(setting: Setting) -> Any:
+    return dataclasses.field(default=setting.default, metadata={_SETTING: setting})
+
+
+@cache
+def settings_of(cls: type[object]) -> Mapping[str, Setting]:
+    """The settings of a dataclass, by name, in their order. A group goes on until a field names the next."""
+    found: dict[str, Setting] = {}
+    group = ""
+    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if _SETTING in item.metadata:
+            setting: Setting = item.metadata[_SETTING]
+            group = setting.group or group
+            found[item.name] = dataclasses.replace(setting, group=group)
+    return MappingProxyType(found)
+
+
+def check_settings(item: Any, name: Callable[[str], str], error: type[UsageError] = UsageError) -> None:
+    """Checks and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
+
+    Args:
+        name: what messages call a field.
+        error: the kind of error to raise.
+
+    Raises:
+        UsageError: see :meth:`Setting.check`.
+    """
+    for key, setting in settings_of(item.__class__).items():
+        object.__setattr__(item, key, setting.check(name(key), getattr(item, key), error))
+
+
+def require_known(
+    keys: Iterable[object], known: Iterable[str], what: str, error: type[UsageError] = UsageError
+) -> None:
+    """
+    Raises:
+        UsageError: a key is unknown; the message names the nearest known one, and all of them.
+    """
+    names = list(known)
+    for key in keys:
+        if key not in names:
+            raise error(f"unknown {what} {shown(key)}{nearest(key, names)}; known: {', '.join(names)}")
+
+
+def nearest(key: object, known: Iterable[str]) -> str:
+    """ " (did you mean 'bins'?)", or nothing where no known key is like it."""
+    close = difflib.get_close_matches(str(key), list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def shown(value: object) -> str:
+    """A value for a message: as it is written, but no page of it."""
+    as_text = repr(list(value) if isinstance(value, tuple) else value)
+    return as_text if len(as_text) <= _LONGEST_SHOWN else as_text[:_LONGEST_SHOWN] + " ..."
+
+
+def _limit(value: float) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _is_number(value: str) -> bool:
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True
