@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch.utils.data._utils.collate import default_collate_fn_map
 
+from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import ARRAYS, Provenance
 
 
@@ -89,3 +91,14 @@ class Batch:
     def _with(self, arrays: dict[str, torch.Tensor]) -> Batch:
         named: dict[str, Any] = dict(arrays)
         return dataclasses.replace(self, **named)
+
+
+def _collate(batches: Any, *, collate_fn_map: Any) -> Any:
+    raise UsageError(
+        "DataLoader puts samples together to batches, and V2VStreamDataset gives whole ones: "
+        "DataLoader(dataset, batch_size=None, ...), and the size to V2VStreamDataset(..., batch_size=...)"
+    )
+
+
+# PyTorch's place for what its default collate function shall do with a type it does not know.
+default_collate_fn_map[Batch] = _collate

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import Any
 
 import torch.distributed
@@ -29,6 +31,12 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
     "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
+)
+
+_ACCELERATE = (
+    "this dataset's loader went through accelerate's prepare(), which cuts batches up among processes that have their "
+    "own already, and counts epochs from 0 after a resume: leave the loader out of prepare(), and take "
+    "batch.to(accelerator.device); ranks come from torch.distributed"
 )
 
 
@@ -150,6 +158,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._ambient = _distributed() or (0, 1)
         self._position = Position(_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
+        self._offered: Stream | None = None  # what the server said when it was only asked
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -198,15 +207,19 @@ class V2VStreamDataset(IterableDataset[Batch]):
         }
 
     def __len__(self) -> int:
-        """Batches of the next iteration.
+        """Batches of the next iteration. Before the first one, the server is asked.
 
         Raises:
-            TypeError: not known before the first Welcome (or a loaded state): a guess would make a DataLoader lie.
+            V2VError: no server answers, or it refuses: see iterating.
         """
         standing = self._position.standing()
-        if standing.stream is None:
-            raise TypeError("the number of batches is known once the server has answered: iterate first")
-        return self._consumer.plan(standing.stream, standing.state).batches
+        stream = standing.stream or self._offered
+        if stream is None:
+            with closing(self._connection(standing.epoch)) as connection:
+                connection.open()
+                # Not pinned: the spacing of siblings is settled by how many loader workers iterate.
+                stream = self._offered = connection.stream
+        return self._consumer.plan(stream, standing.state).batches
 
     @property
     def _consumer(self) -> Consumer:
@@ -219,7 +232,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
         Under a larger batch size or more ranks, less than a global batch may be left of a loaded state's epoch. Then
         the next iteration delivers the epoch after it, or nothing where the state's own epoch is set.
+
+        Raises:
+            UsageError: no such epoch; or it is accelerate that sets it.
         """
+        if str(sys._getframe(1).f_globals.get("__name__")).startswith("accelerate."):
+            raise UsageError(_ACCELERATE)
         self._position.set_epoch(_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
@@ -262,22 +280,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:
         consumer, epoch, state = self._consumer, begun.epoch, begun.state
         pinned = self.stream
-        connection = Connection(
-            self._address,
-            Hello(
-                self._options.spec(pinned, "this dataset's stream"),
-                self._arrays,
-                self._batch_size,
-                self._seed,
-                quarantine=None if state is None else state.quarantine,
-                stride=self._batch_size * consumer.world_size * begun.workers,
-            ),
-            epoch,
-            pinned=pinned,
-            pinned_by="the saved state" if state is not None else "this dataset",
-            patience=self._patience,
-        )
-        try:
+        with closing(self._connection(epoch, state, begun.workers)) as connection:
             connection.open()
             stream = connection.stream
             if pinned is None:
@@ -305,11 +308,29 @@ class V2VStreamDataset(IterableDataset[Batch]):
                     consumer.after(stream, epoch, plan, number, seen)
                     if begun.loader is None
                     else consumer.in_share(stream, begun, begun.loader, done, seen),
+                    last=number == batches[-1],
                 )
                 yield batch
-        finally:
-            connection.close()
         self._position.finish(begun, consumer)
+
+    def _connection(self, epoch: int, state: ResumeState | None = None, loader_workers: int = 1) -> Connection:
+        pinned = self.stream
+        hello = Hello(
+            self._options.spec(pinned, "this dataset's stream"),
+            self._arrays,
+            self._batch_size,
+            self._seed,
+            quarantine=None if state is None else state.quarantine,
+            stride=self._batch_size * self.world_size * loader_workers,
+        )
+        return Connection(
+            self._address,
+            hello,
+            epoch,
+            pinned=pinned,
+            pinned_by="the saved state" if state is not None else "this dataset",
+            patience=self._patience,
+        )
 
 
 def _distributed() -> tuple[int, int] | None:

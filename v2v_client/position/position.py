@@ -254,20 +254,28 @@ class Position:
         if first is not None:
             first.require_same(stream, ours="another loader worker", theirs=address)
 
-    def reached(self, begun: Iteration, state: ResumeState) -> None:
-        """A batch has come out of an iteration; ``state`` is the one after it."""
+    def reached(self, begun: Iteration, state: ResumeState, *, last: bool) -> None:
+        """A batch comes out of an iteration now.
+
+        Args:
+            state: the one after it.
+            last: whether it is the last one: who counts batches may never ask whether there is another.
+        """
         if begun.number == self._iterations:  # an older iterator that is still read says nothing about where we are
             self._here = state
+            if last:
+                self._finish(begun)
 
     def finish(self, begun: Iteration, consumer: Consumer) -> None:
-        """An iteration has delivered all its batches."""
+        """An iteration has delivered all its batches, and was asked for one more."""
         if begun.number != self._iterations:
             return
+        self._finish(begun)
+        self._here = None if begun.loader is None else consumer.beginning(self.standing().stream, begun.epoch + 1)
+
+    def _finish(self, begun: Iteration) -> None:
         loader = begun.loader
-        if loader is None:
-            if self.standing().beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
-                self._progress.set(begun.epoch + 1, None)
-            self._here = None
-        else:
+        if loader is not None:
             self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers)
-            self._here = consumer.beginning(self.standing().stream, begun.epoch + 1)
+        elif self.standing().beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
+            self._progress.set(begun.epoch + 1, None)

@@ -34,7 +34,7 @@ from v2v_client.session.arrival import Arrival, opened_provenance
 from v2v_client.session.link import Link
 from v2v_client.session.liveness import Due, Liveness, Patience
 from v2v_protocol.arena import Slot
-from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
+from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost, UsageError
 from v2v_protocol.messages import (
     Denied,
     ErrorCode,
@@ -194,6 +194,7 @@ class Connection:
 
         Raises:
             ServerLost: this connection was closed.
+            UsageError: it was opened by another process, from which this one was forked.
         """
         self._queued.extend(indices)
         self._lending.offer(slots)
@@ -227,6 +228,7 @@ class Connection:
             RemoteError: the server refuses a request.
             StateMismatch: after a restart the server offers another stream.
             ProtocolError: it sent what no server of ours sends.
+            UsageError: the connection was opened by another process, from which this one was forked.
         """
         self._liveness.listen(self._clock())
         try:
@@ -379,6 +381,11 @@ class Connection:
     # --- the link -----------------------------------------------------------------------------------------------------
 
     def _open_link(self) -> Link:
+        if os.getpid() != self._process:
+            raise UsageError(
+                f"this iterator belongs to process {self._process}, and process {os.getpid()} was forked from it: call "
+                "iter() in the process that takes the batches (DataLoader workers do)"
+            )
         if self._link is None:
             raise ServerLost(f"{self._address}: this connection is closed")
         return self._link

@@ -1,0 +1,81 @@
+"""What loaders, loops and launchers of others do with the dataset: it works, or the error says what to do instead."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+
+import pytest
+from torch.utils.data import DataLoader
+
+from tests.client.fake_server import FakeServer
+from v2v_client import Batch, UsageError, V2VStreamDataset
+
+FORK = multiprocessing.get_context("fork")
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with FakeServer(sequences=23, credit=8) as running:
+        yield running
+
+
+def dataset(server: FakeServer) -> V2VStreamDataset:
+    return V2VStreamDataset(server.address, batch_size=4, timeout_seconds=20.0)
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_a_loader_that_would_put_batches_together_is_told_not_to(server: FakeServer, batch_size: int) -> None:
+    with pytest.raises(UsageError, match="batch_size=None"):
+        next(iter(DataLoader(dataset(server), batch_size=batch_size)))
+
+
+def test_a_loop_that_counts_batches_ends_the_epoch_too(server: FakeServer) -> None:
+    """Lightning takes as many as there are, and never asks whether there is another."""
+    stream = dataset(server)
+    epochs = []
+    for _ in range(3):
+        batches = iter(stream)
+        epochs += [next(batches).epoch for _ in range(len(stream))]
+    assert epochs == [0] * 5 + [1] * 5 + [2] * 5
+
+
+def test_an_epoch_that_is_set_during_the_last_batch_is_the_next(server: FakeServer) -> None:
+    stream = dataset(server)
+    for batch in stream:
+        if batch.indices[-1] == 19:
+            stream.set_epoch(7)
+    assert next(iter(stream)).epoch == 7
+
+
+def test_a_loader_prepared_by_accelerate_is_refused(server: FakeServer) -> None:
+    """All of its loaders set the epoch by a count of their own before they iterate."""
+    theirs: dict[str, object] = {"__name__": "accelerate.data_loader", "stream": dataset(server)}
+    with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
+        exec("stream.set_epoch(0)", theirs)
+
+
+def test_a_child_that_was_forked_may_not_read_on(server: FakeServer) -> None:
+    batches = iter(dataset(server))
+    next(batches)
+    here, there = FORK.Pipe()
+    child = FORK.Process(target=_read_on, args=(batches, there))
+    child.start()
+    there.close()
+    assert here.poll(20.0)
+    said = here.recv()
+    child.join()
+    child.close()
+    here.close()
+    assert "process" in said
+    assert "call iter() in the process that takes the batches" in said
+    assert next(batches).indices == (4, 5, 6, 7)
+
+
+def _read_on(batches: Iterator[Batch], there: multiprocessing.connection.Connection) -> None:
+    try:
+        there.send(str(next(batches)))
+    except UsageError as error:
+        there.send(str(error))
+    os._exit(0)
