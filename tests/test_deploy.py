@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from v2v_protocol.errors import UsageError
-from v2v_server.broker.sockets import Broker
+from v2v_server.broker.transport import Sockets
 from v2v_server.commands.cli import serve
 from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.config import ServeConfig
@@ -59,7 +59,7 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
 def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawConfigParser) -> None:
     # 192.0.2.0/24 is nobody's, like an address that the host does not have yet.
     with pytest.raises(UsageError, match=r"--bind tcp://192\.0\.2\.1:5555"):
-        Broker("tcp://192.0.2.1:5555", "ipc://@v2v-test-deploy")
+        Sockets("tcp://192.0.2.1:5555", "ipc://@v2v-test-deploy")
     assert "network-online.target" in unit["Unit"]["After"].split()
     assert unit["Unit"]["Wants"] == "network-online.target"
 

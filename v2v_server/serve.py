@@ -1,4 +1,4 @@
-"""One server from start to stop: catalogue, sockets, workers, the loop, and a clean end."""
+"""One server from start to stop: catalogue, sockets, workers, the loop, and a clean end. One thread, one loop."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record
+from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
-from v2v_server.broker.sockets import Broker
+from v2v_server.broker.transport import FromConsumer, FromWorker, Sockets, Transport
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
@@ -28,9 +28,15 @@ from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.supervise.local_pool import Pool
+from v2v_server.supervise.protocol import Supervisor
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.rows import Rows
+
+_TURN_SECONDS = 0.1
+"""Of the loop without any message; also from one look at deadlines and deaths to the next."""
+_LONGEST_TURN_SECONDS = 1.0
+"""What goes beyond is time in which nobody was listened to."""
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -89,86 +95,147 @@ def serve(config: ServeConfig) -> None:
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
-        broker = Broker(config.bind, config.worker_bind or _private_address(label))
-        pool = Pool(config.workers, catalogue.root, broker.worker_address, label)
-        running = _Running(config, catalogue, dispatcher, broker, pool, quarantine, quarantine_file)
-
-        def stopping() -> bool:
-            return stop.is_set() or (config.parent_pid != 0 and os.getppid() != config.parent_pid)
-
+        sockets = Sockets(config.bind, config.worker_bind or _private_address(label))
+        pool = Pool(catalogue.root, label)
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file)
         try:
-            broker.run(
-                dispatcher,
-                give_up=running.give_up,
-                record=running.record,
-                look_for=running.look_for,
-                watched=pool.watches,
-                every_tick=running.every_tick,
-                stopping=stopping,
-            )
+            pool.start(sockets.worker_address)
+            pool.scale(config.workers)
+            while not stop.is_set() and config.parent_pid in (0, os.getppid()):
+                server.turn(_TURN_SECONDS)
         finally:
-            running.status.close()
-            broker.say_farewell(dispatcher.stop_workers())
-            pool.stop()
-            broker.close()
+            server.close()
             catalogue.close()
-            if running.port_file_written:
-                with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend
-                    Path(config.port_file).unlink(missing_ok=True)
 
 
-@dataclass(slots=True)
-class _Running:
-    """What a running server does to the world: reap and kill workers, write verdicts, talk to its operator."""
+class Server:
+    """The loop: carries messages to the dispatcher, and its actions out.
 
-    config: ServeConfig
-    catalogue: Catalogue
-    dispatcher: Dispatcher
-    broker: Broker
-    pool: Pool
-    quarantine: Quarantine
-    quarantine_file: Path
-    status: StatusLine = field(default_factory=lambda: StatusLine(sys.stderr))  # that of now, not of the import
-    announced: bool = False
-    port_file_written: bool = False
-    missing_told: float = -math.inf
+    Args:
+        config: of the server.
+        catalogue: the corpus.
+        dispatcher: decides.
+        transport: has the consumers and the workers.
+        supervisor: has the workers' processes.
+        quarantine: the snapshots.
+        quarantine_file: where verdicts are written down.
+    """
 
-    def every_tick(self, now: float) -> list[Instruction]:
-        """Reaps the dead, starts what is due, announces, and shows the status."""
-        instructions: list[Instruction] = []
-        for death in self.pool.check(now, self.dispatcher.counters.samples):
-            self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
-            instructions += self.dispatcher.worker_lost(death.identity, death.loss, now)
-        for refusal in self.dispatcher.take_refusals():
-            self._say(f"passed over {refusal}")
-        if not self.announced and (self.dispatcher.workers or not self.config.workers):
-            self.announced = True
-            self._say(f"ready: consumers connect to {self.broker.address}, workers to {self.broker.worker_address}")
-            if self.config.port_file:
-                _write_port_file(self.config.port_file, self.broker.address)
-                self.port_file_written = True
-        if self.announced:
-            self.status.update(now, self.dispatcher, self.pool.running)
-        return instructions
+    def __init__(
+        self,
+        config: ServeConfig,
+        catalogue: Catalogue,
+        dispatcher: Dispatcher,
+        transport: Transport,
+        supervisor: Supervisor,
+        quarantine: Quarantine,
+        quarantine_file: Path,
+    ) -> None:
+        self._config = config
+        self._catalogue = catalogue
+        self._dispatcher = dispatcher
+        self._transport = transport
+        self._supervisor = supervisor
+        self._quarantine = quarantine
+        self._quarantine_file = quarantine_file
+        self._clock = Clock()
+        self._next_tick = self._clock()
+        self._status = StatusLine(sys.stderr)
+        self._announced = False
+        self._port_file: Path | None = None
+        self._missing_told = -math.inf
 
-    def give_up(self, hopeless: GiveUp) -> Loss:
+    def turn(self, longest_wait_seconds: float) -> None:
+        """Takes what has come, and does what is due. Waits for a message if none is there.
+
+        Raises:
+            WorkerCrashLoop: the workers die without finishing anything.
+            UsageError: the port file cannot be written.
+        """
+        arrivals = self._transport.receive(longest_wait_seconds)
+        now = self._clock()
+        for arrival in arrivals:
+            match arrival:
+                case FromWorker(identity, frames):
+                    self._carry_out(self._dispatcher.from_worker(identity, frames, now))
+                case FromConsumer(identity, frames):
+                    self._carry_out(self._dispatcher.from_consumer(identity, frames, now))
+        if now >= self._next_tick:
+            self._next_tick = now + _TURN_SECONDS
+            self._carry_out(self._dispatcher.tick(now))
+            for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
+                self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
+                self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
+            self._show(now)
+
+    def close(self) -> None:
+        """Tells the workers to stop, ends them, and ends all connections."""
+        self._status.close()
+        for farewell in self._dispatcher.stop_workers():
+            self._transport.send(farewell)
+        self._supervisor.stop()
+        self._transport.close()
+        if self._port_file is not None:
+            with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend
+                self._port_file.unlink(missing_ok=True)
+
+    def _carry_out(self, actions: list[Action]) -> None:
+        """Does what the dispatcher wants, in its order, and tells it what came of it."""
+        dispatcher, now = self._dispatcher, self._clock
+        todo = deque(actions)
+        while todo:
+            match todo.popleft():
+                case ToConsumer() as message:
+                    if not self._transport.send(message):
+                        dispatcher.consumer_lost(message.identity)
+                case ToWorker() as message:
+                    if not self._transport.send(message) and not self._supervisor.watches(message.identity):
+                        todo.extend(dispatcher.worker_unreachable(message.identity, now()))
+                case GiveUp() as hopeless:
+                    todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
+                case Record() as record:
+                    # Before anything that follows is sent.
+                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record.verdict), now())))
+                case LookFor() as missing:
+                    todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
+                case PassOver(refusal):
+                    self._say(f"passed over {refusal}")
+
+    def _give_up(self, hopeless: GiveUp) -> Loss:
         """Ends the process of a worker that hangs, if it is one of ours."""
-        elsewhere = Loss(Cause.UNEXPLAINED, hopeless.reason)
-        loss = self.pool.give_up(hopeless.identity, hopeless.reason) or elsewhere
+        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(Cause.UNEXPLAINED, hopeless.reason)
         name = hopeless.identity.decode(errors="replace")
         self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others")
         return loss
 
-    def look_for(self, missing: LookFor) -> bool:
+    def _record(self, verdict: Verdict) -> list[Verdict]:
+        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
+
+        Returns:
+            the lines that the quarantine has more now.
+        """
+        try:
+            written = write_verdict(self._quarantine_file, verdict, self._quarantine)
+        except (OSError, CorpusError) as error:
+            self._say(
+                f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
+                f"again, because the quarantine cannot be written: {error}"
+            )
+            return []
+        for line in written:
+            self._say(f"quarantine: {line}")
+        return written
+
+    def _look_for(self, missing: LookFor) -> bool:
         """Whether this host has the video as it was catalogued. If so, the operator is told of the host that has not,
         once in a while: all workers of a host fail alike."""
         try:
-            check_fingerprint(self.catalogue.path(missing.video), missing.fingerprint)
+            check_fingerprint(self._catalogue.path(missing.video), missing.fingerprint)
         except (VideoError, CorpusError):
             return False
         now = time.monotonic()
-        if now >= self.missing_told + REST_SECONDS:
-            self.missing_told = now
+        if now >= self._missing_told + REST_SECONDS:
+            self._missing_told = now
             name = missing.identity.decode(errors="replace")
             self._say(
                 f"worker {name} failed on {missing.video}, which is on this host as it was catalogued: "
@@ -177,24 +244,38 @@ class _Running:
             )
         return True
 
-    def record(self, instruction: Record) -> list[Verdict]:
-        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs."""
-        try:
-            written = write_verdict(self.quarantine_file, instruction.verdict, self.quarantine)
-        except (OSError, CorpusError) as error:
-            verdict = instruction.verdict
-            self._say(
-                f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
-                f"again, because the quarantine cannot be written: {error}"
-            )
-            return []
-        for verdict in written:
-            self._say(f"quarantine: {verdict}")
-        return written
+    def _show(self, now: float) -> None:
+        """Says once that the server is ready; after that keeps the status up to date."""
+        if not self._announced and (self._dispatcher.workers or not self._config.workers):
+            self._announced = True
+            address = self._transport.address
+            self._say(f"ready: consumers connect to {address}, workers to {self._transport.worker_address}")
+            if self._config.port_file:
+                _write_port_file(self._config.port_file, address)
+                self._port_file = Path(self._config.port_file)
+        if self._announced:
+            self._status.update(now, self._dispatcher, self._supervisor.running)
 
     def _say(self, text: str) -> None:
-        self.status.interrupt()
+        self._status.interrupt()
         _say(text)
+
+
+class Clock:
+    """Seconds, as far as this process was there to listen.
+
+    While it is stopped (in a terminal, by a batch system, with its whole machine) it hears no answer, and those who owe
+    one may be stopped as well: a deadline that runs out meanwhile is nobody's fault.
+    """
+
+    def __init__(self) -> None:
+        self._seen = time.monotonic()
+        self._away = 0.0
+
+    def __call__(self) -> float:
+        seen, self._seen = self._seen, time.monotonic()
+        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
+        return self._seen - self._away
 
 
 def _private_address(label: str) -> str:

@@ -1,4 +1,4 @@
-"""Fake consumers and workers around a dispatcher, and a post office that carries its instructions out."""
+"""Fake consumers and workers around a dispatcher, and a post office that carries its actions out."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
-from v2v_protocol.sample import array_layout, layout_bytes
+from v2v_protocol.sample import Refusal, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, Verdict
@@ -100,7 +100,8 @@ class Peers:
         recorded: verdicts that were to be written down.
         others: lines that somebody else writes before the next verdict, numbered.
         gone: videos that the server's host has not either.
-        sent: kinds of all instructions in the order they were carried out, with what they were about.
+        passed_over: what the operator was told of.
+        sent: kinds of all actions in the order they were carried out, with what they were about.
     """
 
     dispatcher: Dispatcher
@@ -116,13 +117,14 @@ class Peers:
     recorded: list[Verdict] = field(default_factory=list)
     others: list[Verdict] = field(default_factory=list)
     gone: set[str] = field(default_factory=set)
+    passed_over: list[Refusal] = field(default_factory=list)
     sent: list[tuple[str, Any]] = field(default_factory=list)
 
     # --- carrying -----------------------------------------------------------------------------------------------------
 
-    def carry_out(self, instructions: list[Instruction]) -> None:
-        """As the broker does it, in its order."""
-        todo = deque(instructions)
+    def carry_out(self, actions: list[Action]) -> None:
+        """As the loop does it, in its order."""
+        todo = deque(actions)
         while todo:
             match todo.popleft():
                 case ToConsumer(identity, frames):
@@ -144,6 +146,8 @@ class Peers:
                 case Record() as record:
                     self.sent.append(("record", record.verdict))
                     todo.extendleft(reversed(self.dispatcher.recorded(record, self._write(record.verdict), self.now)))
+                case PassOver(refusal):
+                    self.passed_over.append(refusal)
                 case LookFor() as missing:
                     found = missing.video not in self.gone
                     todo.extend(self.dispatcher.looked_for(missing, found, self.now))

@@ -1,4 +1,5 @@
-"""What the dispatcher wants done. Whoever has the sockets, the processes and the disk carries it out."""
+"""What the dispatcher wants done. The loop (:mod:`v2v_server.serve`) has the sockets, the processes and the disk, and
+carries it out."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from v2v_protocol.messages import Denied, ErrorCode
+from v2v_protocol.sample import Refusal
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict
@@ -71,7 +73,14 @@ class LookFor:
     request: Request
 
 
-Instruction: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor
+@dataclass(frozen=True, slots=True)
+class PassOver:
+    """Tell the operator that a video was passed over."""
+
+    refusal: Refusal
+
+
+Action: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor | PassOver
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from v2v_protocol.messages import Unavailable
 from v2v_protocol.sample import Refusal
 from v2v_protocol.wire import encode
-from v2v_server.broker.actions import Instruction, Record, ToConsumer
+from v2v_server.broker.actions import Action, PassOver, Record, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
@@ -41,12 +41,6 @@ class Candidates:
         self._quarantine = quarantine
         self._counters = counters
         self._wall_clock = wall_clock
-        self._refusals: list[Refusal] = []
-
-    def take_refusals(self) -> list[Refusal]:
-        """The candidates that failed since the last call, for the log."""
-        taken, self._refusals = self._refusals, []
-        return taken
 
     def current(self, request: Request, session: Session) -> Request:
         """The request under its session's snapshot.
@@ -69,7 +63,7 @@ class Candidates:
         video = sequence.video
         return self._quarantine.refusal(snapshot, video.id, video.fingerprint, sequence.start_frame)
 
-    def condemn(self, request: Request, reason: str) -> list[Instruction]:
+    def condemn(self, request: Request, reason: str) -> list[Action]:
         """The request's candidate brought its worker down: a verdict, unless there is one already."""
         session = self._sessions.get(request.session)
         if session is None:
@@ -82,7 +76,7 @@ class Candidates:
             Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), request)
         ]
 
-    def refuse_condemned(self, request: Request, reason: str) -> list[Instruction]:
+    def refuse_condemned(self, request: Request, reason: str) -> list[Action]:
         """On to the next candidate: by the quarantine if the request's snapshot has the verdict, which says the same to
         whoever makes the sample again; else by what happened."""
         session = self._sessions.get(request.session)
@@ -93,23 +87,22 @@ class Candidates:
         self._sessions.put_back(replace(request, deaths=0))
         return []
 
-    def refuse(self, request: Request, frame: int | None, reason: str, *, log: bool = True) -> list[Instruction]:
+    def refuse(self, request: Request, frame: int | None, reason: str, *, log: bool = True) -> list[Action]:
         """The request's candidate cannot be used: on to the next, or to the consumer with the whole story."""
         session = self._sessions.get(request.session)
         if session is None:
             return []
         self._counters.refused_candidates += 1
         passed_over = next_candidate(request, self.sequence(session, request).video.id, frame, reason)
-        if log:
-            self._refusals.append(passed_over.refusals[-1])
+        actions: list[Action] = [PassOver(passed_over.refusals[-1])] if log else []
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
-            return []
+            return actions
         if not self._sessions.answered(request, 0.0):
-            return []
+            return actions
         self._counters.unavailable += 1
         text = "; ".join(map(str, passed_over.refusals))
-        return [ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
+        return [*actions, ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
 
 
 def next_candidate(request: Request, video: str, frame: int | None, reason: str) -> Request:

@@ -1,7 +1,7 @@
-"""The server's mind: messages and deaths in, instructions out. No sockets, no processes, no clock.
+"""The server's mind: messages and deaths in, actions out. No sockets, no processes, no clock.
 
 Consumers ask (Want), sessions queue, free workers are given leases, results pass through as they are. Whatever a peer
-sends, the answer is an instruction or a counted fault, never an exception: one bad peer must not stop the others.
+sends, the answer is an action or a counted fault, never an exception: one bad peer must not stop the others.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from v2v_protocol.messages import (
     Want,
     WorkerHello,
 )
-from v2v_protocol.sample import Refusal, SampleId
+from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
-from v2v_server.broker.actions import GiveUp, Instruction, LookFor, Record, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import Action, GiveUp, LookFor, Record, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
@@ -101,13 +101,9 @@ class Dispatcher:
         """Asked samples that nobody works on yet."""
         return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
 
-    def take_refusals(self) -> list[Refusal]:
-        """The candidates that failed since the last call, for the log."""
-        return self._candidates.take_refusals()
-
     # --- consumers ---------------------------------------------------------------------------------------------------
 
-    def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Instruction]:
+    def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Action]:
         """A message from the consumers' side."""
         try:
             message = _only(frames)
@@ -138,7 +134,7 @@ class Dispatcher:
         self._leases.forget_session(identity)
         self._lone = deque(request for request in self._lone if request.session != identity)
 
-    def _hello(self, identity: bytes, hello: Hello, now: float) -> Instruction:
+    def _hello(self, identity: bytes, hello: Hello, now: float) -> Action:
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
             return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
@@ -150,7 +146,7 @@ class Dispatcher:
         self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
 
-    def _want(self, session: Session, want: Want) -> list[Instruction]:
+    def _want(self, session: Session, want: Want) -> list[Action]:
         try:
             slots = _slots(want)
         except ProtocolError as error:
@@ -172,7 +168,7 @@ class Dispatcher:
 
     # --- workers -----------------------------------------------------------------------------------------------------
 
-    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Instruction]:
+    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Action]:
         """A message from the workers' side. The frames behind a Result are passed on as they are."""
         try:
             message = decode(frames[0]) if frames else _only(frames)
@@ -198,22 +194,22 @@ class Dispatcher:
                 self.counters.malformed += 1
                 return []
 
-    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         """A worker died, was given up, or cannot be reached any more."""
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
-    def worker_unreachable(self, identity: bytes, now: float) -> list[Instruction]:
+    def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
         """Something sent to a worker did not go out, and nobody will say what became of its process."""
         if identity not in self._workers:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
-    def recorded(self, record: Record, written: Sequence[Verdict], now: float) -> list[Instruction]:
+    def recorded(self, record: Record, written: Sequence[Verdict], now: float) -> list[Action]:
         """What came of a :class:`Record`.
 
         Args:
-            record: the instruction.
+            record: the action.
             written: the lines that the quarantine has more now, others' among them; none when it cannot be written.
             now: the time.
         """
@@ -226,11 +222,11 @@ class Dispatcher:
                 each.quarantine = self._quarantine.latest
         return [*self._candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
 
-    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Instruction]:
+    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
         """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
 
         Args:
-            missing: the instruction.
+            missing: the action.
             found: whether this host has the video as it was catalogued.
             now: the time.
         """
@@ -241,44 +237,44 @@ class Dispatcher:
         self.sessions.put_back(missing.request)
         return self._assign(now)
 
-    def tick(self, now: float) -> list[Instruction]:
+    def tick(self, now: float) -> list[Action]:
         """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
-        instructions: list[Instruction] = []
+        actions: list[Action] = []
         self._workers.wake(now)
         for identity in self._workers.hanging(now):
-            instructions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
+            actions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
         for identity in self._workers.vanished(now):
-            instructions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
+            actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
         for request, worker in self._leases.slow(now):
             second = self._workers.for_request(keep_one_empty=bool(self._lone), other_than=worker)
             if second is not None and not runs_alone(request):
                 self.counters.second_leases += 1
-                instructions += self._grant(replace(request, slot=None), second, now)
+                actions += self._grant(replace(request, slot=None), second, now)
         # A consumer that left may have freed a worker that was kept for it, or for its requests.
-        return instructions + self._assign(now)
+        return actions + self._assign(now)
 
-    def stop_workers(self) -> list[Instruction]:
+    def stop_workers(self) -> list[ToWorker]:
         """Tells every worker to finish and leave."""
         return [ToWorker(identity, encode(Stop())) for identity in self._workers.identities()]
 
-    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Instruction]:
+    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
         again = Loss(Cause.KILLED, "started again")
-        instructions = self._take_back(identity, again, now) if identity in self._workers else []
+        actions = self._take_back(identity, again, now) if identity in self._workers else []
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
-            return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *instructions]
+            return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *actions]
         if len(self._workers) >= MOST_WORKERS:
             text = f"this server has {MOST_WORKERS} workers, its limit"
-            return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *instructions]
+            return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
         self._workers.add(identity, hello.credit, now)
-        return instructions + self._assign(now)
+        return actions + self._assign(now)
 
-    def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Instruction]:
+    def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Action]:
         request = self._leases.request(result.lease, identity)
         session = None if request is None else self.sessions.get(request.session)
-        instructions: list[Instruction] = []
+        actions: list[Action] = []
         decoded = True
         if request is None or session is None:
             self.counters.late_results += 1
@@ -291,12 +287,12 @@ class Dispatcher:
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
-                instructions.append(ToConsumer(request.session, payload))
+                actions.append(ToConsumer(request.session, payload))
         self._leases.finished(result.lease, identity, now, decoded=decoded)
         self._leases.begun(result.begins, identity, now)
-        return instructions + self._assign(now)
+        return actions + self._assign(now)
 
-    def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Instruction]:
+    def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
         request = self._leases.finished(failed.lease, identity, now)
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
@@ -321,9 +317,9 @@ class Dispatcher:
         self.counters.in_slots += in_slot
         return True
 
-    def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Instruction]:
+    def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         self._workers.remove(identity)
-        instructions: list[Instruction] = []
+        actions: list[Action] = []
         returned = self._leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
@@ -331,35 +327,35 @@ class Dispatcher:
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                instructions += self._candidates.condemn(request, verdict)
-        return instructions + self._assign(now)
+                actions += self._candidates.condemn(request, verdict)
+        return actions + self._assign(now)
 
     # --- requests ----------------------------------------------------------------------------------------------------
 
-    def _assign(self, now: float) -> list[Instruction]:
+    def _assign(self, now: float) -> list[Action]:
         """Gives waiting requests to workers, until there is no request or no room."""
-        instructions: list[Instruction] = []
+        actions: list[Action] = []
         while True:
             if self._lone:
                 empty = self._workers.for_lone_request()
                 if empty is not None:
-                    instructions += self._give([self._lone.popleft()], empty, now)
+                    actions += self._give([self._lone.popleft()], empty, now)
                     continue
             worker = self._workers.for_request(keep_one_empty=bool(self._lone))
             request = self.sessions.next_request() if worker is not None else None
             if worker is None or request is None:
-                return instructions
+                return actions
             if runs_alone(request):
                 self._lone.append(request)
             else:
-                instructions += self._give([request, *self.sessions.take_siblings(request)], worker, now)
+                actions += self._give([request, *self.sessions.take_siblings(request)], worker, now)
 
-    def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Instruction]:
+    def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
         """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
         session = self.sessions.get(requests[0].session)
         if session is None:
             return []
-        instructions: list[Instruction] = []
+        actions: list[Action] = []
         good: list[Request] = []
         for request in requests:
             current = self._candidates.current(request, session)
@@ -367,12 +363,12 @@ class Dispatcher:
             if quarantined is None:
                 good.append(current)
             else:
-                instructions += self._candidates.refuse(current, None, quarantined, log=False)
+                actions += self._candidates.refuse(current, None, quarantined, log=False)
         for place, request in enumerate(good):
-            instructions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
-        return instructions
+            actions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
+        return actions
 
-    def _grant(self, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Instruction]:
+    def _grant(self, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Action]:
         session = self.sessions.get(request.session)
         if session is None:
             return []

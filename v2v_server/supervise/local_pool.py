@@ -24,6 +24,7 @@ import psutil
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_protocol.programs import environment
 from v2v_server.broker.blame import Cause, Loss
+from v2v_server.supervise.protocol import Death
 from v2v_server.worker.logbook import Logbook
 
 _FIRST_BACKOFF_SECONDS = 0.2
@@ -34,16 +35,9 @@ _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
-@dataclass(frozen=True, slots=True)
-class Death:
-    """A worker process that ended without being asked to, or that the system did not start."""
-
-    identity: bytes
-    loss: Loss
-
-
-@dataclass(slots=True)
-class _Slot:
+@dataclass(slots=True, eq=False)
+class _Place:
+    number: int
     process: subprocess.Popen[bytes] | None = None
     logbook: Logbook | None = None
     identity: bytes = b""
@@ -51,21 +45,28 @@ class _Slot:
     given_up: bool = False
     start_at: float = 0.0
 
+    def close(self) -> None:
+        """Forgets the process, which has ended."""
+        self.process = None
+        if self.logbook is not None:
+            self.logbook.close()
+            self.logbook = None
+
 
 class Pool:
-    """Keeps a number of worker processes running.
+    """Keeps a number of worker processes running: a :class:`v2v_server.supervise.protocol.Supervisor`.
 
     Args:
-        workers: how many.
         root: the corpus folder.
-        address: where the server listens for workers.
         label: prefix of the workers' names, unique to this server.
     """
 
-    def __init__(self, workers: int, root: Path, address: str, label: str) -> None:
-        self._slots = [_Slot() for _ in range(workers)]
+    def __init__(self, root: Path, label: str) -> None:
+        self._places: list[_Place] = []
+        self._leaving: list[_Place] = []  # too many: told to leave
+        self._numbered = 0
         self._root = root
-        self._address = address
+        self._address = ""
         self._label = label
         self._deaths_in_a_row = 0
         self._samples_seen = 0
@@ -75,22 +76,38 @@ class Pool:
     @property
     def crash_budget(self) -> int:
         """Deaths in a row, without any finished sample between them, that are survived."""
-        return 3 * len(self._slots) + 4
+        return 3 * len(self._places) + 4
 
     @property
     def running(self) -> int:
         """Processes that are alive."""
-        return sum(slot.process is not None and slot.process.poll() is None for slot in self._slots)
+        return len(self.pids())
+
+    def start(self, address: str) -> None:
+        """Workers that :meth:`watch` starts connect to ``address``."""
+        self._address = address
+
+    def scale(self, workers: int) -> None:
+        """There shall be so many; :meth:`watch` starts those that lack."""
+        while len(self._places) < workers:
+            self._places.append(_Place(self._numbered))
+            self._numbered += 1
+        self._places, surplus = self._places[:workers], self._places[workers:]
+        for place in surplus:
+            if place.process is not None:
+                place.process.terminate()  # it finishes the sample it is at, gives back the others and leaves
+                self._leaving.append(place)
 
     def pids(self) -> list[int]:
         """Process ids of the workers that are alive."""
-        return [slot.process.pid for slot in self._slots if slot.process is not None and slot.process.poll() is None]
+        processes = [place.process for place in self._all() if place.process is not None]
+        return [process.pid for process in processes if process.poll() is None]
 
     def watches(self, identity: bytes) -> bool:
-        """Whether :meth:`check` will report how that worker ends: one of this pool's that was not given up."""
-        return any(slot.identity == identity and slot.process is not None and not slot.given_up for slot in self._slots)
+        """Whether :meth:`watch` will report how that worker ends: one of this pool's that was not given up."""
+        return any(place.identity == identity and place.process and not place.given_up for place in self._all())
 
-    def check(self, now: float, samples: int) -> list[Death]:
+    def watch(self, now: float, samples: int) -> list[Death]:
         """Reaps the dead and starts what is due. To be called a few times a second.
 
         Args:
@@ -104,30 +121,37 @@ class Pool:
             self._samples_seen = samples
             self._deaths_in_a_row = 0
         deaths = []
-        ended = {number for number, slot in enumerate(self._slots) if slot.process and slot.process.poll() is not None}
+        ended = {place.number for place in self._all() if place.process and place.process.poll() is not None}
         memory_kills = _out_of_memory_kills()  # counted before its victims are gone, so these are in it
         if memory_kills > self._memory_kills:
             self._memory_kills, self._short_of_memory_until = memory_kills, now + _MEMORY_SECONDS
-        for number, slot in enumerate(self._slots):
-            if slot.process is not None and number in ended:
-                at = None if slot.logbook is None else slot.logbook.lease()
-                loss = _post_mortem(slot.process.returncode, short_of_memory=now < self._short_of_memory_until)
-                death = Death(slot.identity, replace(loss, lease=at))
-                self._put_off(slot, death, now)
-                if not slot.given_up:
-                    deaths.append(death)
-            if slot.process is None and now >= slot.start_at:
+        for place in self._all():
+            if place.process is None or place.number not in ended:
+                continue
+            at = None if place.logbook is None else place.logbook.lease()
+            loss = _post_mortem(place.process.returncode, short_of_memory=now < self._short_of_memory_until)
+            death = Death(place.identity, replace(loss, lease=at))
+            as_told = place in self._leaving and place.process.returncode in (0, -signal.SIGTERM)
+            if place in self._leaving:
+                self._leaving.remove(place)
+                place.close()
+            else:
+                self._put_off(place, death, now)
+            if not place.given_up and not as_told:
+                deaths.append(death)
+        for place in self._places:
+            if place.process is None and now >= place.start_at:
                 try:
-                    self._start(number, slot)
+                    self._start(place)
                 except OSError as error:
                     # Too many processes, or no memory for one more: that passes, and must not end those that run.
                     text = f"could not be started: {error.strerror or error}"
-                    deaths.append(Death(slot.identity, Loss(Cause.KILLED, text)))
-                    self._put_off(slot, deaths[-1], now)
+                    deaths.append(Death(place.identity, Loss(Cause.KILLED, text)))
+                    self._put_off(place, deaths[-1], now)
         return deaths
 
-    def _put_off(self, slot: _Slot, death: Death, now: float) -> None:
-        """Lets some time pass before the next process of a slot.
+    def _put_off(self, place: _Place, death: Death, now: float) -> None:
+        """Lets some time pass before the next process of a place.
 
         Raises:
             WorkerCrashLoop: the crash budget is used up.
@@ -142,22 +166,22 @@ class Pool:
         # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
         doublings = min(self._deaths_in_a_row - 1, 16)
         delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
-        slot.process, slot.start_at = None, now + delay
+        place.process, place.start_at = None, now + delay
 
     def give_up(self, identity: bytes, reason: str) -> Loss | None:
         """Kills a worker that hangs.
 
         Returns:
-            what its loss means, not to be reported again by :meth:`check`; None when it is none of this pool's.
+            what its loss means, not to be reported again by :meth:`watch`; None when it is none of this pool's.
         """
-        for slot in self._slots:
-            if slot.identity == identity and slot.process is not None:
-                slot.given_up = True
-                status = _status(slot.process.pid)
-                slot.process.kill()
+        for place in self._all():
+            if place.identity == identity and place.process is not None:
+                place.given_up = True
+                status = _status(place.process.pid)
+                place.process.kill()
                 if status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
                     return Loss(Cause.KILLED, "was stopped from outside and killed")
-                at = None if slot.logbook is None else slot.logbook.lease()
+                at = None if place.logbook is None else place.logbook.lease()
                 if status == psutil.STATUS_DISK_SLEEP:
                     # A network file system whose server is away holds every worker at whatever clip it has.
                     return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at)
@@ -166,7 +190,7 @@ class Pool:
 
     def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
         """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
-        processes = [slot.process for slot in self._slots if slot.process is not None]
+        processes = [place.process for place in self._all() if place.process is not None]
         _wait(processes, join_seconds)
         for process in processes:
             if process.poll() is None:
@@ -176,24 +200,24 @@ class Pool:
             if process.poll() is None:
                 process.kill()
             process.wait()
-        for slot in self._slots:
-            slot.process = None
-            if slot.logbook is not None:
-                slot.logbook.close()
+        for place in self._all():
+            place.close()
+        self._places, self._leaving = [], []
 
-    def _start(self, number: int, slot: _Slot) -> None:
-        slot.generation += 1
-        slot.given_up = False
-        name = f"{self._label}-{number}.{slot.generation}"
-        slot.identity = name.encode()
-        if slot.logbook is not None:
-            slot.logbook.close()
-            slot.logbook = None
-        slot.logbook = Logbook()
-        slot.process = subprocess.Popen(
-            [*_command(self._address, self._root, name), "--logbook-fd", str(slot.logbook.descriptor)],
+    def _all(self) -> list[_Place]:
+        return [*self._places, *self._leaving]
+
+    def _start(self, place: _Place) -> None:
+        place.generation += 1
+        place.given_up = False
+        name = f"{self._label}-{place.number}.{place.generation}"
+        place.identity = name.encode()
+        place.close()
+        place.logbook = Logbook()
+        place.process = subprocess.Popen(
+            [*_command(self._address, self._root, name), "--logbook-fd", str(place.logbook.descriptor)],
             stdin=subprocess.DEVNULL,
-            pass_fds=(slot.logbook.descriptor,),
+            pass_fds=(place.logbook.descriptor,),
             env=environment() | _ONE_THREAD,
             process_group=0,
         )

@@ -18,7 +18,8 @@ from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.supervise import local_pool as pool_module
-from v2v_server.supervise.local_pool import Death, Pool
+from v2v_server.supervise.local_pool import Pool
+from v2v_server.supervise.protocol import Death, Supervisor
 
 SLEEPS = "import time\ntime.sleep(600)"
 LEAVES = "import sys\nsys.exit(3)"
@@ -42,7 +43,9 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
         monkeypatch.setattr(
             pool_module, "_command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
         )
-        pools.append(Pool(workers, Path("/corpus"), "tcp://127.0.0.1:1", "label"))
+        pools.append(Pool(Path("/corpus"), "label"))
+        pools[-1].start("tcp://127.0.0.1:1")
+        pools[-1].scale(workers)
         return pools[-1]
 
     yield make
@@ -74,7 +77,7 @@ def is_gone(pid: int) -> bool:
 def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
     assert (pool.running, pool.pids()) == (0, [])
-    assert pool.check(0.0, 0) == []
+    assert pool.watch(0.0, 0) == []
     assert pool.running == 2
     pids = pool.pids()
 
@@ -84,19 +87,52 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
 
     until(lambda: b"" not in names())
     assert names() == [b"label-0.1", b"label-1.1"]
-    assert pool.check(100.0, 0) == []
+    assert pool.watch(100.0, 0) == []
     assert pool.pids() == pids
 
 
 def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
     pool = start(0, SLEEPS)
-    assert pool.check(0.0, 0) == []
+    assert pool.watch(0.0, 0) == []
     pool.stop()
+
+
+def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
+    pool: Supervisor = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + SLEEPS)
+    assert pool.watch(0.0, 0) == []
+    pool.scale(1)
+    assert [pool.watches(name) for name in (b"label-0.1", b"label-2.1")] == [True, True]
+    until(lambda: pool.running == 1)
+    assert pool.watch(100.0, 0) == []
+    assert not pool.watches(b"label-2.1")
+    pool.scale(2)
+    assert pool.watch(200.0, 0) == []
+    assert (pool.running, pool.watches(b"label-3.1")) == (2, True)
+
+
+def test_one_that_dies_while_it_leaves_is_reported_and_not_replaced(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, "import os, signal, time\nsignal.signal(15, lambda *_: os.kill(os.getpid(), 11))\n" + SLEEPS)
+    pool.watch(0.0, 0)
+    until(lambda: is_loaded(pool.pids()[0]) and _catches_terminate(pool.pids()[0]))
+    pool.scale(0)
+    all_dead(pool)
+    assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(Cause.CRASHED, "was ended by SIGSEGV"))]
+    assert pool.watch(100.0, 0) == []
+    assert pool.running == 0
+
+
+def _catches_terminate(pid: int) -> bool:
+    (caught,) = (
+        line.split()[1]
+        for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+        if line.startswith("SigCgt")
+    )
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
 
 
 def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     (pid,) = pool.pids()
     assert os.getpgid(pid) == pid != os.getpgid(0)
 
@@ -115,18 +151,18 @@ def test_a_process_that_the_system_does_not_start_is_tried_again(
         return popen(*arguments, **options)
 
     monkeypatch.setattr(subprocess, "Popen", spawn)
-    assert pool.check(0.0, 0) == []
+    assert pool.watch(0.0, 0) == []
     os.kill(pool.pids()[0], signal.SIGKILL)
     until(lambda: pool.running == 1)
     short[0] = True
-    assert [death.identity for death in pool.check(1.0, 0)] == [b"label-0.1"]
+    assert [death.identity for death in pool.watch(1.0, 0)] == [b"label-0.1"]
     lost = Death(b"label-0.2", Loss(Cause.KILLED, "could not be started: Resource temporarily unavailable"))
-    assert pool.check(2.0, 0) == [lost]
+    assert pool.watch(2.0, 0) == [lost]
     assert not pool.watches(b"label-0.2")
     short[0] = False
-    assert pool.check(2.3, 0) == []  # two deaths in a row: 0.4 s
+    assert pool.watch(2.3, 0) == []  # two deaths in a row: 0.4 s
     assert pool.running == 1
-    assert pool.check(2.5, 0) == []
+    assert pool.watch(2.5, 0) == []
     assert pool.running == 2
 
 
@@ -139,9 +175,9 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
     monkeypatch.setattr(subprocess, "Popen", refuse)
     pool = start(1, SLEEPS)
     for now in range(pool.crash_budget):
-        assert len(pool.check(100.0 * now, 0)) == 1
+        assert len(pool.watch(100.0 * now, 0)) == 1
     with pytest.raises(WorkerCrashLoop, match="could not be started: No such file or directory"):
-        pool.check(1e6, 0)
+        pool.watch(1e6, 0)
 
 
 @pytest.mark.parametrize(
@@ -165,11 +201,11 @@ def test_a_crash_is_told_from_a_kill(
 ) -> None:
     monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: 5)
     pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     until(lambda: is_loaded(pool.pids()[0]))
     os.kill(pool.pids()[0], number)
     all_dead(pool)
-    assert pool.check(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
+    assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
 
 
 def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
@@ -178,14 +214,14 @@ def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
     kills = [7]
     monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: kills[0])
     pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     causes = []
     for now, more in ((10.0, 1), (20.0, 0)):
         kill_one(pool)
         kills[0] += more
-        (death,) = pool.check(now, 1)
+        (death,) = pool.watch(now, 1)
         causes.append(death.loss.cause)
-        pool.check(now + 5.0, 2)
+        pool.watch(now + 5.0, 2)
     assert causes == [Cause.UNEXPLAINED, Cause.KILLED]
 
 
@@ -200,18 +236,18 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
         for pid in pool.pids():
             os.kill(pid, signal.SIGKILL)
         all_dead(pool)
-        return [death.loss.cause for death in pool.check(now, 1)]
+        return [death.loss.cause for death in pool.watch(now, 1)]
 
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     kills[0] += 2
     assert causes_of_deaths_at(10.0) == [Cause.UNEXPLAINED] * 2
-    pool.check(20.0, 1)
+    pool.watch(20.0, 1)
     kills[0] += 1
-    pool.check(30.0, 1)  # what was killed takes a moment to be gone
+    pool.watch(30.0, 1)  # what was killed takes a moment to be gone
     assert causes_of_deaths_at(30.1) == [Cause.UNEXPLAINED] * 2
-    pool.check(40.0, 1)
+    pool.watch(40.0, 1)
     kills[0] += 1  # something else on this host
-    pool.check(50.0, 1)
+    pool.watch(50.0, 1)
     assert causes_of_deaths_at(1000.0) == [Cause.KILLED] * 2
 
 
@@ -223,15 +259,15 @@ def test_the_kernels_count_of_such_kills_is_read() -> None:
 @pytest.mark.parametrize("status", [0, 1, 3])
 def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], status: int) -> None:
     pool = start(1, f"import sys\nsys.exit({status})")
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     all_dead(pool)
     expected = Loss(Cause.UNEXPLAINED, f"exited with status {status}")
-    assert pool.check(0.0, 0) == [Death(b"label-0.1", expected)]
+    assert pool.watch(0.0, 0) == [Death(b"label-0.1", expected)]
 
 
 def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     hung, other = pool.pids()
     assert pool.watches(b"label-0.1")
     assert pool.give_up(b"label-9.9", "slept") is None
@@ -243,22 +279,22 @@ def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Call
         False,
     ]
     until(lambda: pool.running == 1)
-    assert pool.check(0.0, 0) == []
+    assert pool.watch(0.0, 0) == []
     assert pool.pids() == [other]
-    assert pool.check(100.0, 0) == []
+    assert pool.watch(100.0, 0) == []
     assert pool.running == 2
     assert is_gone(hung)
     # The next life of the slot is a new worker: its death is reported.
     assert pool.watches(b"label-0.2")
     os.kill(pool.pids()[0], signal.SIGKILL)
     until(lambda: pool.running == 1)
-    assert [death.identity for death in pool.check(200.0, 0)] == [b"label-0.2"]
+    assert [death.identity for death in pool.watch(200.0, 0)] == [b"label-0.2"]
     assert not pool.watches(b"label-0.2")
 
 
 def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     (pid,) = pool.pids()
     os.kill(pid, signal.SIGSTOP)
     until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
@@ -273,7 +309,7 @@ def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
 ) -> None:
     """All workers of a host wait then, each at a sound clip."""
     pool = start(1, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     monkeypatch.setattr(psutil.Process, "status", lambda self: psutil.STATUS_DISK_SLEEP)
     expected = Loss(Cause.UNEXPLAINED, "waited for its storage and gave no answer for 60 s")
     assert pool.give_up(b"label-0.1", "gave no answer for 60 s") == expected
@@ -291,31 +327,32 @@ def kill_one(pool: Pool) -> None:
 def test_each_death_in_a_row_doubles_the_wait(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     now = 0.0
-    pool.check(now, 0)
+    pool.watch(now, 0)
     for wait in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0):
         kill_one(pool)
-        pool.check(now, 0)
-        pool.check(now + 0.99 * wait, 0)
+        pool.watch(now, 0)
+        pool.watch(now + 0.99 * wait, 0)
         assert pool.running == 0
         now += 1.01 * wait
-        pool.check(now, 0)
+        pool.watch(now, 0)
         assert pool.running == 1
 
 
 def test_the_wait_is_bounded_however_large_the_pool() -> None:
     """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
-    pool = Pool(1000, Path("/corpus"), "tcp://127.0.0.1:1", "label")
-    for slot in pool._slots[:1]:
-        slot.start_at = 0.0
-    for slot in pool._slots[1:]:
-        slot.start_at = float("inf")
+    pool = Pool(Path("/corpus"), "label")
+    pool.scale(1000)
+    for place in pool._places[:1]:
+        place.start_at = 0.0
+    for place in pool._places[1:]:
+        place.start_at = float("inf")
     pool._deaths_in_a_row = pool.crash_budget - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
-    pool._slots[0].process, pool._slots[0].identity = dead, b"label-0.1"
-    (death,) = pool.check(100.0, 0)
+    pool._places[0].process, pool._places[0].identity = dead, b"label-0.1"
+    (death,) = pool.watch(100.0, 0)
     assert death.identity == b"label-0.1"
-    assert pool._slots[0].start_at == 110.0
+    assert pool._places[0].start_at == 110.0
 
 
 def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
@@ -323,24 +360,24 @@ def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Poo
     assert pool.crash_budget == 7
     now = 0.0
     for _ in range(pool.crash_budget):
-        pool.check(now, 0)
+        pool.watch(now, 0)
         all_dead(pool)
-        assert len(pool.check(now, 0)) == 1
+        assert len(pool.watch(now, 0)) == 1
         now += 60.0
-    pool.check(now, 0)
+    pool.watch(now, 0)
     all_dead(pool)
     with pytest.raises(WorkerCrashLoop, match=r"8 server workers died in a row .* \(limit 7\).*exited with status 3"):
-        pool.check(now, 0)
+        pool.watch(now, 0)
 
 
 def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     now = 0.0
     for samples in range(2 * pool.crash_budget):
-        pool.check(now, samples)
+        pool.watch(now, samples)
         kill_one(pool)
         # The first death after progress waits the shortest time again.
-        assert len(pool.check(now, samples + 1)) == 1
+        assert len(pool.watch(now, samples + 1)) == 1
         now += 0.21
 
 
@@ -349,7 +386,7 @@ def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None
 
 def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, "import time\ntime.sleep(0.05)")
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     pids = pool.pids()
     pool.stop(join_seconds=60.0)
     assert all(is_gone(pid) for pid in pids)
@@ -364,7 +401,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
         "time.sleep(600)\n"
     )
     pool = start(2, stubborn)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     pids = pool.pids()
     until(lambda: len(list(tmp_path.iterdir())) == 2)
     pool.stop(join_seconds=0.0, terminate_seconds=0.1)
@@ -374,7 +411,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
 
 def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
-    pool.check(0.0, 0)
+    pool.watch(0.0, 0)
     pids = pool.pids()
     os.kill(pids[0], signal.SIGKILL)
     pool.stop(join_seconds=0.0)

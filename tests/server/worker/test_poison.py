@@ -53,7 +53,7 @@ def test_kills_from_outside_never_refuse_a_candidate_however_many(begun: bool) -
         if begun:
             at.begin()
         at.die(cause=Cause.KILLED)
-    assert (at.recorded, at.dispatcher.take_refusals(), at.quarantine.latest) == ([], [], 0)
+    assert (at.recorded, at.passed_over, at.quarantine.latest) == ([], [], 0)
     assert at.dispatcher.counters.refused_candidates == 0
 
 
@@ -90,7 +90,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
     at.work_off()
     assert at.samples() == [(0, 0), (0, 1)]
     # The operator reads the verdict; what the quarantine refuses from then on is no news.
-    assert at.dispatcher.take_refusals() == []
+    assert at.passed_over == []
     assert at.dispatcher.counters.refused_candidates == 1
 
 
@@ -346,7 +346,7 @@ def test_when_it_cannot_be_written_there_is_no_snapshot_and_the_sample_says_what
     assert (second.candidate, second.quarantine) == (1, 0)
     refusal = Refusal(0, lease.video, None, "a worker died over it")
     assert Refusal(**second.refusals["refusals"][0]) == refusal
-    assert at.dispatcher.take_refusals() == [refusal]
+    assert at.passed_over == [refusal]
     at.work_off()
     # The next to ask meets it again; and the next verdict that can be written has the next number.
     at.writable = True
@@ -385,7 +385,7 @@ def test_what_is_in_quarantine_is_passed_over_without_a_lease() -> None:
         "frame": None,
         "reason": "sequence in quarantine snapshot 1: a worker died over it",
     }
-    assert at.dispatcher.take_refusals() == []
+    assert at.passed_over == []
 
 
 def test_a_changed_file_is_not_the_one_in_quarantine() -> None:

@@ -1,0 +1,65 @@
+"""The sockets: who cannot be reached is said, and the system looks after silent connections."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from tests.waiting import until
+from v2v_protocol.messages import Ping, Pong, Stop
+from v2v_protocol.wire import encode
+from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
+
+
+@pytest.fixture
+def sockets() -> Iterator[Sockets]:
+    both = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    yield both
+    both.close()
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="Linux only")
+def test_the_system_looks_after_connections_on_which_nothing_is_said(sockets: Sockets) -> None:
+    """A host that lost power closes none of them."""
+    for address in (sockets.address, sockets.worker_address):
+        with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as peer:
+            peer.recv(1)  # ZeroMQ's greeting: it has taken the connection
+            until(lambda: _keepalive_is_due(peer))
+
+
+def _keepalive_is_due(peer: socket.socket) -> bool:
+    """Whether the other end of a connection, which is idle, waits to send a probe: proc_net_tcp(5), timer 2."""
+    ends = [f"0100007F:{port:04X}" for _, port in (peer.getpeername(), peer.getsockname())]
+    rows = (line.split() for line in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines())
+    return any(row[1:3] == ends and row[5].startswith("02:") for row in rows)
+
+
+def test_what_is_sent_to_nobody_is_not_sent(sockets: Sockets) -> None:
+    assert not sockets.send(ToWorker(b"w", encode(Stop())))
+    assert not sockets.send(ToConsumer(b"c", encode(Pong())))
+
+
+def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Sockets) -> None:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as consumer, context.socket(zmq.DEALER) as worker:
+        for peer, name, address in ((consumer, b"c", sockets.address), (worker, b"w", sockets.worker_address)):
+            peer.setsockopt(zmq.LINGER, 0)
+            peer.setsockopt(zmq.ROUTING_ID, name)
+            peer.connect(address)
+            for number in range(2):
+                peer.send_multipart([*encode(Ping()), bytes([number])])
+        until(lambda: len(dict(sockets._poller.poll(0))) == 2)
+        came: list[Arrival] = []
+        while len(came) < 4:
+            both = sockets.receive(5.0)
+            assert [type(one) for one in both] in ([FromWorker, FromConsumer], [FromWorker], [FromConsumer])
+            came += both
+        assert sockets.receive(0.0) == []
+        for kind in (FromWorker, FromConsumer):
+            assert [bytes(one.frames[1]) for one in came if isinstance(one, kind)] == [b"\0", b"\1"]
+        assert sockets.send(ToWorker(b"w", encode(Stop())))
+        assert sockets.send(ToConsumer(b"c", encode(Pong())))

@@ -1,0 +1,112 @@
+"""A server without sockets and processes: peers talk over plain queues, and a toy supervisor keeps the workers."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from v2v_protocol.messages import Message
+from v2v_protocol.wire import decode, encode
+from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker
+from v2v_server.supervise.protocol import Death
+
+
+@dataclass
+class Queues:
+    """A transport of plain queues.
+
+    Attributes:
+        arrived: what peers have sent and the server has not taken yet, oldest first.
+        sent: what the server has sent to each peer that is there, and that has not taken it yet.
+    """
+
+    address: str = "queue://consumers"
+    worker_address: str = "queue://workers"
+    arrived: deque[Arrival] = field(default_factory=deque)
+    sent: dict[bytes, deque[Sequence[Any]]] = field(default_factory=dict)
+
+    def receive(self, seconds: float) -> list[Arrival]:
+        return [self.arrived.popleft()] if self.arrived else []
+
+    def send(self, action: ToConsumer | ToWorker) -> bool:
+        there = self.sent.get(action.identity)
+        if there is None:
+            return False
+        there.append(action.frames)
+        return True
+
+    def close(self) -> None:
+        self.sent.clear()
+
+    # What peers do.
+
+    def connect(self, identity: bytes) -> None:
+        self.sent[identity] = deque()
+
+    def consumer_says(self, identity: bytes, message: Message) -> None:
+        self.arrived.append(FromConsumer(identity, encode(message)))
+
+    def worker_says(self, identity: bytes, frames: Sequence[Any]) -> None:
+        self.arrived.append(FromWorker(identity, frames))
+
+    def take(self, identity: bytes) -> list[Message]:
+        """The messages that were sent to that peer since the last call."""
+        taken = [decode(frames[0]) for frames in self.sent[identity]]
+        self.sent[identity].clear()
+        return taken
+
+
+class ToySupervisor:
+    """Keeps as many workers as it was told to, each of which is whatever ``begin`` makes of a name and an address.
+
+    Args:
+        begin: starts a worker.
+    """
+
+    def __init__(self, begin: Callable[[bytes, str], None]) -> None:
+        self._begin = begin
+        self._address = ""
+        self._named = 0
+        self.workers: list[bytes] = []
+        self.wanted = 0
+        self.deaths: list[Death] = []
+
+    @property
+    def running(self) -> int:
+        return len(self.workers)
+
+    def start(self, address: str) -> None:
+        self._address = address
+
+    def scale(self, workers: int) -> None:
+        self.wanted = workers
+        del self.workers[workers:]
+
+    def watch(self, now: float, samples: int) -> list[Death]:
+        deaths, self.deaths = self.deaths, []
+        while len(self.workers) < self.wanted:
+            self._named += 1
+            self.workers.append(f"toy{self._named}".encode())
+            self._begin(self.workers[-1], self._address)
+        return deaths
+
+    def watches(self, identity: bytes) -> bool:
+        return identity in self.workers
+
+    def give_up(self, identity: bytes, reason: str) -> Loss | None:
+        if identity not in self.workers:
+            return None
+        self.workers.remove(identity)
+        return Loss(Cause.HUNG, reason)
+
+    def stop(self) -> None:
+        self.scale(0)
+
+    def kill(self, identity: bytes, cause: Cause) -> None:
+        """That worker ends."""
+        self.workers.remove(identity)
+        self.deaths.append(Death(identity, Loss(cause, "died")))

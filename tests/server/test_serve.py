@@ -1,0 +1,181 @@
+"""The loop carries actions out in their order, and reports back what it alone can know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.server.queues import Queues, ToySupervisor
+from v2v_protocol.errors import VideoChanged
+from v2v_protocol.messages import Pong, Stop
+from v2v_protocol.sample import Refusal
+from v2v_protocol.wire import encode
+from v2v_server import serve as serve_module
+from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.counters import Counters
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import Request
+from v2v_server.broker.quarantine import Quarantine, Verdict, read_quarantine
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.config import ServeConfig
+from v2v_server.serve import Server
+
+VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
+RECORD = Record(VERDICT, Request(b"c", 0, 0))
+
+
+class Scripted:
+    """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
+
+    workers, sessions, waiting = 0, (), 0
+
+    def __init__(self, first: Sequence[Action] = (), after_record: Sequence[Action] = ()) -> None:
+        self.first: list[Action] = list(first)
+        self.after_record = after_record
+        self.told: list[tuple[Any, ...]] = []
+        self.times: list[float] = []
+        self.counters = Counters()
+
+    def tick(self, now: float) -> list[Action]:
+        self.times.append(now)
+        said, self.first = self.first, []
+        return said
+
+    def recorded(self, record: Record, written: list[Verdict], now: float) -> list[Action]:
+        self.told.append(("recorded", record, written))
+        return list(self.after_record)
+
+    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
+        self.told.append(("looked for", missing, found))
+        return []
+
+    def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
+        self.told.append(("lost", identity, loss))
+        return []
+
+    def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
+        self.told.append(("unreachable", identity))
+        return []
+
+    def consumer_lost(self, identity: bytes) -> None:
+        self.told.append(("consumer lost", identity))
+
+    def stop_workers(self) -> list[ToWorker]:
+        return [ToWorker(b"w", encode(Stop()))]
+
+
+def served(
+    dispatcher: Scripted, folder: Path, supervisor: ToySupervisor | None = None, transport: Queues | None = None
+) -> Server:
+    """A server that has made one turn."""
+    server = Server(
+        ServeConfig(videos="videos", workers=0),
+        cast(Catalogue, SimpleNamespace(path=lambda video: folder / video)),
+        cast(Dispatcher, dispatcher),
+        transport or Queues(),
+        supervisor or ToySupervisor(lambda name, address: None),
+        Quarantine(),
+        folder / "quarantine.jsonl",
+    )
+    server.turn(0.0)
+    return server
+
+
+def test_a_record_is_written_and_reported_before_what_follows(tmp_path: Path) -> None:
+    dispatcher = Scripted(
+        [RECORD, ToConsumer(b"gone", encode(Pong()))], after_record=[ToConsumer(b"first", encode(Pong()))]
+    )
+    served(dispatcher, tmp_path)
+    written = replace(VERDICT, snapshot=1)
+    assert dispatcher.told == [("recorded", RECORD, [written]), ("consumer lost", b"first"), ("consumer lost", b"gone")]
+    assert read_quarantine(tmp_path / "quarantine.jsonl").lines == (written,)
+
+
+def test_a_record_that_cannot_be_written_is_said_and_the_server_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "quarantine.jsonl").mkdir()
+    dispatcher = Scripted([RECORD])
+    served(dispatcher, tmp_path)
+    assert dispatcher.told == [("recorded", RECORD, [])]
+    assert "v.mp4 from frame 0: crash; it is passed over this once and comes again" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_what_is_looked_for_is_reported(
+    found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def check(path: Path, fingerprint: str) -> None:
+        if not found:
+            raise VideoChanged("a.mp4", None, "another file")
+
+    monkeypatch.setattr(serve_module, "check_fingerprint", check)
+    missing = LookFor("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
+    dispatcher = Scripted([missing, missing])
+    served(dispatcher, tmp_path)
+    assert dispatcher.told == [("looked for", missing, found)] * 2
+    said = capsys.readouterr().err
+    assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
+
+
+def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:
+    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor.scale(1)
+    supervisor.watch(0.0, 0)
+    dispatcher = Scripted([GiveUp(b"toy1", "slept"), GiveUp(b"elsewhere", "slept")])
+    served(dispatcher, tmp_path, supervisor)
+    assert dispatcher.told == [
+        ("lost", b"toy1", Loss(Cause.HUNG, "slept")),
+        ("lost", b"elsewhere", Loss(Cause.UNEXPLAINED, "slept")),
+    ]
+
+
+def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor.scale(2)
+    supervisor.watch(0.0, 0)
+    supervisor.kill(b"toy1", Cause.CRASHED)
+    dispatcher = Scripted()
+    served(dispatcher, tmp_path, supervisor)
+    assert dispatcher.told == [("lost", b"toy1", Loss(Cause.CRASHED, "died"))]
+    assert supervisor.workers == [b"toy2", b"toy3"]
+    assert "worker toy1 died; its work is given to others" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool, tmp_path: Path) -> None:
+    """How a process of ours ended says whether the sample is to blame; that it is not there any more does not."""
+    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor.scale(int(watched))
+    supervisor.watch(0.0, 0)
+    dispatcher = Scripted([ToWorker(b"toy1", encode(Stop()))])
+    served(dispatcher, tmp_path, supervisor)
+    assert dispatcher.told == ([] if watched else [("unreachable", b"toy1")])
+
+
+def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    served(Scripted([PassOver(Refusal(0, "a.mp4", 7, "cut short"))]), tmp_path)
+    assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
+
+
+def test_a_server_that_stops_says_farewell_whoever_is_there(tmp_path: Path) -> None:
+    server = served(Scripted(), tmp_path)
+    server.close()  # to a worker that is not there
+
+
+def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its workers were stopped along with it, or have answered to nobody: no deadline may run out."""
+    dispatcher = Scripted()
+    monkeypatch.setattr(serve_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
+    server = served(dispatcher, tmp_path)
+    server.turn(0.0)
+    server.turn(0.0)
+    assert dispatcher.times == [50.0, 51.0, 52.0]

@@ -1,0 +1,166 @@
+"""The way in and out: who sent what, and what goes to whom.
+
+The loop (:mod:`v2v_server.serve`) knows only the :class:`Transport`. The server's is :class:`Sockets`, two ZeroMQ
+sockets; tests have one of plain queues.
+
+Samples pass through as the very frames that arrived; only the small header before them is read.
+
+Memory: a consumer asks for more only as it takes what it was sent, so broker bytes <= sum over sessions of credit x
+sample bytes (in ZeroMQ's out-queue of a consumer that is slow) + workers x 2 x sample bytes. A peer that asks and never
+reads is cut off at MOST_QUEUED messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import zmq
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_HEADER_BYTES
+from v2v_server.broker.actions import ToConsumer, ToWorker
+
+MOST_QUEUED = 512
+"""Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
+_KEEPALIVE_SECONDS = 300
+# Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
+_NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
+
+
+@dataclass(frozen=True, slots=True)
+class FromConsumer:
+    """A message that a consumer sent."""
+
+    identity: bytes
+    frames: Sequence[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class FromWorker:
+    """A message that a worker sent."""
+
+    identity: bytes
+    frames: Sequence[Any]
+
+
+Arrival: TypeAlias = FromConsumer | FromWorker
+
+
+class Transport(Protocol):
+    """Carries messages between the server and its peers."""
+
+    @property
+    def address(self) -> str:
+        """Where consumers connect."""
+
+    @property
+    def worker_address(self) -> str:
+        """Where workers connect."""
+
+    def receive(self, seconds: float) -> list[Arrival]:
+        """At most one message of each side, so that neither can shut the other out; the workers' first.
+
+        Args:
+            seconds: longest wait for any of them.
+        """
+
+    def send(self, action: ToConsumer | ToWorker) -> bool:
+        """False when the peer is not connected any more, or does not read what it is sent."""
+
+    def close(self) -> None:
+        """Ends all connections; what was not sent is dropped."""
+
+
+class Sockets:
+    """Two ROUTER sockets, one for consumers and one for workers.
+
+    Args:
+        bind: address for consumers.
+        worker_bind: address for workers.
+
+    Raises:
+        UsageError: an address that cannot be bound; the message names the flag.
+    """
+
+    def __init__(self, bind: str, worker_bind: str) -> None:
+        self._context = zmq.Context()
+        try:
+            self._consumers = self._router(bind, "--bind", LARGEST_HEADER_BYTES)
+            self._workers = self._router(worker_bind, "--worker-bind", LARGEST_ARRAY_BYTES)
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._poller = zmq.Poller()
+        self._poller.register(self._consumers, zmq.POLLIN)
+        self._poller.register(self._workers, zmq.POLLIN)
+        self.address = self._consumers.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.worker_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def _router(self, address: str, flag: str, largest_bytes: int) -> zmq.Socket[bytes]:
+        router = self._context.socket(zmq.ROUTER)
+        router.setsockopt(zmq.LINGER, 0)
+        # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
+        router.setsockopt(zmq.IPV6, int("[" in address))
+        router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
+        router.setsockopt(zmq.RCVHWM, MOST_QUEUED)
+        router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
+        # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
+        router.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        # A host that vanishes (pre-empted, unplugged) says no farewell, and nothing is said to it that would show it:
+        # the system asks, or its connection would stay open as long as this process lives.
+        router.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
+        try:
+            router.bind(address)
+        except zmq.ZMQError as error:
+            raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
+        return router
+
+    def receive(self, seconds: float) -> list[Arrival]:
+        """See :class:`Transport`."""
+        ready = dict(self._poller.poll(int(seconds * 1000)))
+        arrivals: list[Arrival] = []
+        if self._workers in ready and (message := _receive(self._workers)) is not None:
+            arrivals.append(FromWorker(*message))
+        if self._consumers in ready and (message := _receive(self._consumers)) is not None:
+            arrivals.append(FromConsumer(*message))
+        return arrivals
+
+    def send(self, action: ToConsumer | ToWorker) -> bool:
+        """See :class:`Transport`."""
+        router = self._consumers if isinstance(action, ToConsumer) else self._workers
+        try:
+            router.send(action.identity, _NOBLOCK_MORE)
+            for frame in action.frames[:-1]:
+                router.send(frame, _NOBLOCK_MORE, copy=False)
+            router.send(action.frames[-1], _NOBLOCK, copy=False)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError as error:
+            if error.errno == zmq.EHOSTUNREACH:
+                return False
+            raise
+        return True
+
+    def close(self) -> None:
+        """Closes both sockets; what was not sent is dropped."""
+        self._context.destroy(linger=0)
+
+
+def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
+    """A message that is there, and who sent it.
+
+    The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
+    """
+    frames: list[Any] = []
+    try:
+        identity = frame = router.recv(_NOBLOCK, copy=False)
+        while frame.more:  # recv_multipart asks the socket instead, which takes longer
+            frame = router.recv(_NOBLOCK, copy=False)
+            frames.append(frame if frames else frame.bytes)
+    except zmq.Again:
+        return None  # a connection that just ended took it along
+    return identity.bytes, frames
