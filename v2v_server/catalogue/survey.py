@@ -112,8 +112,8 @@ def survey(
 
 
 def _culprit(root: Path, id: str, death: Died) -> Record:
-    if death.from_outside:
-        why = f"could not be probed: the process was ended from outside or for want of memory ({death.how}), twice"
+    if not death.is_crash:
+        why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return Record(id, -1, 0, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:

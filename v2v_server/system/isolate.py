@@ -18,6 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
+from v2v_protocol.errors import UsageError
 from v2v_server.system.process import die_with_parent
 
 J = TypeVar("J")
@@ -26,6 +27,10 @@ R = TypeVar("R")
 _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+_NO_START = (
+    "a process that reads videos ended as it started ({how}); its own message stands above. In a script, put what opens "
+    'videos below `if __name__ == "__main__":`, because each such process imports the script again'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +40,12 @@ class Died:
     Attributes:
         exitcode: as ``multiprocessing`` gives it: the exit status, or minus the number of a signal.
         overdue_seconds: how long it was waited for before it was ended here; 0 if it died by itself.
+        begun: whether the process had started when it died, so that it was at the job.
     """
 
     exitcode: int
     overdue_seconds: float = 0.0
+    begun: bool = True
 
     @property
     def how(self) -> str:
@@ -51,9 +58,13 @@ class Died:
         return f"signal {signal.Signals(number).name if number in set(signal.Signals) else number}"
 
     @property
-    def from_outside(self) -> bool:
-        """Whether it was killed by somebody, or by a kernel short of memory, so that the job is not to blame."""
-        return not self.overdue_seconds and -self.exitcode in _FROM_OUTSIDE
+    def is_crash(self) -> bool:
+        """Whether the job is to blame: a signal of the process's own making struck it at work.
+
+        Otherwise somebody killed it, the kernel was short of memory, it was overdue, or it ended with a status: an
+        exception of this program, or something that is wrong with the installation.
+        """
+        return self.begun and self.exitcode < 0 and not self.overdue_seconds and -self.exitcode not in _FROM_OUTSIDE
 
 
 def run_isolated(
@@ -76,6 +87,7 @@ def run_isolated(
 
     Raises:
         OSError: no process can be started.
+        UsageError: a process ended with a status before it took its job: no other one would do better.
     """
     if processes == 0:
         yield from ((job, function(job)) for job in jobs)
@@ -94,6 +106,8 @@ def run_isolated(
             for ready in [connection for connection, lane in lanes.items() if connection.poll() or lane.patience <= 0]:
                 lane = lanes[ready]
                 finished = lane.finish() if ready.poll() else lane.give_up()
+                if finished is None:
+                    continue
                 for following in left:
                     if isinstance(finished[1], Died):
                         lane = _Lane(function, deadline_seconds)
@@ -129,6 +143,7 @@ class _Lane(Generic[J, R]):
     def __init__(self, function: Callable[[J], R], deadline_seconds: Callable[[J], float] | None) -> None:
         self._deadline_seconds = deadline_seconds
         self.patience = math.inf
+        self._begun = False
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, function, os.getpid()), daemon=True)
@@ -151,17 +166,25 @@ class _Lane(Generic[J, R]):
         except OSError:
             return  # it died before it had the job: finish() finds the end of the pipe
 
-    def finish(self) -> tuple[J, R | Died]:
+    def finish(self) -> tuple[J, R | Died] | None:
+        """What came of the job; None if the process has only said that it began."""
         try:
-            return self._job, self.connection.recv()
+            result = self.connection.recv()
         except (EOFError, OSError):
             self._process.join()
-            return self._job, Died(self._process.exitcode or 0)
+            death = Died(self._process.exitcode or 0, begun=self._begun)
+            if not death.begun and death.exitcode >= 0:
+                raise UsageError(_NO_START.format(how=death.how)) from None
+            return self._job, death
+        if self._begun:
+            return self._job, result
+        self._begun = True
+        return None
 
     def give_up(self) -> tuple[J, R | Died]:
         self._process.kill()
         self._process.join(_EXIT_SECONDS)
-        return self._job, Died(-signal.SIGKILL, self._allowed)
+        return self._job, Died(-signal.SIGKILL, self._allowed, self._begun)
 
     def end(self) -> None:
         self.connection.close()
@@ -187,6 +210,7 @@ def _interrupt_held_back() -> Iterator[None]:
 def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int) -> None:
     die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
+    connection.send(None)  # begun: what ends this process from here on is no fault of its start
     while True:
         try:
             job = connection.recv()

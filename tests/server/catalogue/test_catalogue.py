@@ -7,6 +7,8 @@ import os
 import pwd
 import shutil
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -15,12 +17,12 @@ import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
 from tests.server.catalogue.failing_storage import failing_opens
-from tests.server.video.lethal_reads import always_killed, killed_once, lethal, waiting
+from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.catalogue import catalogue as catalogue_module
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.refresh import index_path
-from v2v_server.catalogue.survey import survey
+from v2v_server.catalogue.survey import Examine, survey
 from v2v_server.store.manifest import MANIFEST_NAME
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
@@ -367,9 +369,24 @@ def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
 def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
     names = ["a.mp4", "sub/b.mp4"]
     assert {record.id: record.problem for record in survey(corpus, names, 2, killed_once)} == dict.fromkeys(names)
-    (record,) = survey(corpus, ["a.mp4"], 2, always_killed)
-    assert "from outside or for want of memory (signal SIGKILL)" in (record.problem or "")
+
+
+@pytest.mark.parametrize(("ended", "how"), [(always_killed, "signal SIGKILL"), (always_exits, "exit status 3")])
+def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ended: Examine, how: str) -> None:
+    (record,) = survey(corpus, ["a.mp4"], 2, ended)
+    assert f"twice ({how}), which says nothing of the file" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again
+
+
+def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "from v2v_server.catalogue.catalogue import open_catalogue\n"
+        f"open_catalogue({str(corpus)!r}, cache_dir={str(opener.cache)!r}, processes=2)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert '`if __name__ == "__main__":`' in done.stderr
+    assert len(opener(corpus).videos) == 3
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -64,7 +66,7 @@ def test_a_job_that_waits_for_ever_costs_itself(tmp_path: Path) -> None:
     hung = results.pop(2)
     assert hung == Died(-signal.SIGKILL, 1.0)
     assert isinstance(hung, Died)
-    assert (hung.how, hung.from_outside) == ("ended after 1 s without a result", False)
+    assert (hung.how, hung.is_crash) == ("ended after 1 s without a result", False)
     assert results == {1: 1, 3: 9, 4: 16}
 
 
@@ -80,7 +82,9 @@ def test_how_a_process_died() -> None:
     assert [death.how for death in deaths] == [
         "exit status 7", "signal SIGSEGV", "signal SIGKILL", "signal SIGTERM", "signal 40",
     ]  # fmt: skip
-    assert [death.from_outside for death in deaths] == [False, False, True, True, False]
+    assert [death.is_crash for death in deaths] == [False, True, False, False, True]
+    assert not Died(-signal.SIGSEGV, begun=False).is_crash
+    assert not Died(-signal.SIGSEGV, overdue_seconds=1.0).is_crash
 
 
 def interrupts_let_through(job: None) -> tuple[bool, bool]:
@@ -91,6 +95,21 @@ def interrupts_let_through(job: None) -> tuple[bool, bool]:
 def test_an_interrupt_strikes_the_caller_only() -> None:
     assert list(run_isolated(interrupts_let_through, [None, None, None], processes=2)) == [(None, (False, False))] * 3
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+    """Each spawned process imports the script, which would start processes of its own."""
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "from v2v_server.system.isolate import run_isolated\n"
+        "print(list(run_isolated(abs, [1, 2, 3], processes=2)))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1
+    assert last.startswith("v2v_protocol.errors.UsageError: ")
+    assert "exit status 1" in last
+    assert '`if __name__ == "__main__":`' in last
 
 
 def test_a_process_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
