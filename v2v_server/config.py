@@ -37,6 +37,7 @@ class ServeConfig:
         insecure: allow addresses other than loopback although nothing is encrypted or authenticated.
         port_file: file that receives the bound address once the server is ready.
         cache_dir: folder of the catalogue index; empty: the user's cache.
+        list_refused: name every video that cannot be used at the start, not only the first five.
         preset: speed preset ("exact", "balanced", "fast"), see :data:`v2v_protocol.spec.SPEED_PRESETS`.
         recipe: recipe preset name, or a mapping of recipe fields: the default for consumers that ask for none.
         voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
@@ -61,6 +62,7 @@ class ServeConfig:
     insecure: bool = False
     port_file: str = ""
     cache_dir: str = ""
+    list_refused: bool = False
     preset: str = "exact"
     recipe: Any = None
     voxel_dtype: str = "int8"

@@ -74,7 +74,7 @@ def serve(config: ServeConfig) -> None:
     for note in catalogue.notes:
         _say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    for line in summary(catalogue, config.spec, table):
+    for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
         _say(line)
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")

@@ -48,7 +48,7 @@ from v2v_bench.speed.memory import Fit, fit, rss_mib
 from v2v_client.tools.loadtest import percentile
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
-from v2v_server.catalogue.tree import VIDEO_SUFFIXES
+from v2v_server.catalogue.files import VIDEO_SUFFIXES
 
 _LOOK_SECONDS = 0.05
 _WARM_UP_SECONDS = 8.0

@@ -44,7 +44,9 @@ def effective_samples(count: int, coefficient: float) -> float:
 
 
 def diversity(root: Path, leases: Sequence[Lease]) -> list[dict[str, Any]]:
-    """Records of siblings and of a batch of as many different places."""
+    """Records of siblings and of a batch of as many different places; none where there is but one place."""
+    if len(leases) < 2:
+        return []
     places = [_activities(root, lease) for lease in leases]
     siblings = [pair for place in places for pair in itertools.combinations(place, 2)]
     strangers = [pair for view in zip(*places, strict=True) for pair in itertools.combinations(view, 2)]

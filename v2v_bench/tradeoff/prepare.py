@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
-from v2v_server.catalogue.tree import video_files
+from v2v_server.catalogue.files import video_files
 from v2v_server.prepare.encode import CODECS, Codec, Encoding, encode_luma
 from v2v_server.prepare.transcode import luma_frames
 from v2v_server.video.decode import decode_luma

@@ -10,13 +10,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
+from v2v_server.catalogue.files import (
+    UNPRINTABLE,
+    VIDEO_SUFFIXES,
+    Notice,
+    corpus_root,
+    printable,
+    regular_files,
+    video_files,
+)
 from v2v_server.catalogue.index_file import Record, Store
-from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list, regular_files
+from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
-from v2v_server.catalogue.round_trips import Notice
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
-from v2v_server.catalogue.tree import VIDEO_SUFFIXES, printable, video_files
 from v2v_server.store.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
@@ -235,7 +242,8 @@ def open_catalogue(
         rows = None
         ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
     else:
-        ids = _found(root, refused, notice) if listed is None else regular_files(root, listed, refused, notice)
+        named = None if listed is None else [entry.id for entry in listed]
+        ids = _found(root, refused, notice) if named is None else regular_files(root, named, refused, notice)
         refuse_prepared_below(root, ids)
     if not ids:
         raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
@@ -250,17 +258,15 @@ def open_catalogue(
 
 def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Path, tuple[ListEntry, ...] | None]:
     """The root folder, and the entries to take from it; None takes every video below it."""
+    folder = corpus_root(source)
     if source.is_dir():
-        return source.resolve(), None if list_file is None else read_list(list_file)
+        return folder, None if list_file is None else read_list(list_file)
     if list_file is not None:
         raise CorpusError(f"{source}: not a folder; a list file names videos of a folder")
-    if not source.is_file():
-        raise CorpusError(f"{source}: there is no such folder, video or list file")
-    folder = source.parent.resolve()
     if source.suffix.lower() in LIST_SUFFIXES:
         return folder, read_list(source)
     if printable(source.name) != source.name:
-        raise CorpusError(f"{printable(source.name)}: its name is not UTF-8 text; rename it")
+        raise CorpusError(f"{printable(source.name)}: {UNPRINTABLE}")
     return folder, (ListEntry(source.name),)
 
 

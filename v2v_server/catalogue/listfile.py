@@ -11,13 +11,12 @@ import csv
 import math
 import os
 import re
-import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.round_trips import Notice, answers
+from v2v_server.catalogue.files import printable
 
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 
@@ -76,38 +75,6 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
     return tuple(found)
 
 
-def regular_files(
-    root: Path, entries: Sequence[ListEntry], refused: dict[str, str], notice: Notice | None = None
-) -> tuple[str, ...]:
-    """The ids of a list but for those that name something else than a file.
-
-    To open a named pipe waits for somebody to write into it, for ever if need be, and a device may not end. An id that
-    names nothing stays: whoever reads it says why it cannot.
-
-    Args:
-        root: the folder that ids are relative to.
-        entries: of the list.
-        refused: receives, by id, why one cannot be taken in.
-        notice: told how far it is.
-    """
-
-    def may_be_read(id: str) -> bool:
-        try:
-            return stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
-        except OSError:
-            return True
-
-    ids = []
-    for done, (id, is_regular) in enumerate(answers(may_be_read, [entry.id for entry in entries]), 1):
-        if notice is not None:
-            notice(f"looking at the list's files: {done} of {len(entries)}")
-        if is_regular:
-            ids.append(id)
-        else:
-            refused[id] = "is no regular file"
-    return tuple(ids)
-
-
 def _comma_columns(line: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], strict=True))]
 
@@ -156,6 +123,6 @@ def _relative(text: str) -> str:
         raise ValueError(f"{text} leaves the folder of the videos")
     if not _SUFFIX.fullmatch(path.suffix):
         raise ValueError(f"{text!r} does not name a video file")
-    if any(ord(character) < 32 for character in text):
-        raise ValueError(f"{text!r} holds control characters")
+    if printable(text) != text:
+        raise ValueError(f"{printable(text)} holds control characters")
     return str(path)

@@ -12,8 +12,8 @@ from contextlib import closing
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.files import Notice, answers
 from v2v_server.catalogue.index_file import Record, Store
-from v2v_server.catalogue.round_trips import Notice, answers
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
 

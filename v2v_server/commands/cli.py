@@ -23,6 +23,7 @@ from v2v_protocol.spec import (
     SPEED_PRESETS,
     VOXEL_DTYPES,
 )
+from v2v_server.catalogue.files import corpus_root
 from v2v_server.config import DEFAULT_BIND, ServeConfig, recipe_setting
 
 
@@ -54,6 +55,9 @@ def serve(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--port-file", metavar="FILE", help="receives the bound address once the server is ready")
     parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_argument(
+        "--list-refused", action="store_true", default=None, help="name every video that cannot be used, not only five"
+    )
     _add_spec(parser)
     parser.add_argument(
         "--lease-deadline-seconds", type=float, metavar="S", help="a worker silent for longer hangs (60)"
@@ -81,7 +85,7 @@ def worker(argv: Sequence[str] | None = None) -> None:
     """`v2v-worker`."""
     parser = new_parser("v2v-worker", "Work for a server: take leases, make samples.")
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
-    parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus folder on this host")
+    parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus on this host: what the server's is")
     parser.add_argument("--name", help="how its name begins in logs (default: host and process id)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
@@ -91,7 +95,9 @@ def worker(argv: Sequence[str] | None = None) -> None:
 
         # Its own workers a server names itself, and knows them by it.
         name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
-        run_worker(arguments.connect, Path(arguments.videos), name, arguments.parent_pid, arguments.logbook_fd)
+        run_worker(
+            arguments.connect, corpus_root(Path(arguments.videos)), name, arguments.parent_pid, arguments.logbook_fd
+        )
 
     run_command(parser, run, argv)
 

@@ -12,9 +12,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
 from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
+from v2v_server.catalogue.files import corpus_root
 from v2v_server.commands.cli import new_parser, run_command
 
 
@@ -29,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it holds")
 
     def run(arguments: argparse.Namespace) -> None:
-        file = quarantine_path(_root(Path(arguments.videos)), arguments.cache_dir)
+        file = quarantine_path(corpus_root(Path(arguments.videos)), arguments.cache_dir)
         quarantine = read_quarantine(file)
         if arguments.clear and quarantine.verdicts(quarantine.latest):
             _clear(file, quarantine)
@@ -42,17 +43,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             write_json(arguments.json, records)
 
     run_command(parser, run, argv)
-
-
-def _root(source: Path) -> Path:
-    """The corpus folder that a catalogue of this source would have."""
-    try:
-        is_there = source.exists()
-    except OSError as error:
-        raise CorpusError(f"--videos {source}: cannot be looked at: {error.strerror or error}") from error
-    if not is_there:
-        raise CorpusError(f"--videos {source}: there is no such folder, video or list file")
-    return (source if source.is_dir() else source.parent).resolve()
 
 
 def _clear(file: Path, quarantine: Quarantine) -> None:

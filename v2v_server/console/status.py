@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TextIO
 
@@ -17,8 +18,13 @@ _LIVE_SECONDS = 0.5
 _LOG_SECONDS = 10.0
 
 
-def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> list[str]:
-    """Lines that say how many sequences there are, which videos give none, and which setting would admit them."""
+def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, list_refused: bool = False) -> list[str]:
+    """Lines that say how many sequences there are, which videos give none, and which setting would admit them.
+
+    Args:
+        catalogue, spec, table: of the server.
+        list_refused: names all of those videos, not only the first few.
+    """
     recipe = spec.recipe
     lines = [
         f"{len(catalogue.videos)} videos in {catalogue.root}: {table.videos} give {table.count} sequences of "
@@ -31,17 +37,19 @@ def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable) -> lis
         )
     if table.rejections:
         lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
-        for rejection in table.rejections[:_SHOWN]:
-            lines.append(f"  {rejection.video}: {rejection.reason}; would admit it: {rejection.remedy}")
-        if len(table.rejections) > _SHOWN:
-            lines.append(f"  ... and {len(table.rejections) - _SHOWN} more")
+        refused = [f"{one.video}: {one.reason}; would admit it: {one.remedy}" for one in table.rejections]
+        lines += _listed(refused, list_refused)
         lines += _shorter_clips(table)
     if catalogue.problems:
         lines.append(f"{len(catalogue.problems)} files cannot be used at all:")
-        lines += [f"  {problem.id}: {problem.reason}" for problem in catalogue.problems[:_SHOWN]]
-        if len(catalogue.problems) > _SHOWN:
-            lines.append(f"  ... and {len(catalogue.problems) - _SHOWN} more")
+        lines += _listed([f"{problem.id}: {problem.reason}" for problem in catalogue.problems], list_refused)
     return lines
+
+
+def _listed(refused: Sequence[str], all_of_them: bool) -> list[str]:
+    shown = refused if all_of_them else refused[:_SHOWN]
+    rest = len(refused) - len(shown)
+    return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
 
 
 def _shorter_clips(table: SequenceTable) -> list[str]:

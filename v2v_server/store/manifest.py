@@ -20,8 +20,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_server.catalogue.files import answers
 from v2v_server.catalogue.index_file import Record
-from v2v_server.catalogue.round_trips import answers
 from v2v_server.catalogue.scene import Scene
 from v2v_server.prepare.encode import Encoding
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX

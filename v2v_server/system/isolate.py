@@ -28,8 +28,8 @@ _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _NO_START = (
-    "a process that reads videos ended as it started ({how}); its own message stands above. In a script, put what opens "
-    'videos below `if __name__ == "__main__":`, because each such process imports the script again'
+    "a process that reads videos ended as it started ({how}); its own message stands above. In a script, put what "
+    'opens videos below `if __name__ == "__main__":`, because each such process imports the script again'
 )
 
 

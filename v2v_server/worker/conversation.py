@@ -22,7 +22,6 @@ import zmq
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import (
-    CorpusError,
     ProtocolError,
     RemoteError,
     UsageError,
@@ -312,18 +311,11 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
 
     Raises:
-        CorpusError: the folder is missing, or this user may not look at it.
         UsageError: the address cannot be connected to.
         RemoteError, VersionMismatch: the server refuses this worker.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    try:
-        is_there = root.is_dir()
-    except OSError as error:
-        raise CorpusError(f"--videos {root}: cannot be looked at: {error.strerror or error}") from error
-    if not is_there:
-        raise CorpusError(f"--videos {root}: no such folder on this host")
     keep_freed_memory()
     # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"

@@ -15,21 +15,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.bench.small import FLAGS, clips, is_picture, one_line, records
-from tests.clips import write_clip
+from tests.clips import panned_luma, write_clip
+from v2v_bench.records import recipe_of
 from v2v_bench.speed.kernel import textured_frames
 from v2v_bench.tradeoff import tradeoff
 from v2v_bench.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, at_threshold, spurious
-from v2v_bench.tradeoff.diversity import effective_samples, overlap
+from v2v_bench.tradeoff.diversity import diversity, effective_samples, overlap
 from v2v_bench.tradeoff.errors import Tally, common_bins, compare, correlation
 from v2v_bench.tradeoff.forms import ENCODINGS, SOURCE
 from v2v_bench.tradeoff.front import best, dominates, dominators
 from v2v_bench.tradeoff.knobs import EXACT, Setting, settings, write_preset
 from v2v_bench.tradeoff.noise import cheap_kernel, run_kernel
 from v2v_bench.tradeoff.other import compressors
-from v2v_bench.tradeoff.speed import Speed, Work, measure
+from v2v_bench.tradeoff.speed import Speed, Work, leases_of, measure
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import preset
 from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.simulation.clip import simulate_clip
@@ -219,6 +221,16 @@ def test_works_take_turns_and_the_fastest_round_of_each_place_counts(monkeypatch
     assert done == ["a0", "b0", *["a0", "b0", "a1", "b1"], *["b0", "a0", "b1", "a1"]]
     assert found["a"] == Speed(fastest=(1.0 + 2.0) / 2 / 2, median=1.25, rounds=2)
     assert found["b"] == Speed(fastest=5.0, median=7.5, rounds=2)
+
+
+def test_one_place_alone_has_no_diversity(tmp_path: Path) -> None:
+    (tmp_path / "clips").mkdir()
+    write_clip(tmp_path / "clips" / "a.mp4", panned_luma(40, 100, 180))
+    spec = StreamSpec(recipe=recipe_of(["voxels_per_clip=3", "crop_height_px=64", "crop_width_px=64"]))
+    with contextlib.closing(open_catalogue(tmp_path / "clips", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        leases = leases_of(catalogue, spec, 2)
+    assert diversity(tmp_path / "clips", leases[:1]) == []
+    assert [record["name"] for record in diversity(tmp_path / "clips", leases)] == ["siblings", "batch"]
 
 
 def test_works_of_different_places_are_refused() -> None:

@@ -54,7 +54,7 @@ def test_many_rejections_are_counted_and_a_length_of_clip_named_that_admits_them
     spec = replace(SMALL_SPEC, recipe=replace(SMALL, voxels_per_clip=10))
     said = lines(corpus(*shorts, video("still.mp4", frames=1), video("good.mp4")), spec)
     assert said[1] == "8 videos give none under the server's own recipe:"
-    assert said[-2] == "  ... and 3 more"
+    assert said[-2] == "  ... and 3 more: --list-refused names all"
     assert len(said) == 2 + 5 + 2
     # The middle one of those seven has room for three voxel grids, and all of them for two.
     assert said[-1] == "  with --set voxels_per_clip=N (now the longest that fits is 7): 3 admits 6, 2 admits 7 of them"
@@ -68,8 +68,11 @@ def test_files_that_cannot_be_used_are_named() -> None:
     assert said[1:] == [
         "7 files cannot be used at all:",
         *(f"  p{number}.mp4: has no video track" for number in range(5)),
-        "  ... and 2 more",
+        "  ... and 2 more: --list-refused names all",
     ]
+    table = SequenceTable(named.videos, named.rows, SMALL_SPEC)
+    every = summary(named, SMALL_SPEC, table, list_refused=True)  # type: ignore[arg-type]
+    assert every[2:] == [f"  p{number}.mp4: has no video track" for number in range(7)]
 
 
 # --- the live line ----------------------------------------------------------------------------------------------------

@@ -101,8 +101,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
     """Each spawned process imports the script, which would start processes of its own."""
     script = tmp_path / "unguarded.py"
     script.write_text(
-        "from v2v_server.system.isolate import run_isolated\n"
-        "print(list(run_isolated(abs, [1, 2, 3], processes=2)))\n"
+        "from v2v_server.system.isolate import run_isolated\nprint(list(run_isolated(abs, [1, 2, 3], processes=2)))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
     last = done.stderr.strip().splitlines()[-1]

@@ -1,0 +1,109 @@
+"""Names that may be shown; many questions at a time, and their answers in order."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.files import answers, corpus_root, printable, video_files
+from v2v_server.catalogue.listfile import read_list
+
+STEERING = {
+    "red\x1b[31m.mp4": r"red\x1b[31m.mp4",
+    "gone\x7f.mp4": r"gone\x7f.mp4",
+    "csi\x9b31m.mp4": r"csi\x9b31m.mp4",
+    "evil\u202e4pm.exe.mp4": r"evil\u202e4pm.exe.mp4",
+    "isolate\u2067x\u2069.mp4": r"isolate\u2067x\u2069.mp4",
+    "mark\u200f.mp4": r"mark\u200f.mp4",
+    "line\u2028.mp4": r"line\u2028.mp4",
+    "bytes\udcff.mp4": r"bytes\xff.mp4",
+}
+
+
+@pytest.mark.parametrize("name", STEERING)
+def test_a_name_that_would_steer_a_terminal_is_shown_escaped_and_refused(tmp_path: Path, name: str) -> None:
+    assert printable(name) == STEERING[name]
+    (tmp_path / name).touch()
+    refused: dict[str, str] = {}
+    assert not list(video_files(tmp_path, refused))
+    assert list(refused) == [STEERING[name]]
+    if name.isprintable() or "\udcff" in name or "\u2028" in name:
+        return  # no text that a list file could hold in one line
+    listed = tmp_path / "list.txt"
+    listed.write_text(f"{name}\n", encoding="utf-8")
+    with pytest.raises(CorpusError) as caught:
+        read_list(listed)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("name", ["plain.mp4", "Straße 1.mp4", "映像.mp4", "فیلم‌ها.mp4", "👩‍👩‍👧.mp4"])
+def test_names_of_any_language_are_taken_as_they_are(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    assert printable(name) == name
+    assert list(video_files(tmp_path, {})) == [name]
+
+
+def test_the_root_of_a_corpus_is_its_folder_or_that_of_its_video_or_list(tmp_path: Path) -> None:
+    for name in ("clip.mp4", "list.txt"):
+        (tmp_path / name).touch()
+        assert corpus_root(tmp_path / name) == tmp_path.resolve()
+    assert corpus_root(tmp_path) == tmp_path.resolve()
+    with pytest.raises(CorpusError, match="no such folder, video or list file on this host"):
+        corpus_root(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("files", [0, 1, 63, 64, 65, 1000])
+def test_each_is_asked_once_and_answered_in_its_place(files: int) -> None:
+    asked: list[int] = []
+
+    def question(file: int) -> int:
+        asked.append(file)
+        return file * file
+
+    assert list(answers(question, range(files))) == [(file, file * file) for file in range(files)]
+    assert sorted(asked) == list(range(files))
+
+
+def test_what_comes_late_holds_up_no_other_question_and_keeps_its_place() -> None:
+    others = threading.Event()
+
+    def question(file: int) -> bool:
+        if file == 999:
+            others.set()
+        return others.wait(10) if file == 0 else True
+
+    assert [file for file, in_time in answers(question, range(1000)) if in_time] == list(range(1000))
+
+
+@pytest.mark.parametrize("room", [0, 3])
+def test_without_room_for_threads_they_are_asked_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    start, started = threading.Thread.start, []
+
+    def limited(thread: threading.Thread) -> None:
+        if len(started) == room:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", limited)
+    assert list(answers(lambda file: -file, range(1000))) == [(file, -file) for file in range(1000)]
+
+
+def test_who_hears_no_more_asks_no_more() -> None:
+    threads, asked = threading.active_count(), []
+
+    def question(file: int) -> None:
+        asked.append(file)
+        time.sleep(0.001)
+
+    heard = answers(question, range(20_000))
+    next(heard)
+    heard.close()
+    assert len(asked) < 20_000
+    assert threading.active_count() == threads
