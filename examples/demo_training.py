@@ -9,8 +9,9 @@ import torch
 
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
-from trainer.run.preview import films, write_png
-from trainer.run.resume import LAST
+from trainer.pictures import write_png
+from trainer.run.checkpoint import LAST
+from trainer.tasks import Reconstruction
 from trainer.weights import load_into
 from v2v_client import Batch, V2VStreamDataset
 
@@ -56,7 +57,8 @@ def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
         f"trained network: mean absolute error {loss:.4f}; constant-mean predictor: {constant:.4f} "
         f"({loss / constant:.0%} of it) on {len(target)} new samples of {_SIDE_PX} x {_SIDE_PX}"
     )
-    shown = [film for batch in batches[:_COLUMNS] for film in films(network, batch, torch.device("cpu"))][:_COLUMNS]
+    task = Reconstruction(config.loss, network, torch.device("cpu"), bfloat16=False)
+    shown = [film for batch in batches[:_COLUMNS] for film in task.judge(network, batch, _COLUMNS)[1]][:_COLUMNS]
     picks = np.linspace(_FIRST_SHOWN, len(shown[0]) - 1, _ROWS).round().astype(int)
     write_png(picture, np.concatenate([np.concatenate(list(film[picks]), axis=0) for film in shown], axis=1))
     print(f"picture: {picture} (events, target, reconstruction; time runs down)")

@@ -1,5 +1,7 @@
 """What a training run can be told: six sections of small frozen dataclasses.
 
+Section ``loss`` is that of the network's task: see :mod:`trainer.tasks`.
+
 Keys are written with their section (``optimizer.learning_rate``), in files as nested mappings; every message names the
 key that way. Files are read by :mod:`trainer.config_file`.
 """
@@ -10,13 +12,13 @@ import copy
 import dataclasses
 import difflib
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal
 
-from trainer.losses.backbones import BACKBONES
 from trainer.models import NETWORKS
-from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS
+from trainer.tasks import TASKS
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
@@ -77,34 +79,6 @@ class StreamConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LossConfig:
-    """What is minimised: a weighted sum; a term of weight 0 costs nothing and needs no file.
-
-    Attributes:
-        l1_weight, lpips_weight, temporal_weight: of the terms.
-        lpips_network: "vgg", "alex" or "squeeze".
-        lpips_backbone, lpips_heads: its weight files.
-        temporal_first_step, temporal_rule, temporal_as_published: see
-        :class:`trainer.losses.temporal.TemporalConsistency`.
-        flow: "raft" on this device, or "stream": estimated by the server's workers.
-        raft_size, raft_weights: "small" or "large", and its weight file.
-    """
-
-    l1_weight: float = 1.0
-    lpips_weight: float = 0.0
-    temporal_weight: float = 0.0
-    lpips_network: str = "vgg"
-    lpips_backbone: str = ""
-    lpips_heads: str = ""
-    temporal_first_step: int = 20
-    temporal_rule: Literal["half", "full"] = "half"
-    temporal_as_published: bool = False
-    flow: Literal["raft", "stream"] = "raft"
-    raft_size: str = "small"
-    raft_weights: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class OptimizerConfig:
     """How it is minimised.
 
@@ -112,8 +86,10 @@ class OptimizerConfig:
         name: "adam" or "adamw".
         learning_rate, weight_decay, amsgrad: PyTorch's.
         learning_rate_decay: factor at the end of each epoch; 1 keeps the rate.
+        warmup_steps: in which the rate rises from 0.
+        schedule: "cosine" lets the rate fall to 0 at the end of the run (``run.steps``, else ``run.epochs``).
         clip_gradient_norm: gradients longer than this are shortened to it; 0: never.
-        ema_decay: of the averaged network (see :mod:`trainer.ema`); 0: none.
+        ema_decay: of the averaged network (see :class:`trainer.learner.AveragedNetwork`); 0: none.
     """
 
     name: Literal["adam", "adamw"] = "adam"
@@ -121,6 +97,8 @@ class OptimizerConfig:
     weight_decay: float = 0.0
     amsgrad: bool = True
     learning_rate_decay: float = 1.0
+    warmup_steps: int = 0
+    schedule: Literal["constant", "cosine"] = "constant"
     clip_gradient_norm: float = 0.0
     ema_decay: float = 0.0
 
@@ -131,7 +109,9 @@ class ComputeConfig:
 
     Attributes:
         device: "auto" takes a GPU if there is one.
-        precision: "bfloat16" runs convolutions under autocast; weights, losses and pictures stay float32.
+        precision: "float32" is IEEE's also on a GPU; "tf32" allows its shorter products; "bfloat16" runs convolutions
+            under autocast, while weights, losses and pictures stay float32.
+        pieces: a batch is computed in so many pieces whose gradients are added up: less memory, the same step.
         channels_last: memory format of the network.
         compile: through ``torch.compile``.
         threads: of PyTorch on the CPU; 0: its own choice. Leave cores to the server's workers.
@@ -139,7 +119,8 @@ class ComputeConfig:
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    pieces: int = 1
     channels_last: bool = False
     compile: bool = False
     threads: int = 0
@@ -156,9 +137,11 @@ class RunConfig:
         steps, seconds: end earlier, after so many optimiser steps or so much time of this process; 0: no such limit.
         log_every: steps between two readings of the losses (the only regular wait for the device).
         save_every: steps between two checkpoints; there is always one at the end.
-        keep_epochs: also keep a checkpoint of the end of each epoch.
-        preview_every: steps between previews; 0: none.
-        preview_samples: samples shown in a preview, if an epoch has so many.
+        keep_epochs: also keep checkpoints of the ends of the last so many epochs.
+        judge_every: steps between two looks at a held-out batch of the stream; 0: none.
+        judge_samples: samples of it, if an epoch has so many.
+        preview_every: steps between films of that batch; 0: none.
+        preview_samples: how many of its samples they show.
     """
 
     out: str = ""
@@ -167,7 +150,9 @@ class RunConfig:
     seconds: float = 0.0
     log_every: int = 20
     save_every: int = 500
-    keep_epochs: bool = False
+    keep_epochs: int = 0
+    judge_every: int = 500
+    judge_samples: int = 4
     preview_every: int = 500
     preview_samples: int = 2
 
@@ -178,15 +163,13 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "stream.seed": (0, LARGEST_SEED),
     "stream.loader_workers": (0, 64),
     "stream.timeout_seconds": (0.1, 1e6),
-    "loss.l1_weight": (0, 1e6),
-    "loss.lpips_weight": (0, 1e6),
-    "loss.temporal_weight": (0, 1e6),
-    "loss.temporal_first_step": (1, 1_000_000),
     "optimizer.learning_rate": (1e-12, 1e3),
     "optimizer.weight_decay": (0, 1e3),
     "optimizer.learning_rate_decay": (1e-6, 1),
+    "optimizer.warmup_steps": (0, 10**9),
     "optimizer.clip_gradient_norm": (0, 1e9),
     "optimizer.ema_decay": (0, 0.999999),
+    "compute.pieces": (1, 65_536),
     "compute.threads": (0, 1024),
     "compute.seed": (0, 2**63 - 1),
     "run.epochs": (1, 1_000_000),
@@ -194,14 +177,16 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "run.seconds": (0, 1e9),
     "run.log_every": (1, 10**9),
     "run.save_every": (1, 10**9),
+    "run.keep_epochs": (0, 1_000_000),
+    "run.judge_every": (0, 10**9),
+    "run.judge_samples": (1, 64),
     "run.preview_every": (0, 10**9),
     "run.preview_samples": (1, 64),
 }
 
 _SET_ELSEWHERE = {
-    "recipe": "stream.recipe",
-    "flow_direction": "loss.temporal_as_published",
-    "flow_from": "loss.temporal_first_step",
+    "recipe": "set stream.recipe instead",
+    **dict.fromkeys(("flow_direction", "flow_from"), "section loss decides"),
 }
 """Fields of the spec that follow from other keys."""
 
@@ -214,16 +199,15 @@ _KINDS: dict[Any, tuple[type[Any], str]] = {
     Any: (object, "a value"),
 }
 
-_CHOICES: dict[str, Sequence[str]] = {
-    "network.name": tuple(NETWORKS),
-    "loss.lpips_network": tuple(BACKBONES),
-    "loss.raft_size": tuple(WHERE_TO_GET_WEIGHTS),
-}
+_CHOICES: dict[str, Collection[str]] = {"network.name": NETWORKS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig:
     """One run.
+
+    Attributes:
+        loss: ``Settings`` of the network's task; None: all of their defaults.
 
     Raises:
         UsageError: an unknown key, or a value of the wrong kind, outside its limits or in conflict with another; the
@@ -232,33 +216,38 @@ class TrainConfig:
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
+    loss: Any = None
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
-        recipe, loss = self.stream.resolved_recipe, self.loss
-        if recipe.lead_frames or recipe.lead_voxels:
-            raise UsageError("stream.recipe has lead_frames or lead_voxels: they are for flow networks, give 0")
-        for name, owner in _SET_ELSEWHERE.items():
+        task = TASKS[NETWORKS[self.network.name].task]
+        if self.loss is None:
+            object.__setattr__(self, "loss", task.Settings())
+        for name in ("lead_frames", "lead_voxels"):
+            if isinstance(self.stream.recipe, Mapping) and name in self.stream.recipe:
+                raise UsageError(f"stream.recipe.{name}: leave it out, it follows from network.name and section loss")
+        for name, remedy in _SET_ELSEWHERE.items():
             if name in self.stream.spec:
-                raise UsageError(f"stream.spec.{name}: set {owner} instead")
+                raise UsageError(f"stream.spec.{name}: {remedy}")
         StreamSpec.from_dict(self.stream.spec)
         if "bins" in self.network.options:
             raise UsageError("network.options.bins: set stream.recipe.bins instead, the network follows it")
-        if not loss.l1_weight + loss.lpips_weight + loss.temporal_weight:
-            raise UsageError("loss.l1_weight, lpips_weight and temporal_weight are all 0: nothing would be trained")
-        if loss.temporal_weight and loss.temporal_first_step >= recipe.voxels_per_clip:
-            raise UsageError(
-                f"loss.temporal_first_step = {loss.temporal_first_step}: give less than stream.recipe.voxels_per_clip "
-                f"= {recipe.voxels_per_clip}"
-            )
+        task.check(self.loss, self.stream.resolved_recipe)
+
+    def with_network_options(self, options: Mapping[str, Any], **changes: Any) -> TrainConfig:
+        """This configuration with more options of the network, behind those that it has, and other changes of it."""
+        merged = {**options, **self.network.options}
+        return dataclasses.replace(self, network=dataclasses.replace(self.network, options=merged, **changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
         """From nested plain values; what is missing keeps its default."""
         sections = {item.name: typing.get_type_hints(cls)[item.name] for item in dataclasses.fields(cls)}
+        network = values.get("network")
+        name = network.get("name", "e2vid") if isinstance(network, Mapping) else "e2vid"
+        sections["loss"] = TASKS[NETWORKS[name].task if name in NETWORKS else "reconstruction"].Settings
         built = {}
         for name, content in values.items():
             if name not in sections:
@@ -269,6 +258,16 @@ class TrainConfig:
     def to_dict(self) -> dict[str, Any]:
         """All keys as nested plain values."""
         return dataclasses.asdict(self)
+
+
+def keys() -> str:
+    """All keys, for people: section by section, ``loss`` for each task."""
+    hints = typing.get_type_hints(TrainConfig)
+    kinds = {name: kind for name, kind in hints.items() if name != "loss"}
+    kinds |= {f"loss ({name})": task.Settings for name, task in TASKS.items()}
+    return "; ".join(
+        f"{name}: {', '.join(item.name for item in dataclasses.fields(kind))}" for name, kind in kinds.items()
+    )
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
@@ -286,20 +285,22 @@ def _section(kind: type[Any], name: str, content: Any) -> Any:
     if not isinstance(content, Mapping):
         raise UsageError(f"{name} = {content!r}: it is a section, give keys and values")
     hints = typing.get_type_hints(kind)
+    stated = {item.name: item.metadata for item in dataclasses.fields(kind)}
     for key in content:
         if key not in hints:
             raise UsageError(f"unknown key {name}.{key}{_nearest(str(key), hints)}; known: {', '.join(hints)}")
-    return kind(**{key: setting_of(f"{name}.{key}", hints[key], value) for key, value in content.items()})
+    return kind(**{key: setting_of(f"{name}.{key}", hints[key], value, stated[key]) for key, value in content.items()})
 
 
-def setting_of(key: str, hint: Any, value: Any) -> Any:
-    """``value`` in the kind that ``hint`` says, within the limits of its key.
+def setting_of(key: str, hint: Any, value: Any, stated: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """``value`` in the kind that ``hint`` says, within the limits, and of the words, that are stated for its key.
 
     Raises:
         UsageError: it is of another kind, or outside; the message names the key.
     """
-    if typing.get_origin(hint) is Literal or key in _CHOICES:
-        words = _CHOICES.get(key) or typing.get_args(hint)
+    words = stated.get("words") or _CHOICES.get(key)
+    if typing.get_origin(hint) is Literal or words:
+        words = words or typing.get_args(hint)
         if value not in words:
             raise UsageError(f"{key} = {value!r}: choose one of {', '.join(words)}")
         return value
@@ -308,8 +309,9 @@ def setting_of(key: str, hint: Any, value: Any) -> Any:
     kind, word = _KINDS[hint]
     if not isinstance(value, kind) or (hint is int and isinstance(value, bool)):
         raise UsageError(f"{key} = {value!r}: give {word}")
-    if key in _LIMITS:
-        low, high = _LIMITS[key]
+    limits = stated.get("limits") or _LIMITS.get(key)
+    if limits:
+        low, high = limits
         if not low <= value <= high:
             raise UsageError(f"{key} = {value!r}: give {word} from {low:g} to {high:g}")
     return copy.deepcopy(value)

@@ -38,6 +38,12 @@ def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
     return TrainConfig.from_dict(values)
 
 
+def show_config(config: TrainConfig) -> str:
+    """All keys of a configuration as YAML, which ``v2v-train`` takes again."""
+    shown: str = yaml.safe_dump(config.to_dict(), sort_keys=False)
+    return shown
+
+
 def _read(file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     path = Path(file)
     if not path.is_file() and file in shipped():

@@ -10,67 +10,65 @@ import signal
 import time
 from collections.abc import Iterable, Iterator
 from itertools import islice
+from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
 
 from trainer.config import TrainConfig
+from trainer.tasks import Asked
 from v2v_client import Batch, V2VStreamDataset
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.sample import LARGEST_SEED
 
-PREVIEW_SEED = 1 << 32
-"""Added to the seed: previews show the same virtual cameras throughout a run, and others than it trains on."""
+HELD_OUT_SEED = 1 << 32
+"""Added to the seed: a run is judged by the same virtual cameras throughout, and others than it trains on."""
 
 
-def stream(config: TrainConfig, address: str) -> V2VStreamDataset:
+def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V2VStreamDataset:
     """What the run trains on.
+
+    Args:
+        config: of the run.
+        asked: by its task.
+        address: of the server.
+        changes: arguments of the dataset that differ from the configuration.
 
     Raises:
         UsageError: a setting that no server could meet.
     """
-    settings, loss = config.stream, config.loss
-    wants_flow = loss.temporal_weight > 0 and loss.flow == "stream"
-    return V2VStreamDataset(
-        address,
-        batch_size=settings.batch_size,
-        arrays=("voxels", "frames", "flow") if wants_flow else ("voxels", "frames"),
-        recipe=settings.resolved_recipe,
-        seed=settings.seed,
-        # The loss wants to know where each pixel was; the released code takes negated forward flow for that.
-        flow_direction="forward" if loss.temporal_as_published or not wants_flow else "backward",
-        flow_from=loss.temporal_first_step if wants_flow else 0,
-        timeout_seconds=settings.timeout_seconds,
+    settings = config.stream
+    arguments: dict[str, Any] = {
+        "batch_size": settings.batch_size,
+        "arrays": asked.arrays,
+        "recipe": asked.recipe(settings.resolved_recipe),
+        "seed": settings.seed,
+        "flow_direction": asked.flow_direction,
+        "flow_from": asked.flow_from,
+        "timeout_seconds": settings.timeout_seconds,
         **settings.spec,
-    )
+    }
+    return V2VStreamDataset(address, **(arguments | changes))
 
 
-def preview_batch(config: TrainConfig, address: str) -> Iterator[Batch]:
-    """Yields the batch that previews show, on the CPU: the same one whenever the run is started again.
+def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:
+    """Yields the batch that the run is judged by, on the CPU: the same one whenever the run is started again.
 
-    It has ``run.preview_samples`` samples, or as many as an epoch has.
+    It has ``run.judge_samples`` samples, or as many as an epoch has.
     """
 
-    def preview(samples: int) -> V2VStreamDataset:
-        return V2VStreamDataset(
-            address,
-            batch_size=samples,
-            recipe=config.stream.resolved_recipe,
-            seed=(config.stream.seed + PREVIEW_SEED) % (LARGEST_SEED + 1),
-            rank=0,
-            world_size=1,
-            timeout_seconds=config.stream.timeout_seconds,
-            **config.stream.spec,
-        )
+    def held_out(samples: int) -> V2VStreamDataset:
+        seed = (config.stream.seed + HELD_OUT_SEED) % (LARGEST_SEED + 1)
+        return stream(config, asked, address, batch_size=samples, seed=seed, rank=0, world_size=1)
 
-    dataset = preview(config.run.preview_samples)
+    dataset = held_out(config.run.judge_samples)
     try:
         yield from islice(dataset, 1)
     except UsageError:
         sequences = 0 if dataset.stream is None else dataset.stream.sequences
-        if not 0 < sequences < config.run.preview_samples:
+        if not 0 < sequences < config.run.judge_samples:
             raise
-        yield from islice(preview(sequences), 1)
+        yield from islice(held_out(sequences), 1)
 
 
 class Feed:
@@ -94,6 +92,7 @@ class Feed:
                 batch_size=None,
                 num_workers=loader_workers,
                 persistent_workers=True,
+                pin_memory=device.type == "cuda",  # in a thread of its own
                 multiprocessing_context="spawn",  # a fork would take the threads' locks of this process with it
                 worker_init_fn=_leave_signals_to_the_trainer,
             )

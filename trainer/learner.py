@@ -1,10 +1,12 @@
-"""What a configuration trains: the network, what judges it, what improves it, and how all of that is saved."""
+"""What a configuration trains: the network, its task, what improves it, and how all of that is saved."""
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import inspect
-import warnings
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,19 +14,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from trainer.config import LossConfig, OptimizerConfig, TrainConfig, setting_of
-from trainer.ema import AveragedNetwork
-from trainer.evaluation.network import fitting
-from trainer.losses.backbones import BACKBONES
-from trainer.losses.lpips import HEADS_FROM, LPIPS
-from trainer.losses.reconstruction import ReconstructionLoss
-from trainer.losses.temporal import TemporalConsistency
-from trainer.models import NETWORKS, ReconstructionNetwork
-from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
+from trainer.config import OptimizerConfig, RunConfig, TrainConfig, setting_of
+from trainer.models import NETWORKS, VoxelNetwork
 from trainer.run.checkpoint import Checkpoint, capture_rng, restore_rng
 from trainer.run.distributed import Ranks
-from trainer.weights import load_into
-from v2v_client import Batch
+from trainer.tasks import TASKS, Task
+from trainer.tasks.task import Work
+from trainer.weights import load_into, read_weights
 from v2v_protocol.errors import UsageError
 
 
@@ -35,70 +31,83 @@ class Learner:
     Attributes:
         network: holds the weights.
         model: the same, wrapped for several ranks and compiled as asked: call it in the training step.
-        loss: what is minimised.
-        flow: where the temporal loss has its flow from; None: from the batch.
-        optimizer, scheduler: the scheduler counts epochs.
+        task: what it is trained for.
+        optimizer: of the network's parameters.
         average: the averaged network, or None.
+        config: of the run.
+        device: where all of this computes.
     """
 
-    network: ReconstructionNetwork
+    network: VoxelNetwork
     model: nn.Module
-    loss: ReconstructionLoss
-    flow: RaftFlow | None
+    task: Task
     optimizer: torch.optim.Optimizer
-    scheduler: torch.optim.lr_scheduler.LRScheduler
     average: AveragedNetwork | None
+    config: TrainConfig
+    device: torch.device
 
     @property
-    def device(self) -> torch.device:
-        """Where the network is."""
-        return next(self.network.parameters()).device
-
-    @property
-    def trained(self) -> ReconstructionNetwork:
+    def trained(self) -> VoxelNetwork:
         """The network to look at: the averaged one where there is one."""
         return self.network if self.average is None else self.average.network
 
-    def flow_of(self, batch: Batch, target: Tensor) -> Tensor | None:
-        """The flow that the loss wants, [B, T - first_step, 2, H, W] px; None where it wants none."""
-        if self.loss.temporal is None:
-            return None
-        first = self.loss.temporal.first_step
-        if self.flow is None:
-            return None if batch.flow is None else batch.flow[:, first:].float()
-        before, now = target[:, first - 1 : -1].flatten(0, 1), target[:, first:].flatten(0, 1)
-        pair = (before, now) if self.loss.temporal.as_published else (now, before)
-        return torch.unflatten(self.flow(*pair), 0, (len(target), -1))
+    def step(self, work: Work, step: int, epoch: int) -> dict[str, Tensor]:
+        """Forward, backward, update. Work for the device is queued, and nothing here waits for it.
 
-    def end_epoch(self) -> None:
-        """The learning rate of the next one."""
-        with warnings.catch_warnings():
-            # PyTorch does not know of the steps that were made before a checkpoint.
-            warnings.filterwarnings("ignore", "Detected call of `lr_scheduler.step", UserWarning)
-            self.scheduler.step()
+        Args:
+            work: of the task, for one batch.
+            step: optimiser steps before this one.
+            epoch: of the batch.
 
-    def checkpoint(self, step: int, stream: Mapping[str, Any] | None, config: TrainConfig) -> Checkpoint:
+        Returns:
+            The losses and the norm of the gradient, on the device.
+        """
+        config = self.config.compute
+        pieces = work.pieces(config.pieces)
+        losses: dict[str, Tensor] = {}
+        self.optimizer.zero_grad()
+        for number, piece in enumerate(pieces, start=1):
+            with self._exchanging(number == len(pieces)):
+                with torch.autocast(self.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+                    prediction, _ = self.model(piece.voxels, None, piece.guide)
+                    found = self.task.losses(prediction, piece)
+                (found["total"] / len(pieces)).backward()  # type: ignore[no-untyped-call]
+            for name, value in found.items():
+                losses[name] = losses.get(name, 0) + value.detach() / len(pieces)
+        norm = gradient_norm(self.network.parameters(), self.config.optimizer.clip_gradient_norm)
+        rate = learning_rate(self.config.optimizer, self.config.run, step, epoch)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.step()
+        if self.average is not None:
+            self.average.update(self.network, step + 1)
+        return losses | {"gradient_norm": norm}
+
+    def _exchanging(self, now: bool) -> contextlib.AbstractContextManager[None]:
+        """Ranks add their gradients up once a step, with the last piece."""
+        if now or not isinstance(self.model, DistributedDataParallel):
+            return contextlib.nullcontext()
+        return self.model.no_sync()
+
+    def checkpoint(self, step: int, stream: Mapping[str, Any] | None) -> Checkpoint:
         """Everything that decides the next losses; ``stream`` is the resume state of the last batch trained on."""
         return Checkpoint(
             step=step,
             epoch=0 if stream is None else stream["epoch"],
             model=self.network.state_dict(),
             optimizer=self.optimizer.state_dict(),
-            scheduler=self.scheduler.state_dict(),
-            ema=None if self.average is None else self.average.state_dict(),
+            ema=None if self.average is None else dict(self.average.network.state_dict()),
             rng=capture_rng(self.device),
             stream=stream,
-            config=config.to_dict(),
+            config=self.config.to_dict(),
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from there; the configurations must agree (see :func:`trainer.run.resume.require_same_run`)."""
+        """Go on from there; the configurations must agree (see :func:`trainer.run.checkpoint.require_same_run`)."""
         self.network.load_state_dict(checkpoint.model)
         _restore_optimizer(self.optimizer, checkpoint.optimizer)
-        if checkpoint.scheduler is not None:
-            self.scheduler.load_state_dict(dict(checkpoint.scheduler))
         if self.average is not None and checkpoint.ema is not None:
-            self.average.load_state_dict(checkpoint.ema)
+            self.average.network.load_state_dict(checkpoint.ema)
         restore_rng(checkpoint.rng, self.device)
 
 
@@ -108,24 +117,92 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     Raises:
         UsageError: a file or option is missing or wrong; the message names the key.
     """
-    torch.manual_seed(config.compute.seed)
+    compute = config.compute
+    if config.stream.batch_size % compute.pieces:
+        raise UsageError(
+            f"compute.pieces = {compute.pieces}: give a divisor of stream.batch_size = {config.stream.batch_size}"
+        )
+    _set_numerics(compute.precision)
+    torch.manual_seed(compute.seed)
     network = _network(config)
-    if config.compute.channels_last:
+    if compute.channels_last:
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     network = network.to(ranks.device)
-    loss = _loss(config.loss).to(ranks.device)
-    flow = _flow(config, ranks.device)
+    task = TASKS[network.task](config.loss, network, ranks.device, bfloat16=compute.precision == "bfloat16")
     optimizer = _optimizer(config.optimizer, network)
-    scheduler = torch.optim.lr_scheduler.ExponentialLR(optimizer, config.optimizer.learning_rate_decay)
     decay = config.optimizer.ema_decay
     average = AveragedNetwork(network, decay) if decay else None
     model: nn.Module = network
     if ranks.world_size > 1:
         devices = [ranks.device] if ranks.device.type == "cuda" else None
         model = DistributedDataParallel(network, device_ids=devices)
-    if config.compute.compile:
+        # Equal first weights everywhere, but not equal dropout.
+        torch.manual_seed(compute.seed + ranks.rank)
+    if compute.compile:
         model = torch.compile(model)  # type: ignore[assignment]
-    return Learner(network, model, loss, flow, optimizer, scheduler, average)
+    return Learner(network, model, task, optimizer, average, config, ranks.device)
+
+
+def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int) -> float:
+    """Of the step after ``step`` others, in an epoch from 0.
+
+    learning_rate * decay^epoch * (step + 1) / warmup_steps, the last factor at most 1; with ``schedule`` "cosine" also
+    times (1 + cos(pi p)) / 2, where p is the part of the run that is over.
+    """
+    rate = config.learning_rate * config.learning_rate_decay**epoch
+    rate *= min(1.0, (step + 1) / max(1, config.warmup_steps))
+    if config.schedule == "cosine":
+        over = max(epoch / run.epochs, step / run.steps if run.steps else 0.0)
+        rate *= (1 + math.cos(math.pi * min(1.0, over))) / 2
+    return rate
+
+
+@torch.no_grad()
+def gradient_norm(parameters: Iterable[nn.Parameter], longest: float) -> Tensor:
+    """The length of the gradient of all parameters; longer ones than ``longest`` are shortened to it (0: never)."""
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
+    if longest:
+        torch._foreach_mul_(gradients, (longest / (norm + 1e-6)).clamp(max=1.0))
+    return norm
+
+
+class AveragedNetwork:
+    """Exponential moving average of a network: often better pictures than its last weights, for one copy of them.
+
+        average <- average + (1 - d) (weights - average),    d = min(decay, (1 + n) / (10 + n)) at update n = 1, 2, ...
+
+    The ramp lets the random first weights go: a decay of 0.999 alone would still hold a third of them after 1000
+    updates.
+
+    Args:
+        network: unwrapped; its present weights are the first average.
+        decay: d after the ramp, in 0 .. 1, 1 excluded.
+
+    Attributes:
+        network: a copy that holds the average, without gradients: call it for pictures.
+    """
+
+    def __init__(self, network: VoxelNetwork, decay: float) -> None:
+        self.network = copy.deepcopy(network).requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, network: VoxelNetwork, update: int) -> None:
+        """Take in the weights after optimiser step number ``update`` (from 1). Nothing waits for the device."""
+        share = 1 - min(self._decay, (1 + update) / (10 + update))
+        pairs = list(zip(self.network.state_dict().values(), network.state_dict().values(), strict=True))
+        real = [pair for pair in pairs if pair[0].is_floating_point()]
+        torch._foreach_lerp_([mine for mine, _ in real], [theirs for _, theirs in real], share)
+        for mine, theirs in pairs:
+            if not mine.is_floating_point():
+                mine.copy_(theirs)  # a counter has no average
+
+
+def _set_numerics(precision: str) -> None:
+    """float32 is IEEE's on a GPU as well, unless the configuration says "tf32" (10 bits of 23 in products)."""
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "tf32"
+    torch.backends.cudnn.benchmark = True  # shapes do not change within a run
 
 
 def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
@@ -145,7 +222,7 @@ def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any
                 state[name] = torch.empty_like(parameter).copy_(value)
 
 
-def _network(config: TrainConfig) -> ReconstructionNetwork:
+def _network(config: TrainConfig) -> VoxelNetwork:
     kind = NETWORKS[config.network.name]
     parameters = inspect.signature(kind, eval_str=True).parameters.items()
     known = {name: parameter.annotation for name, parameter in parameters if name != "bins"}
@@ -159,67 +236,33 @@ def _network(config: TrainConfig) -> ReconstructionNetwork:
         try:
             load_into(network, config.network.weights)
         except UsageError as error:
-            raise UsageError(f"network.weights: {_what_would_fit(config) or error}") from error
+            raise UsageError(f"network.weights: {error}") from error
     return network
 
 
-def _what_would_fit(config: TrainConfig) -> str:
-    """What to set for the weights that do not fit; "" where the file does not tell, or tells what is set."""
-    weights, bins = config.network.weights, config.stream.resolved_recipe.bins
-    found = fitting(weights)
+def obeying_weights(config: TrainConfig) -> TrainConfig:
+    """The configuration with those options of the network under which its ``network.weights`` were trained.
+
+    Options that the configuration states itself win.
+
+    Raises:
+        UsageError: the file cannot be read, or is of another network or number of bins.
+    """
+    if not config.network.weights:
+        return config
+    try:
+        found = read_weights(config.network.weights).recognised()
+    except UsageError as error:
+        raise UsageError(f"network.weights: {error}") from error
     if found is None:
-        return ""
+        return config
     name, options = found
-    wanted = {"stream.recipe.bins": options.pop("bins", bins), "network.name": name}
-    signature = inspect.signature(NETWORKS[name]).parameters
-    own = {key: value for key, value in config.network.options.items() if key in signature}
-    changed = {key: value for key, value in options.items() if own.get(key, signature[key].default) != value}
-    if changed:
-        wanted["network.options"] = {**own, **changed}
-    present = {"stream.recipe.bins": bins, "network.name": config.network.name}
-    missing = [f"{key} = {value}" for key, value in wanted.items() if present.get(key) != value]
-    return f"{weights} does not fit this network; set {', '.join(missing)}" if missing else ""
-
-
-def _loss(config: LossConfig) -> ReconstructionLoss:
-    lpips = temporal = None
-    if config.lpips_weight:
-        net = config.lpips_network
-        for key, origin in (
-            ("lpips_backbone", BACKBONES[net].weights_from),
-            ("lpips_heads", HEADS_FROM.format(net=net)),
-        ):
-            if not getattr(config, key):
-                raise UsageError(
-                    f"loss.{key} is missing, loss.lpips_weight = {config.lpips_weight:g} needs it. Nothing is "
-                    f"downloaded; get it from {origin}"
-                )
-        lpips = LPIPS.from_files(net, config.lpips_backbone, config.lpips_heads)
-    if config.temporal_weight:
-        temporal = TemporalConsistency(
-            first_step=config.temporal_first_step,
-            rule=config.temporal_rule,
-            as_published=config.temporal_as_published,
-        )
-    return ReconstructionLoss(
-        lpips=lpips,
-        temporal=temporal,
-        lpips_weight=config.lpips_weight,
-        l1_weight=config.l1_weight,
-        temporal_weight=config.temporal_weight,
-    )
-
-
-def _flow(config: TrainConfig, device: torch.device) -> RaftFlow | None:
-    loss = config.loss
-    if not loss.temporal_weight or loss.flow != "raft":
-        return None
-    if not loss.raft_weights:
-        raise UsageError(
-            f"loss.raft_weights is missing, loss.flow = raft needs it (or take loss.flow = stream). Nothing is "
-            f"downloaded; get it from {WHERE_TO_GET_WEIGHTS[loss.raft_size]}"
-        )
-    return RaftFlow(loss.raft_size, loss.raft_weights, device, bfloat16=config.compute.precision == "bfloat16")
+    present = {"stream.recipe.bins": config.stream.resolved_recipe.bins, "network.name": config.network.name}
+    told = {"stream.recipe.bins": options.pop("bins", present["stream.recipe.bins"]), "network.name": name}
+    missing = [f"{key} = {value}" for key, value in told.items() if present[key] != value]
+    if missing:
+        raise UsageError(f"network.weights: {config.network.weights} is of another network; set {', '.join(missing)}")
+    return config.with_network_options(options)
 
 
 def _optimizer(config: OptimizerConfig, network: nn.Module) -> torch.optim.Optimizer:

@@ -1,4 +1,4 @@
-"""The training loop: one page, read from top to bottom."""
+"""The training loop: one page, read from top to bottom. It knows no task by name."""
 
 from __future__ import annotations
 
@@ -6,18 +6,13 @@ import math
 from itertools import islice
 from pathlib import Path
 
-import torch
-from torch.nn.utils import clip_grad_norm_
-
 from trainer.config import TrainConfig
-from trainer.feed import Feed, preview_batch, stream
+from trainer.feed import Feed, held_out_batch, stream
 from trainer.learner import Learner
-from trainer.run.checkpoint import Checkpoint, save_checkpoint
+from trainer.run.checkpoint import LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.run.interruption import StopRequest
-from trainer.run.preview import films
 from trainer.run.reporting import Meter, Reporter
-from trainer.run.resume import LAST
 from v2v_protocol.errors import UsageError, V2VError
 
 
@@ -44,13 +39,10 @@ def train(
         UsageError: a checkpoint cannot be written.
         V2VError: what the stream raises. It costs no steps: they are saved first.
     """
-    run, device = config.run, ranks.device
-    bfloat16 = config.compute.precision == "bfloat16"
-    clip = config.optimizer.clip_gradient_norm or math.inf
-    parameters = list(learner.network.parameters())
+    run, task = config.run, learner.task
 
     # Where to begin in the stream.
-    dataset = stream(config, address)
+    dataset = stream(config, task.asked, address)
     step, epoch, position = 0, 0, None
     if resume is not None:
         learner.restore(resume)
@@ -59,16 +51,16 @@ def train(
             dataset.load_state_dict(position)
         if dataset.epoch > epoch:
             # Under this batch size or number of ranks, nothing but what an epoch drops was left of the one before.
-            learner.end_epoch()
             epoch, position = dataset.epoch, dataset.state_dict()
-    feed = Feed(dataset, device, config.stream.loader_workers)
+    feed = Feed(dataset, ranks.device, config.stream.loader_workers)
     batches = feed.epochs(epoch, run.epochs)
     if run.steps:
         batches = islice(batches, max(0, run.steps - step))
-    shown = stop.next(preview_batch(config, address)) if ranks.first and run.preview_every else None
+    judges = ranks.first and (run.judge_every or run.preview_every)
+    held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
 
     meter = Meter(ranks)
-    begun, saved = step, None
+    begun, saved, judged = step, None, None
 
     def look() -> None:
         """Read the meter: from time to time, and always before anything is saved."""
@@ -85,56 +77,55 @@ def train(
                 f"step {step}: loss {values['total']}, gradient norm {values['gradient_norm']} since the last reading; "
                 f"{kept}. Try a lower optimizer.learning_rate or optimizer.clip_gradient_norm"
             )
-        reporter.metrics(step, epoch, float(learner.scheduler.get_last_lr()[0]), values)
+        reporter.metrics(step, epoch, learner.optimizer.param_groups[0]["lr"], values)
+
+    def judge(*, with_films: bool) -> None:
+        """Losses, and films, of the batch that is not trained on."""
+        assert held_out is not None
+        values, films = task.judge(learner.trained, held_out, run.preview_samples if with_films else 0)
+        reporter.held_out(step, values)
+        reporter.preview(step, films)
 
     def save(name: str) -> None:
         if not ranks.first:
             return
         try:
-            save_checkpoint(out / name, learner.checkpoint(step, position, config))
+            save_checkpoint(out / name, learner.checkpoint(step, position))
         except OSError as error:
             raise UsageError(
                 f"step {step} cannot be saved as {out / name}: {error.strerror}; what was saved before is as it was"
             ) from error
 
     with Reporter(out, speaks=ranks.first, step=step) as reporter:
+        reporter.configuration(config)
         for batch in stop.until(batches):
-            voxels, target = batch.arrays["voxels"], batch.arrays["frames"] / 255.0
-
-            # Forward, backward, update: work for the device is queued, and nothing here waits for it.
-            with torch.autocast(device.type, torch.bfloat16, enabled=bfloat16):
-                prediction, _ = learner.model(voxels)
-                losses = learner.loss(prediction, target, learner.flow_of(batch, target))
-            learner.optimizer.zero_grad()
-            losses["total"].backward()
-            norm = clip_grad_norm_(parameters, clip)
-            learner.optimizer.step()
+            values = learner.step(task.prepare(batch, batch.epoch), step, batch.epoch)
             step, epoch, position = step + 1, batch.epoch, batch.resume_state
-            if learner.average is not None:
-                learner.average.update(learner.network, step)
-            epoch_ends = position["epoch"] > epoch
-            if epoch_ends:
-                learner.end_epoch()
 
             # What is said and kept of it.
-            meter.add(losses | {"gradient_norm": norm})
+            meter.add(values)
             reporter.advance(step, dataset, config)
-            keep = epoch_ends and run.keep_epochs
+            keep = run.keep_epochs and position["epoch"] > epoch
+            if held_out is not None:
+                shown = run.preview_every and step % run.preview_every == 0
+                if shown or (run.judge_every and step % run.judge_every == 0):
+                    judge(with_films=bool(shown))
+                    judged = step
             if step % run.log_every == 0 or step % run.save_every == 0 or keep:
                 look()
             if step % run.save_every == 0:
                 save(LAST)
                 saved = step
             if keep:
-                save(f"epoch-{epoch:04d}.pt")
-            if shown is not None and step % run.preview_every == 0:
-                reporter.preview(step, films(learner.trained, shown, device))
+                save(epoch_name(epoch))
+                if ranks.first:
+                    prune_epochs(out, run.keep_epochs)
         # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
         if saved != step and (step > begun or stop.failure is None):
             look()
             save(LAST)
-        if shown is not None and step % run.preview_every:
-            reporter.preview(step, films(learner.trained, shown, device))
+        if held_out is not None and judged != step:
+            judge(with_films=bool(run.preview_every))
     if stop.failure is not None:
         raise stop.failure
     return step

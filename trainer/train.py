@@ -1,4 +1,4 @@
-"""``v2v-train``: train a reconstruction network on the stream.
+"""``v2v-train``: train a network on the stream.
 
     v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid
     v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4
@@ -19,17 +19,17 @@ from pathlib import Path
 
 import torch
 
-from trainer.config import StreamConfig
-from trainer.config_file import load_config, shipped
-from trainer.learner import build
+from trainer.config import StreamConfig, keys
+from trainer.config_file import load_config, shipped, show_config
+from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
-from trainer.run.checkpoint import load_checkpoint
+from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from trainer.run.resume import LAST, require_fresh, require_same_run, require_writable
 from v2v_client.command import run_command
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.recipe import Recipe
 
 SIGNAL_STATUS = 128
 
@@ -40,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="Exit status: 0 trained to the end, 1 diverged, 2 wrong usage, input or no server, 128 + N ended and "
-        f"saved after signal N.\nShipped configurations: {', '.join(shipped())}.",
+        f"saved after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
     )
     parser.add_argument("config", metavar="CONFIG.yaml", help="a file, or the name of a shipped configuration")
     source = parser.add_mutually_exclusive_group()
@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder of the run (run.out; default runs/NAME of the config, with --resume that of the checkpoint)",
     )
+    parser.add_argument("--show-config", action="store_true", help="print all keys with their values, and end")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
@@ -73,7 +74,7 @@ def _settings(arguments: argparse.Namespace) -> list[str]:
 
 
 @contextmanager
-def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
+def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
     """The address to connect to; of a server of our own, for as long as the block lasts, where none is configured.
 
     Raises:
@@ -96,7 +97,7 @@ def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
     print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
     with ExitStack() as stack:
         try:
-            server = LocalServer(stream.videos, workers=stream.workers, flags=_server_flags(stream))
+            server = LocalServer(stream.videos, workers=stream.workers, flags=_server_flags(stream, recipe))
             stack.enter_context(server)
         except V2VError as error:
             mine.from_first(("", str(error)))
@@ -105,11 +106,11 @@ def serving(stream: StreamConfig, mine: Ranks) -> Iterator[str]:
         yield server.address
 
 
-def _server_flags(stream: StreamConfig) -> list[str]:
+def _server_flags(stream: StreamConfig, recipe: Recipe) -> list[str]:
     # A server looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what
     # the videos show only if it is told at its start.
-    recipe = stream.resolved_recipe.to_dict().items()
-    flags = [text for key, value in recipe for text in ("--set", f"{key}={json.dumps(value)}")]
+    fields = recipe.to_dict().items()
+    flags = [text for key, value in fields for text in ("--set", f"{key}={json.dumps(value)}")]
     asked = {"--list": stream.list, "--scene": stream.spec.get("scene")}
     return ["--rows", stream.rows, *flags, *(part for flag, value in asked.items() if value for part in (flag, value))]
 
@@ -121,14 +122,19 @@ def run(arguments: argparse.Namespace) -> int:
         V2VError: of the configuration, of what :func:`trainer.learner.build` reads, or of :func:`trainer.loop.train`.
     """
     config = load_config(arguments.config, _settings(arguments))
+    if arguments.show_config:
+        print(show_config(config), end="")
+        return 0
     resume = None
     if arguments.resume is None:
+        config = obeying_weights(config)
         out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
     else:
         # Where the checkpoint is, not where a run of this configuration would begin: another one may be there.
         out = Path(config.run.out or Path(arguments.resume).parent)
         resume = load_checkpoint(arguments.resume)
+        config = config.with_network_options(resume.config["network"]["options"], weights="")
         for change in require_same_run(resume, config):
             print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)
     if config.compute.threads:
@@ -137,7 +143,8 @@ def run(arguments: argparse.Namespace) -> int:
         learner = build(config, mine)
         if mine.first:
             require_writable(out)
-        with serving(config.stream, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
+        recipe = learner.task.asked.recipe(config.stream.resolved_recipe)
+        with serving(config.stream, recipe, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
             steps = train(config, learner, address, mine, stop, out, resume)
         if mine.first:
             why = f"ended by signal {stop.signal}" if stop.signal else "done"

@@ -1,14 +1,12 @@
-"""Published weights of reconstruction networks: which tensors a file has, under which names a network wants them.
+"""Published weights: which tensors a file has, under which names a network wants them, and what network they are of.
 
-Files differ in container (a bare state dict; ``state_dict`` or ``model`` in a dict; with pickled objects beside it)
-and in names (``module.`` and ``_orig_mod.`` of wrapped networks, ``unetflow.`` of E2VID+, the short names of FireNet+).
-Every rename, and every tensor that does not find its place, is in the :class:`KeyReport`; loading is always strict.
+Files differ in container (a bare state dict; ``state_dict`` or ``model`` in a dict; with pickled objects beside it) and
+in names (``module.`` and ``_orig_mod.`` of wrapped networks; what else differs, each network knows by itself). Every
+rename, and every tensor that does not find its place, is in the :class:`KeyReport`; loading is always strict.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,22 +14,64 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from trainer.models import NETWORKS, VoxelNetwork
 from trainer.unpickle import Placeholder, read_torch_file
 from v2v_protocol.errors import UsageError
 
 Plain = str | int | float | bool | None
 
-FIRENET_PLUS = {
-    "head.conv2d": "net.head.conv.conv2d",
-    "G1": "net.head.recurrent_block",
-    "R1": "net.resblocks.0.conv",
-    "G2": "net.resblocks.0.recurrent_block",
-    "R2": "net.resblocks.1",
-    "pred.conv2d": "net.pred.conv2d",
-}
-"""FireNet+ is FireNet with its layers under other names."""
 
-PREDICTION = re.compile(r"unetrecurrent\.pred\.conv2d\.(weight|bias)")
+@dataclass(frozen=True)
+class WeightFile:
+    """What a file of weights holds.
+
+    Attributes:
+        path: the file.
+        state: its tensors by their names in the file, on the CPU.
+        settings: plain settings beside them: those of the network (``num_bins``, ``norm`` ...), ``normalize`` where its
+            training normalised voxel grids, ``padding`` where its code did not pad as V2V does.
+        trained_as: section ``network`` of the configuration, in checkpoints of our own.
+    """
+
+    path: str
+    state: Mapping[str, Tensor]
+    settings: Mapping[str, Plain] = field(default_factory=dict)
+    trained_as: Mapping[str, Any] = field(default_factory=dict)
+
+    def named_for(self, kind: type[VoxelNetwork]) -> dict[str, str]:
+        """Names in a network of this kind by name in the file.
+
+        Raises:
+            UsageError: two keys become one.
+        """
+        names = {name: kind.own_name(name.replace("_orig_mod.", "").removeprefix("module.")) for name in self.state}
+        if len(set(names.values())) < len(names):
+            raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
+        return names
+
+    def recognised(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:
+        """Name and arguments of the network that the weights are of; None where nothing tells.
+
+        Args:
+            name: what they are, as somebody said; None takes what an own checkpoint says, else looks at the tensors.
+
+        Raises:
+            UsageError: a network, or a variant, that is not built here.
+        """
+        trained = self.trained_as.get("name")
+        name = name or trained or next((known for known, kind in NETWORKS.items() if self._of(kind)), None)
+        if name is None:
+            return None
+        if name not in NETWORKS:
+            raise UsageError(f"model {name!r}: give one of {', '.join(NETWORKS)}")
+        kind, told = NETWORKS[name], {}
+        if self._of(kind):
+            state = {new: self.state[old] for old, new in self.named_for(kind).items()}
+            told = kind.from_state(state, self.settings)
+        return name, told | (dict(self.trained_as.get("options", {})) if name == trained else {})
+
+    def _of(self, kind: type[VoxelNetwork]) -> bool:
+        return kind.recognises(self.named_for(kind).values())
 
 
 @dataclass(frozen=True)
@@ -42,21 +82,19 @@ class KeyReport:
         path: the file.
         used: names in the network of the tensors that fit.
         renamed: name in the network by name in the file, where they differ.
-        cut: tensors of which only the part for the image was taken (E2VID+ also predicts flow; the image is channel 0).
+        cut: tensors of which only a part was taken (E2VID+ also predicts flow; the image is channel 0).
         unused: tensors of the file that the network has no place for.
         missing: tensors of the network that the file does not give.
         misshaped: tensors of both, of different shapes.
-        settings: plain settings of the network that the file holds beside the tensors (``num_bins``, ``norm`` ...).
     """
 
     path: str
     used: tuple[str, ...]
-    renamed: Mapping[str, str] = field(default_factory=dict)
-    cut: tuple[str, ...] = ()
-    unused: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-    misshaped: tuple[str, ...] = ()
-    settings: Mapping[str, Plain] = field(default_factory=dict)
+    renamed: Mapping[str, str]
+    cut: tuple[str, ...]
+    unused: tuple[str, ...]
+    missing: tuple[str, ...]
+    misshaped: tuple[str, ...]
 
     def __str__(self) -> str:
         """One line per key."""
@@ -70,6 +108,90 @@ class KeyReport:
                 was = f"  (in the file {original[name]})" if name in original else ""
                 lines.append(f"  {word:9} {name}{was}{', channel 0 only' if name in self.cut else ''}")
         return "\n".join(lines)
+
+
+def read_weights(path: str | Path, *, ema: bool = False) -> WeightFile:
+    """A published or own file of weights; nothing of it is executed.
+
+    Args:
+        path: a file of ``torch.save``.
+        ema: take the averaged weights of one of our own checkpoints.
+
+    Raises:
+        UsageError: no such file, not one of PyTorch, or without a state dict.
+    """
+    content = read_torch_file(path)
+    trained = content.get("config") if isinstance(content, Mapping) else None
+    network = trained.get("network") if isinstance(trained, Mapping) else None
+    return WeightFile(
+        str(path),
+        _state_dict(content, path, ema=ema),
+        _settings(content),
+        network if isinstance(network, Mapping) else {},
+    )
+
+
+def read_tensors(path: str | Path) -> dict[str, Tensor]:
+    """The state dict in a file, under its own names, as :func:`read_weights`."""
+    return _state_dict(read_torch_file(path), path, ema=False)
+
+
+def load_into(model: nn.Module, path: str | Path, *, ema: bool = False) -> KeyReport:
+    """Give a network the weights of a file; all of them, or none.
+
+    Raises:
+        UsageError: as :func:`read_weights`, or a tensor is unused, missing or of another shape; the report is in the
+            message.
+    """
+    file = read_weights(path, ema=ema)
+    kind = type(model) if isinstance(model, VoxelNetwork) else VoxelNetwork
+    names = file.named_for(kind)
+    state = {new: kind.own_tensor(new, file.state[old]) for old, new in names.items()}
+    wanted = model.state_dict()
+    # Tables that a network computes by itself, and that files of some releases leave out.
+    state |= {name: wanted[name] for name in kind.computed if name in wanted and name not in state}
+    report = KeyReport(
+        path=str(path),
+        used=tuple(name for name in state if name in wanted and state[name].shape == wanted[name].shape),
+        renamed={old: new for old, new in names.items() if old != new},
+        cut=tuple(new for old, new in names.items() if state[new].shape != file.state[old].shape),
+        unused=tuple(name for name in state if name not in wanted),
+        missing=tuple(name for name in wanted if name not in state),
+        misshaped=tuple(name for name in state if name in wanted and state[name].shape != wanted[name].shape),
+    )
+    if report.unused or report.missing or report.misshaped:
+        raise UsageError(f"the weights do not fit {type(model).__name__}; nothing was loaded.\n{report}")
+    model.load_state_dict(state)
+    return report
+
+
+def load_network(
+    weights: str | Path, *, name: str | None = None, options: Mapping[str, Any] | None = None, ema: bool = False
+) -> tuple[VoxelNetwork, str]:
+    """The network that a file of weights is of.
+
+    Args:
+        weights: see :func:`read_weights`.
+        name: key of NETWORKS; None: see :meth:`WeightFile.recognised`.
+        options: arguments of the network; they override what file and tensors tell.
+        ema: take the averaged weights of an own checkpoint.
+
+    Returns:
+        The network in evaluation mode, on the CPU, and its name.
+
+    Raises:
+        UsageError: the file is not of this network, or an option is unknown.
+    """
+    found = read_weights(weights, ema=ema).recognised(name)
+    if found is None:
+        raise UsageError(f"{weights}: of none of {', '.join(NETWORKS)}; --model says what it is")
+    name, told = found
+    try:
+        network = NETWORKS[name](**(told | dict(options or {})))
+    except TypeError as error:
+        raise UsageError(f"options of {name}: {error}") from error
+    load_into(network, weights, ema=ema)
+    return network.eval(), name
 
 
 def _tensors(value: Any) -> dict[str, Tensor] | None:
@@ -111,123 +233,17 @@ def _mappings(value: Any) -> Iterator[Mapping[Any, Any]]:
 
 
 def _settings(content: Any) -> dict[str, Plain]:
-    """The settings of the network: the first dict that speaks of ``num_bins``."""
-    found: dict[str, Plain] = {}
-    for mapping in _mappings(content):
-        if "num_bins" in mapping:
-            for name, value in mapping.items():
-                if value is None or isinstance(value, (str, int, float)):
-                    found[str(name)] = value
-            if isinstance(content, Mapping) and mapping is content.get("model"):
-                # E2VID's first release keeps its settings here, and its sigmoid is in the code that reads them.
-                found.setdefault("final_activation", "sigmoid")
-            break
+    """See :class:`WeightFile`; the network's are the first dict that speaks of ``num_bins``."""
+    mappings = list(_mappings(content))
+    network: Mapping[Any, Any] = next((mapping for mapping in mappings if "num_bins" in mapping), {})
+    found = {str(name): value for name, value in network.items() if value is None or isinstance(value, Plain)}
+    loader = next((item for mapping in mappings if isinstance(item := mapping.get("data_loader"), Mapping)), {})
+    if isinstance(loader.get("normalize"), bool):
+        found["normalize"] = loader["normalize"]
+    if network and isinstance(content, Mapping):
+        # Code of E2VID's family (but not V2V's, which keeps none of its settings) pads on all sides.
+        found["padding"] = "centred"
+        if network is content.get("model"):
+            # E2VID's first release keeps its settings here, and its sigmoid is in the code that reads them.
+            found.setdefault("final_activation", "sigmoid")
     return found
-
-
-def read_tensors(path: str | Path) -> dict[str, Tensor]:
-    """The state dict in a file, under its own names, on the CPU; nothing of the file is executed.
-
-    Raises:
-        UsageError: no such file, not one of PyTorch, or without a state dict.
-    """
-    return _state_dict(read_torch_file(path), path, ema=False)
-
-
-def _canonical(name: str, *, short: bool) -> str:
-    """The name that our networks use."""
-    name = name.replace("_orig_mod.", "").removeprefix("module.")
-    name = re.sub(r"^unetflow\.", "unetrecurrent.", name)
-    if short:
-        for old, new in FIRENET_PLUS.items():
-            if name.startswith(f"{old}."):
-                return new + name.removeprefix(old)
-    return name
-
-
-def load_weights(path: str | Path, *, ema: bool = False) -> tuple[dict[str, Tensor], KeyReport]:
-    """The tensors of a published or own checkpoint under the names of our networks, on the CPU.
-
-    Args:
-        path: a file of ``torch.save``: E2VID, E2VID+, FireNet, FireNet+, V2V's or our own.
-        ema: take the averaged weights of one of our own checkpoints.
-
-    Returns:
-        The state dict, and the report of its keys (without a network to compare with, all of them count as used).
-
-    Raises:
-        UsageError: no such file, not one of PyTorch, without a state dict, or two keys become one.
-    """
-    content = read_torch_file(path)
-    found = _state_dict(content, path, ema=ema)
-    short = any("G1.reset_gate" in name for name in found)
-    names = {name: _canonical(name, short=short) for name in found}
-    if len(set(names.values())) < len(names):
-        raise UsageError(f"{path}: two tensors have the same name once prefixes are removed; is it two networks?")
-    state, cut = {}, []
-    for old, new in names.items():
-        state[new] = found[old]
-        if PREDICTION.fullmatch(new) and found[old].shape[0] == 3:
-            state[new] = found[old][:1].clone()
-            cut.append(new)
-    report = KeyReport(
-        path=str(path),
-        used=tuple(state),
-        renamed={old: new for old, new in names.items() if old != new},
-        cut=tuple(cut),
-        settings=_settings(content),
-    )
-    return state, report
-
-
-def load_into(model: nn.Module, path: str | Path, *, ema: bool = False) -> KeyReport:
-    """Give a network the weights of a file; all of them, or none.
-
-    Raises:
-        UsageError: as :func:`load_weights`, or a tensor is unused, missing or of another shape; the report is in
-            the message.
-    """
-    state, report = load_weights(path, ema=ema)
-    wanted = model.state_dict()
-    report = dataclasses.replace(
-        report,
-        used=tuple(name for name in state if name in wanted and state[name].shape == wanted[name].shape),
-        unused=tuple(name for name in state if name not in wanted),
-        missing=tuple(name for name in wanted if name not in state),
-        misshaped=tuple(name for name in state if name in wanted and state[name].shape != wanted[name].shape),
-    )
-    if report.unused or report.missing or report.misshaped:
-        raise UsageError(f"the weights do not fit {type(model).__name__}; nothing was loaded.\n{report}")
-    model.load_state_dict(state)
-    return report
-
-
-def e2vid_options(state: Mapping[str, Tensor], settings: Mapping[str, Plain]) -> dict[str, Any]:
-    """The arguments of :class:`trainer.models.E2VID` under which a file's weights fit.
-
-    Sizes, norm and upsampling are read from the tensors; the first release's sigmoid, and with it the normalisation of
-    its input, from the settings.
-
-    Args:
-        state, settings: of :func:`load_weights`.
-
-    Raises:
-        UsageError: not an E2VID, or a variant that is not built here.
-    """
-    head = state.get("unetrecurrent.head.conv2d.weight")
-    if head is None:
-        raise UsageError("these are not weights of an E2VID: there is no unetrecurrent.head.conv2d.weight")
-    for name, built in (("skip_type", "sum"), ("recurrent_block_type", "convlstm")):
-        if settings.get(name, built) != built:
-            raise UsageError(f"E2VID with {name} = {settings[name]!r} is not built here, only {built!r}")
-    sigmoid = settings.get("final_activation") == "sigmoid"
-    return {
-        "bins": head.shape[1],
-        "base_channels": head.shape[0],
-        "encoders": sum(name.endswith("recurrent_block.Gates.weight") for name in state),
-        "residual_blocks": sum(bool(re.fullmatch(r".*resblocks\.\d+\.conv1\.weight", name)) for name in state),
-        "norm": "batch" if any(name.endswith("norm_layer.running_mean") for name in state) else "none",
-        "upsampling": "transposed" if any("transposed_conv2d" in name for name in state) else "bilinear",
-        "final_activation": "sigmoid" if sigmoid else "none",
-        "normalize_voxels": sigmoid,
-    }

@@ -8,21 +8,24 @@ import pytest
 import torch
 
 from tests.trainer.training import configured
-from trainer.config import TrainConfig
 from trainer.config_file import load_config
-from trainer.learner import Learner, build
+from trainer.learner import Learner, build, obeying_weights
+from trainer.models import FireNet
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
 from trainer.run.distributed import Ranks
+from trainer.tasks import Work
 from v2v_protocol.errors import UsageError
 
+ALONE = Ranks(0, 1, torch.device("cpu"))
 
-def learner(folder: Path, *, channels_last: bool, fused: bool) -> tuple[Learner, TrainConfig]:
+
+def learner(folder: Path, *, channels_last: bool, fused: bool) -> Learner:
     """One on the CPU; ``fused`` as if it were a GPU."""
     config = load_config(configured(folder), [f"compute.channels_last={str(channels_last).lower()}"])
-    built = build(config, Ranks(0, 1, torch.device("cpu")))
+    built = build(config, ALONE)
     for group in built.optimizer.param_groups:
         group["fused"] = fused
-    return built, config
+    return built
 
 
 def step(trained: Learner) -> None:
@@ -39,11 +42,11 @@ def step(trained: Learner) -> None:
 def test_the_optimiser_goes_on_in_another_memory_format(
     tmp_path: Path, channels_last: bool, was_fused: bool, fused: bool
 ) -> None:
-    before, config = learner(tmp_path, channels_last=not channels_last, fused=was_fused)
+    before = learner(tmp_path, channels_last=not channels_last, fused=was_fused)
     for _ in range(3):
         step(before)
-    save_checkpoint(tmp_path / "last.pt", before.checkpoint(3, None, config))
-    after, _ = learner(tmp_path, channels_last=channels_last, fused=fused)
+    save_checkpoint(tmp_path / "last.pt", before.checkpoint(3, None))
+    after = learner(tmp_path, channels_last=channels_last, fused=fused)
     after.restore(load_checkpoint(tmp_path / "last.pt"))
     assert [group["fused"] for group in after.optimizer.param_groups] == [fused]
     for parameter, state in after.optimizer.state.items():
@@ -55,22 +58,48 @@ def test_the_optimiser_goes_on_in_another_memory_format(
         assert torch.allclose(after.network.state_dict()[name], tensor, rtol=0, atol=1e-5), name
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["network.options={}"], r"set network\.options = \{'base_channels': 2\}$"),
-        (
-            ["network.options={normalize_voxels: true}"],
-            r"set network\.options = \{'normalize_voxels': True, 'base_channels': 2\}$",
-        ),
-        (["stream.recipe.bins=5"], r"set stream\.recipe\.bins = 2$"),
-        (["network.name=e2vid"], r"set network\.name = firenet$"),
-    ],
-)
-def test_of_weights_that_do_not_fit_it_is_said_what_does(tmp_path: Path, settings: list[str], message: str) -> None:
-    first = build(load_config(configured(tmp_path)), Ranks(0, 1, torch.device("cpu")))
-    torch.save(first.network.state_dict(), tmp_path / "small.pth")
+def test_weights_say_how_their_network_is_built_and_the_configuration_may_say_otherwise(tmp_path: Path) -> None:
+    first = build(load_config(configured(tmp_path)), ALONE)
+    torch.save({"state_dict": first.network.state_dict(), "data_loader": {"normalize": True}}, tmp_path / "small.pth")
     weights = f"network.weights={tmp_path / 'small.pth'}"
-    build(load_config(configured(tmp_path), [weights]), Ranks(0, 1, torch.device("cpu")))
-    with pytest.raises(UsageError, match=rf"network\.weights: .*small\.pth does not fit this network; {message}"):
-        build(load_config(configured(tmp_path), [weights, *settings]), Ranks(0, 1, torch.device("cpu")))
+    obeyed = obeying_weights(load_config(configured(tmp_path), [weights, "network.options={}"]))
+    assert obeyed.network.options == {"base_channels": 2, "normalize_voxels": True, "padding": "centred"}
+    assert build(obeyed, ALONE).network.normalizes
+    own = "network.options={normalize_voxels: false}"
+    assert not build(obeying_weights(load_config(configured(tmp_path), [weights, own])), ALONE).network.normalizes
+    for setting, told in (
+        ("stream.recipe.bins=5", r"set stream\.recipe\.bins = 2$"),
+        ("network.name=e2vid", r"set network\.name = firenet$"),
+    ):
+        config = load_config(configured(tmp_path), [weights, "network.options={}", setting])
+        with pytest.raises(UsageError, match=rf"network\.weights: .*small\.pth is of another network; {told}"):
+            obeying_weights(config)
+
+
+@pytest.mark.parametrize("longest", [0.0, 0.3])
+def test_pieces_of_a_batch_make_the_same_step(tmp_path: Path, longest: float) -> None:
+    """And gradients are shortened, or left alone, as PyTorch would."""
+    network = FireNet(bins=2, base_channels=2)
+    results = []
+    for pieces in (1, 4):
+        settings = [f"compute.pieces={pieces}", f"optimizer.clip_gradient_norm={longest}"]
+        built = build(load_config(configured(tmp_path), settings), ALONE)
+        built.network.load_state_dict(network.state_dict())
+        torch.manual_seed(0)
+        voxels, frames = torch.randint(-3, 4, (4, 3, 2, 16, 20)), torch.rand(4, 3, 1, 16, 20)
+        values = built.step(Work(voxels=voxels, truth={"frames": frames}), 0, 0)
+        results.append((values, [parameter.grad for parameter in built.network.parameters()]))
+    (whole, gradients), (parts, others) = results
+    for name, value in whole.items():
+        torch.testing.assert_close(parts[name], value)
+    torch.testing.assert_close(others, gradients)
+    network.zero_grad()
+    (network(voxels)[0] - frames).abs().mean().backward()
+    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), longest or float("inf"))
+    torch.testing.assert_close(whole["gradient_norm"], norm)
+    torch.testing.assert_close(gradients, [parameter.grad for parameter in network.parameters()])
+
+
+def test_a_batch_is_cut_into_equal_pieces(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"compute\.pieces = 3: give a divisor of stream\.batch_size = 4"):
+        build(load_config(configured(tmp_path), ["compute.pieces=3"]), ALONE)

@@ -5,23 +5,25 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import Tensor
+from torch import Tensor, nn
 
 from tests.client.fake_server import FakeServer
 from tests.trainer.training import arguments, losses, trained
-from trainer.models import FireNet
-from trainer.run.checkpoint import load_checkpoint, save_checkpoint
-from trainer.run.reporting import METRICS
-from trainer.run.resume import LAST, require_fresh
+from trainer.config_file import load_config
+from trainer.models import NETWORKS, FireNet, VoxelNetwork
+from trainer.models.sequence import Guide, Settings
+from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, save_checkpoint
+from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
-from trainer.weights import load_into
+from trainer.weights import load_into, load_network
 from v2v_protocol.errors import UsageError
 
 
@@ -52,8 +54,7 @@ def test_it_trains(whole: Path) -> None:
     readings = losses(whole)
     assert [record["step"] for record in readings] == list(range(1, 13))
     assert [record["epoch"] for record in readings] == [0] * 5 + [1] * 5 + [2] * 2
-    # The rate halves at the end of an epoch; a reading says what the next step will use.
-    assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] * 5 + [0.0025] * 3
+    assert [record["learning_rate"] for record in readings] == [0.01] * 5 + [0.005] * 5 + [0.0025] * 2
     assert readings[-1]["total"] < 0.9 * readings[0]["total"]
     last = load_checkpoint(whole / LAST)
     assert (last.step, last.epoch) == (12, 2)
@@ -74,7 +75,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(
     assert "run.steps: " in capsys.readouterr().err
     assert losses(resumed) == losses(whole)
     mine, theirs = load_checkpoint(resumed / LAST), load_checkpoint(whole / LAST)
-    for part in ("step", "epoch", "model", "optimizer", "scheduler", "ema", "rng", "stream"):
+    for part in ("step", "epoch", "model", "optimizer", "ema", "rng", "stream"):
         assert same(getattr(mine, part), getattr(theirs, part)), part
 
 
@@ -118,7 +119,7 @@ def test_a_larger_batch_does_not_repeat_an_epoch_of_which_less_is_left(tmp_path:
     assert [(record["step"], record["epoch"]) for record in readings] == [
         *((step, 0) for step in (1, 2, 3, 4)), *((5, 1), (6, 1), (7, 2)),
     ]  # fmt: skip
-    assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] + [0.0025] * 2
+    assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] * 2 + [0.0025]
 
 
 def test_a_finished_run_has_nothing_left(server: FakeServer, tmp_path: Path) -> None:
@@ -140,16 +141,16 @@ def test_readings_are_means_over_the_steps_since_the_last(server: FakeServer, wh
 
 def test_checkpoints_of_epochs_and_previews(server: FakeServer, tmp_path: Path) -> None:
     run = trained(
-        tmp_path, server.address, "run", run__epochs=2, run__keep_epochs=True, run__preview_every=6,
+        tmp_path, server.address, "run", run__epochs=3, run__keep_epochs=2, run__preview_every=9,
         run__preview_samples=1,
     )  # fmt: skip
-    assert load_checkpoint(run / "epoch-0000.pt").step == 5
+    assert sorted(path.name for path in run.glob("epoch-*")) == ["epoch-0001.pt", "epoch-0002.pt"]
     assert load_checkpoint(run / "epoch-0001.pt").step == 10
     pictures = sorted(path.name for path in (run / "previews").iterdir())
-    assert pictures == [f"step-00000{step}-0.{kind}" for step in ("06", "10") for kind in ("mp4", "png")]
-    sheet = cv2.imread(str(run / "previews" / "step-0000010-0.png"))
+    assert pictures == [f"step-00000{step}-0.{kind}" for step in ("09", "15") for kind in ("mp4", "png")]
+    sheet = cv2.imread(str(run / "previews" / "step-0000015-0.png"))
     assert sheet.shape == (3 * (8 * 16 + 4), 3 * (8 * 20 + 4), 3)
-    video = cv2.VideoCapture(str(run / "previews" / "step-0000010-0.mp4"))
+    video = cv2.VideoCapture(str(run / "previews" / "step-0000015-0.mp4"))
     assert sum(1 for _ in iter(lambda: video.read()[0], False)) == 3
 
 
@@ -158,10 +159,68 @@ def test_a_preview_does_not_change_the_training(server: FakeServer, whole: Path,
     assert losses(run) == losses(whole)[:4]
 
 
+def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
+    server: FakeServer, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=12, run__judge_every=5)
+    assert losses(run) == losses(whole)
+    judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
+    assert [record["step"] for record in judged] == [5, 10, 12]
+    assert judged[-1]["held_out_total"] < judged[0]["held_out_total"]
+    assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
+
+
+def test_the_configuration_of_a_run_is_beside_it(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=1)
+    assert main([*arguments(tmp_path, server.address, "run", run__steps=1), "--show-config"]) == 0
+    assert capsys.readouterr().out.endswith((run / "config.yaml").read_text())
+    assert load_config(str(run / "config.yaml")).run.steps == 1
+
+
+class Toy(VoxelNetwork):
+    """All that a network needs to be trained, saved, shown and evaluated, besides its line in NETWORKS."""
+
+    task = "reconstruction"
+    signature = ("brightness.weight",)
+
+    def __init__(self, *, bins: int = 5) -> None:
+        super().__init__(bins=bins, size_multiple=4)
+        self.brightness = nn.Conv2d(bins + 1, 1, 1)
+
+    def unroll(self, x: Tensor, state: Tensor | None, steps: int, _guide: Guide | None) -> tuple[Tensor, Tensor]:
+        picture = torch.zeros_like(x[: len(x) // steps, :1]) if state is None else state
+        pictures = []
+        for voxel in x.chunk(steps):
+            picture = self.brightness(torch.cat([voxel, picture], dim=1))
+            pictures.append(picture)
+        return torch.cat(pictures), picture
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], _settings: Settings) -> dict[str, Any]:
+        return {"bins": state["brightness.weight"].shape[1] - 1}
+
+
+def test_a_network_touches_its_own_file_and_one_line_of_the_registry(
+    server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(NETWORKS, "toy", Toy)
+    run = trained(
+        tmp_path, server.address, "run", run__steps=8, run__preview_every=8, network__name="toy", network__options={}
+    )
+    readings = losses(run)
+    assert readings[-1]["total"] < readings[0]["total"]
+    assert list((run / "previews").glob("*.png"))
+    assert load_network(run / LAST)[1] == "toy"
+    torch.save(load_checkpoint(run / LAST).model, tmp_path / "bare.pth")
+    assert isinstance(load_network(tmp_path / "bare.pth")[0], Toy)
+
+
 def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> None:
     with FakeServer(sequences=1) as server:
         run = trained(
-            tmp_path, server.address, "run", run__steps=1, run__preview_every=1, run__preview_samples=2,
+            tmp_path, server.address, "run", run__steps=1, run__preview_every=1, run__judge_samples=2,
             stream__batch_size=1,
         )  # fmt: skip
     assert [path.name for path in (run / "previews").glob("*.png")] == ["step-0000001-0.png"]

@@ -9,33 +9,32 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.config import StreamConfig
-from trainer.ema import AveragedNetwork, decay_at
+from trainer.config import OptimizerConfig, RunConfig, StreamConfig
+from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from trainer.run.preview import GAP_PX, OFF, ON, contact_sheet, draw_events, draw_pictures, side_by_side, write_png
 from trainer.run.reporting import METRICS, Meter, Reporter, read_metrics
 from trainer.train import _server_flags, serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
+from v2v_protocol.recipe import Recipe
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
-    recipe = {"preset": "clean", "bins": 3}
-    plain = _server_flags(StreamConfig(videos="clips", recipe=recipe, rows="top:0.5"))
+    recipe = Recipe.from_dict({"preset": "clean", "bins": 3})
+    plain = _server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
     assert plain[:2] == ["--rows", "top:0.5"]
     assert plain[plain.index("bins=3") - 1] == "--set"
     assert "--list" not in plain
     assert "--scene" not in plain
-    asked = _server_flags(StreamConfig(videos="clips", recipe=recipe, list="some.txt", spec={"scene": "auto"}))
+    asked = _server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
 
 
@@ -47,10 +46,10 @@ def test_it_says_what_server_it_starts_before_that_takes_its_time(
 
     monkeypatch.setattr("trainer.train.LocalServer", never)
     settings = StreamConfig(videos="clips", rows="top:0.54", workers=3)
-    with pytest.raises(ServerLost), serving(settings, ALONE):
+    with pytest.raises(ServerLost), serving(settings, Recipe(), ALONE):
         pass
     assert capsys.readouterr().err == "starting a server: clips, rows top:0.54, 3 workers\n"
-    with serving(StreamConfig(address="tcp://127.0.0.1:1"), ALONE) as address:
+    with serving(StreamConfig(address="tcp://127.0.0.1:1"), Recipe(), ALONE) as address:
         assert address == "tcp://127.0.0.1:1"
     assert not capsys.readouterr().err
 
@@ -70,7 +69,7 @@ def test_the_average_is_the_recurrence_of_its_docstring(values: list[float], dec
             bias.fill_(value)
         average.update(network, update)
         expected += (1 - min(decay, (1 + update) / (10 + update))) * (value - expected)
-    assert float(average.state_dict()["net.pred.conv2d.bias"]) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    assert float(average.network.state_dict()["net.pred.conv2d.bias"]) == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
 def test_the_average_of_a_constant_is_the_constant_and_shares_no_memory() -> None:
@@ -78,27 +77,25 @@ def test_the_average_of_a_constant_is_the_constant_and_shares_no_memory() -> Non
     average = AveragedNetwork(network, 0.9)
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     average.update(network, 1)
-    for name, tensor in average.state_dict().items():
+    for name, tensor in average.network.state_dict().items():
         assert torch.equal(tensor, before[name])
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(1)
-    for name, tensor in average.state_dict().items():
+    for name, tensor in average.network.state_dict().items():
         assert torch.equal(tensor, before[name])
     assert not any(parameter.requires_grad for parameter in average.network.parameters())
 
 
-def test_the_ramp_reaches_the_decay_and_stays() -> None:
-    shares = [decay_at(update, 0.99) for update in range(1, 2000)]
-    assert shares == sorted(shares)
-    assert shares[0] == 2 / 11
-    assert shares[-1] == 0.99
-
-
-@pytest.mark.parametrize("decay", [-0.1, 1.0])
-def test_a_decay_outside_its_range_is_refused(decay: float) -> None:
-    with pytest.raises(UsageError, match="ema_decay"):
-        AveragedNetwork(FireNet(), decay)
+def test_the_rate_warms_up_decays_by_epoch_and_may_end_as_a_cosine() -> None:
+    plain = OptimizerConfig(learning_rate=0.1, learning_rate_decay=0.5, warmup_steps=4)
+    found = [learning_rate(plain, RunConfig(epochs=9), step, epoch) for step, epoch in ((0, 0), (1, 0), (3, 0), (9, 2))]
+    assert found == pytest.approx([0.025, 0.05, 0.1, 0.025])
+    cosine = OptimizerConfig(learning_rate=0.1, schedule="cosine")
+    by_epoch = [learning_rate(cosine, RunConfig(epochs=4), 0, epoch) for epoch in range(5)]
+    by_step = [learning_rate(cosine, RunConfig(epochs=4, steps=8), step, 0) for step in (0, 2, 4, 6, 8)]
+    assert by_epoch == pytest.approx([0.1, 0.1 * (0.5 + 0.125**0.5), 0.05, 0.1 * (0.5 - 0.125**0.5), 0], abs=1e-9)
+    assert by_step == pytest.approx(by_epoch, abs=1e-9)
 
 
 # --- a clean end ------------------------------------------------------------------------------------------------------
@@ -318,39 +315,3 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
 def test_a_gpu_that_is_not_there_is_said() -> None:
     with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda"):
         pass
-
-
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def test_events_are_red_blue_and_white() -> None:
-    voxels = np.zeros((1, 2, 2, 3), np.int8)
-    voxels[0, :, 0, 0] = 3
-    voxels[0, :, 1, 2] = -3
-    drawn = draw_events(voxels)
-    assert drawn.shape == (1, 2, 3, 3)
-    assert tuple(drawn[0, 0, 0]) == ON
-    assert tuple(drawn[0, 1, 2]) == OFF
-    assert (drawn[0, 0, 1:] == 255).all()
-    assert (draw_events(np.zeros((1, 2, 2, 3), np.int8)) == 255).all()
-
-
-def test_pictures_are_clipped() -> None:
-    drawn = draw_pictures(np.array([-1.0, 0.0, 0.5, 1.0, 2.0]).reshape(1, 1, 1, 5))
-    assert drawn[0, 0, :, 0].tolist() == [0, 0, 128, 255, 255]
-
-
-def test_a_film_is_large_enough_to_see() -> None:
-    steps, height, width = 7, 20, 30
-    pictures = np.zeros((steps, 1, height, width), np.float32)
-    film = side_by_side(np.zeros((steps, 5, height, width), np.int8), pictures, pictures)
-    factor = 7  # 7 x 20 px is the first multiple that is not below 128 px
-    assert film.shape == (steps, factor * height + GAP_PX, 3 * (factor * width + GAP_PX), 3)
-    assert contact_sheet(film, steps=3).shape == (3 * film.shape[1], film.shape[2], 3)
-    assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
-
-
-def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="file"):
-        write_png(tmp_path / "file" / "a.png", np.zeros((2, 2, 3), np.uint8))

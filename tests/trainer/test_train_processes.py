@@ -20,8 +20,7 @@ import pytest
 from tests.client.fake_server import FakeServer
 from tests.clips import panned_luma, write_clip
 from tests.trainer.training import arguments, losses, trained
-from trainer.run.checkpoint import load_checkpoint
-from trainer.run.resume import LAST
+from trainer.run.checkpoint import LAST, load_checkpoint
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]

@@ -20,11 +20,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set
 from trainer.evaluation.metrics import METRICS, make_metrics
-from trainer.evaluation.network import load_network
 from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
+from trainer.weights import load_network
 from v2v_client.command import run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json

@@ -7,14 +7,18 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from trainer.evaluation import layout, pictures
+import numpy as np
+
+from trainer import pictures
+from trainer.evaluation import layout
 from trainer.evaluation.cuts import Cut, DataSet
 from trainer.evaluation.metrics import Metric
+from trainer.evaluation.pictures import chosen_steps, draw_step
 from trainer.evaluation.readers import Recording, Window
 from trainer.evaluation.reconstruct import reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
 from trainer.evaluation.voxelise import VoxelSettings
-from trainer.models import ReconstructionNetwork
+from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
 
 Advance = Callable[[str, int, int], None]
@@ -57,7 +61,7 @@ class Run:
         drawing: pictures and videos.
     """
 
-    network: ReconstructionNetwork
+    network: VoxelNetwork
     voxels: VoxelSettings
     metrics: Mapping[str, Metric]
     device: str = "cpu"
@@ -120,20 +124,20 @@ def evaluate_sequence(
         windows = _windows(run, recording, cut)
         scorer = SequenceScorer(run.metrics)
         rows = []
-        shown = pictures.chosen_steps(len(windows), run.drawing.rows)
+        shown = chosen_steps(len(windows), run.drawing.rows)
         with _video(run.drawing, data_set, recording.name, windows) as video:
             steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device)
             for number, step in enumerate(steps):
                 scorer.add(step)
                 if video is not None or (run.drawing.folder is not None and number in shown):
-                    image = pictures.draw_step(step, windows[0].begin, with_camera=bool(recording.images))
+                    image = draw_step(step, windows[0].begin, with_camera=bool(recording.images))
                     if number in shown:
                         rows.append(image)
                     if video is not None:
                         video.add(image)
                 advance(recording.name, number + 1, len(windows))
         if run.drawing.folder is not None:
-            pictures.write_png(run.drawing.folder / data_set / f"{recording.name}.png", rows)
+            pictures.write_png(run.drawing.folder / data_set / f"{recording.name}.png", np.vstack(rows))
         return scorer.score(data_set, recording.name, recording.repaired_images)
 
 

@@ -16,7 +16,7 @@ import torch
 
 from trainer.evaluation.readers import Image, Recording, Window
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
-from trainer.models import ReconstructionNetwork
+from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
 
 WINDOWS_PER_CALL = 8
@@ -48,7 +48,7 @@ class Step:
 def reconstruct(
     recording: Recording,
     windows: Sequence[Window],
-    network: ReconstructionNetwork,
+    network: VoxelNetwork,
     settings: VoxelSettings,
     *,
     device: str = "cpu",

@@ -12,8 +12,9 @@ pred      conv1 on (x + head), linear                  32 -> 1
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import Literal
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -27,10 +28,11 @@ from trainer.models.blocks import (
     TransposedConvLayer,
     UpsampleConvLayer,
 )
-from trainer.models.sequence import ReconstructionNetwork, predict
+from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork, predict
 from v2v_protocol.errors import UsageError
 
 KERNEL_SIZE = 5
+PREDICTION = re.compile(r"unetrecurrent\.pred\.conv2d\.(weight|bias)")
 
 
 class UNetRecurrent(nn.Module):
@@ -48,29 +50,46 @@ class UNetRecurrent(nn.Module):
         )
         self.resblocks = nn.ModuleList(ResidualBlock(channels[-1], norm=norm) for _ in range(residual_blocks))
         upsample = TransposedConvLayer if transposed else UpsampleConvLayer
-        self.decoders = nn.ModuleList(
+        self.decoders: nn.ModuleList = nn.ModuleList(
             upsample(channels[level], channels[level - 1], KERNEL_SIZE, norm=norm) for level in range(encoders, 0, -1)
         )
         self.pred = ConvLayer(channels[0], 1, 1, relu=False, norm=norm)
 
-    def forward(
-        self, x: Tensor, states: Sequence[LSTMState | None], steps: int
-    ) -> tuple[Tensor, tuple[LSTMState, ...]]:
-        """[T*B, bins, H, W] and one state per encoder -> [T*B, 1, H, W] and the states after the last step."""
-        head = self.head(x)
-        x, skips, after = head, [], []
-        for encoder, state in zip(self.encoders, states, strict=True):
-            x, state = encoder(x, state, steps)
+    def encode(
+        self, x: Tensor, states: Sequence[LSTMState | None] | None, steps: int
+    ) -> tuple[Tensor, list[Tensor], tuple[LSTMState, ...]]:
+        """Everything in front of the decoders.
+
+        Args:
+            x: [T*B, bins, H, W].
+            states: one per encoder; None after a reset.
+            steps: T.
+
+        Returns:
+            The output of the residual blocks; what the decoders add (head, then the hidden states of the encoders); the
+            states after the last step.
+        """
+        x = self.head(x)
+        skips, after = [x], []
+        for number, encoder in enumerate(self.encoders):
+            x, state = encoder(x, None if states is None else states[number], steps)
             skips.append(x)
             after.append(state)
         for block in self.resblocks:
             x = block(x)
-        for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
-            x = decoder(x + skip)
-        return predict(self.pred, x + head), tuple(after)
+        return x, skips, tuple(after)
+
+    def forward(
+        self, x: Tensor, states: Sequence[LSTMState | None] | None, steps: int
+    ) -> tuple[Tensor, tuple[LSTMState, ...]]:
+        """[T*B, bins, H, W] and one state per encoder -> [T*B, 1, H, W] and the states after the last step."""
+        x, skips, after = self.encode(x, states, steps)
+        for decoder in self.decoders:
+            x = decoder(x + skips.pop())
+        return predict(self.pred, x + skips.pop()), after
 
 
-class E2VID(ReconstructionNetwork):
+class E2VID(VoxelNetwork):
     """Recurrent E2VID.
 
     Args:
@@ -82,10 +101,13 @@ class E2VID(ReconstructionNetwork):
         upsampling: "bilinear" (E2VID+, V2V), or "transposed" convolution.
         final_activation: "none" (E2VID+, V2V), or "sigmoid" (first release).
         normalize_voxels: see :func:`trainer.models.sequence.normalize_voxels`; True for the first release.
+        padding: see :class:`VoxelNetwork`; "centred" for the first release and E2VID+.
 
     Raises:
         UsageError: a setting that is none of these.
     """
+
+    signature = ("unetrecurrent.decoders.0.conv2d.weight", "unetrecurrent.decoders.0.transposed_conv2d.weight")
 
     def __init__(
         self,
@@ -98,6 +120,7 @@ class E2VID(ReconstructionNetwork):
         upsampling: Literal["bilinear", "transposed"] = "bilinear",
         final_activation: Literal["none", "sigmoid"] = "none",
         normalize_voxels: bool = False,
+        padding: Padding = "bottom-right",
     ) -> None:
         for name, value, known in (
             ("norm", norm, ("none", "batch")),
@@ -108,8 +131,9 @@ class E2VID(ReconstructionNetwork):
                 raise UsageError(f"E2VID {name} = {value!r}: give one of {', '.join(known)}")
         if min(bins, base_channels, encoders) < 1 or residual_blocks < 0:
             raise UsageError("E2VID bins, base_channels and encoders are at least 1, residual_blocks at least 0")
-        # 16 as in V2V, although three encoders ask for 8 only: published figures were made with this padding.
-        super().__init__(bins=bins, size_multiple=max(16, 2**encoders), normalizes=normalize_voxels)
+        # V2V pads to 16, although three encoders ask for 8 only: published figures were made with this padding.
+        multiple = max(16, 2**encoders) if padding == "bottom-right" else 2**encoders
+        super().__init__(bins=bins, size_multiple=multiple, normalizes=normalize_voxels, padding=padding)
         self.unetrecurrent = UNetRecurrent(
             bins,
             base_channels,
@@ -121,9 +145,38 @@ class E2VID(ReconstructionNetwork):
         self.sigmoid = final_activation == "sigmoid"
 
     def unroll(
-        self, x: Tensor, state: tuple[LSTMState, ...] | None, steps: int
+        self, x: Tensor, state: tuple[LSTMState, ...] | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, tuple[LSTMState, ...]]:
-        """See :meth:`ReconstructionNetwork.unroll`; one :class:`LSTMState` per encoder."""
-        states = [None] * len(self.unetrecurrent.encoders) if state is None else state
-        pictures, after = self.unetrecurrent(x, states, steps)
+        """See :meth:`VoxelNetwork.unroll`; one :class:`LSTMState` per encoder."""
+        pictures, after = self.unetrecurrent(x, state, steps)
         return torch.sigmoid(pictures) if self.sigmoid else pictures, after
+
+    @classmethod
+    def own_name(cls, name: str) -> str:
+        """E2VID+ calls itself ``unetflow``."""
+        return re.sub(r"^unetflow\.", "unetrecurrent.", name)
+
+    @classmethod
+    def own_tensor(cls, name: str, tensor: Tensor) -> Tensor:
+        """E2VID+ also predicts flow; the picture is channel 0."""
+        return tensor[:1].clone() if PREDICTION.fullmatch(name) and len(tensor) == 3 else tensor
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
+        """Sizes, norm and upsampling from the tensors; the sigmoid of the first release from the settings."""
+        for name, built in (("skip_type", "sum"), ("recurrent_block_type", "convlstm")):
+            if settings.get(name, built) != built:
+                raise UsageError(f"E2VID with {name} = {settings[name]!r} is not built here, only {built!r}")
+        head = state["unetrecurrent.head.conv2d.weight"]
+        sigmoid = settings.get("final_activation") == "sigmoid"
+        return {
+            "bins": head.shape[1],
+            "base_channels": head.shape[0],
+            "encoders": sum(name.endswith("recurrent_block.Gates.weight") for name in state),
+            "residual_blocks": sum(bool(re.fullmatch(r".*resblocks\.\d+\.conv1\.weight", name)) for name in state),
+            "norm": "batch" if any(name.endswith("norm_layer.running_mean") for name in state) else "none",
+            "upsampling": "transposed" if any("transposed_conv2d" in name for name in state) else "bilinear",
+            "final_activation": "sigmoid" if sigmoid else "none",
+            "normalize_voxels": bool(settings.get("normalize", sigmoid)),
+            "padding": settings.get("padding", "bottom-right"),
+        }

@@ -6,14 +6,27 @@ conv3 + ReLU -> ConvGRU -> residual block -> ConvGRU -> residual block -> conv1,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from torch import Tensor, nn
 
 from trainer.models.blocks import ConvGRU, ConvLayer, RecurrentLayer, ResidualBlock
-from trainer.models.sequence import ReconstructionNetwork, predict
+from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork, predict
 from v2v_protocol.errors import UsageError
 
 GREY = 0.5
 """What an untrained network predicts on average: the middle of the range of pictures."""
+
+PLUS = {
+    "head.conv2d": "net.head.conv.conv2d",
+    "G1": "net.head.recurrent_block",
+    "R1": "net.resblocks.0.conv",
+    "G2": "net.resblocks.0.recurrent_block",
+    "R2": "net.resblocks.1",
+    "pred.conv2d": "net.pred.conv2d",
+}
+"""FireNet+ is FireNet with its layers under other names."""
 
 
 class _FireUNet(nn.Module):
@@ -36,7 +49,7 @@ class _FireUNet(nn.Module):
         return predict(self.pred, self.resblocks[1](x)), (first, second)
 
 
-class FireNet(ReconstructionNetwork):
+class FireNet(VoxelNetwork):
     """FireNet.
 
     Args:
@@ -44,20 +57,46 @@ class FireNet(ReconstructionNetwork):
         base_channels: channels of every layer.
         normalize_voxels: see :func:`trainer.models.sequence.normalize_voxels`; True for the published FireNet, False
             for FireNet+ and for networks trained on the stream.
+        padding: "bottom-right" adds nothing, the network takes all sizes. "centred" pads to multiples of 16, as the
+            code did with which the first FireNet was published.
 
     Raises:
         UsageError: ``bins`` or ``base_channels`` below 1.
     """
 
-    def __init__(self, *, bins: int = 5, base_channels: int = 16, normalize_voxels: bool = False) -> None:
+    signature = ("net.head.recurrent_block.reset_gate.weight",)
+
+    def __init__(
+        self,
+        *,
+        bins: int = 5,
+        base_channels: int = 16,
+        normalize_voxels: bool = False,
+        padding: Padding = "bottom-right",
+    ) -> None:
         if min(bins, base_channels) < 1:
             raise UsageError(f"FireNet bins = {bins}, base_channels = {base_channels}: give 1 or more")
-        super().__init__(bins=bins, size_multiple=1, normalizes=normalize_voxels)
+        multiple = 1 if padding == "bottom-right" else 16
+        super().__init__(bins=bins, size_multiple=multiple, normalizes=normalize_voxels, padding=padding)
         self.net = _FireUNet(bins, base_channels)
 
     def unroll(
-        self, x: Tensor, state: tuple[Tensor, Tensor] | None, steps: int
+        self, x: Tensor, state: tuple[Tensor, Tensor] | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """See :meth:`ReconstructionNetwork.unroll`; two hidden states [B, 16, H, W]."""
+        """See :meth:`VoxelNetwork.unroll`; two hidden states [B, 16, H, W]."""
         pictures, after = self.net(x, (None, None) if state is None else state, steps)
         return pictures, after
+
+    @classmethod
+    def own_name(cls, name: str) -> str:
+        """See :data:`PLUS`."""
+        layer = next((layer for layer in PLUS if name.startswith(f"{layer}.")), None)
+        return name if layer is None else PLUS[layer] + name.removeprefix(layer)
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
+        """Sizes from the tensors. The first FireNet normalises its input, and its file says so."""
+        base_channels, bins = state["net.head.conv.conv2d.weight"].shape[:2]
+        first = bool(settings.get("normalize", False))
+        padding = "centred" if first else "bottom-right"
+        return {"bins": bins, "base_channels": base_channels, "normalize_voxels": first, "padding": padding}

@@ -4,25 +4,41 @@ A checkpoint holds tensors and plain values only, so it loads with ``weights_onl
 the optimiser and the scheduler (never the objects), the state of the random generators, the position in the stream
 after the last batch that was trained on (``Batch.resume_state``), the counters and the configuration.
 
-Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole.
+Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole. Which run a
+checkpoint belongs to, and which folder a run may write to, is decided here as well.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
-from trainer.run.replacing import replacing
+from trainer.config import TrainConfig, differences
+from trainer.run.distributed import on_gpu
 from trainer.unpickle import read_torch_file
 from v2v_protocol.errors import UsageError
 
-FORMAT = 1
+FORMAT = 2
+LAST = "last.pt"
+
+MAY_DIFFER = (
+    *("stream.address", "stream.videos", "stream.list", "stream.workers"),
+    *("stream.loader_workers", "stream.timeout_seconds"),
+    *("loss.lpips_backbone", "loss.lpips_heads", "loss.raft_weights", "network.weights", "compute.seed"),
+)
+"""Where things lie and how fast they come. What the videos hold is compared by the stream itself."""
+
+MAY_CHANGE = ("run.", "compute.", "stream.batch_size")
+"""Said aloud, but allowed: how long to train and on what. Losses are then no longer those of an uninterrupted run."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +50,6 @@ class Checkpoint:
         epoch: the epoch that the next batch belongs to.
         model: state dict of the network itself (unwrapped: not of DistributedDataParallel).
         optimizer: its state dict.
-        scheduler: its state dict, or None without one.
         ema: state dict of the averaged network, or None without one.
         rng: of :func:`capture_rng`.
         stream: ``resume_state`` of the last batch trained on; None before the first.
@@ -45,7 +60,6 @@ class Checkpoint:
     epoch: int
     model: Mapping[str, Tensor]
     optimizer: Mapping[str, Any]
-    scheduler: Mapping[str, Any] | None
     ema: Mapping[str, Tensor] | None
     rng: Mapping[str, Any]
     stream: Mapping[str, Any] | None
@@ -117,7 +131,96 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     content = read_torch_file(path, plain=True)
     names = [item.name for item in dataclasses.fields(Checkpoint)]
     if not isinstance(content, dict) or not {"format", *names} <= content.keys():
-        raise UsageError(f"{path} is no checkpoint of a training run (for weights alone use load_weights)")
+        raise UsageError(f"{path} is no checkpoint of a training run (for weights alone use read_weights)")
     if content["format"] != FORMAT:
         raise UsageError(f"{path} has checkpoint format {content['format']}, this release reads {FORMAT}")
     return Checkpoint(**{name: content[name] for name in names})
+
+
+def epoch_name(epoch: int) -> str:
+    """File of the checkpoint after an epoch."""
+    return f"epoch-{epoch:04d}.pt"
+
+
+def prune_epochs(out: Path, keep: int) -> None:
+    """Removes checkpoints of epochs in the folder of a run, the oldest first, until ``keep`` are left."""
+    for path in sorted(out.glob("epoch-*.pt"))[:-keep]:
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, which takes the place of ``path`` once the block has ended and all of it is on the disk.
+
+    Raises:
+        OSError: the disk refused; ``path`` is as it was, as it is after an error in the block.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    # The rename is an entry of the folder: without this it can be lost although the file is not.
+    with contextlib.suppress(PermissionError):  # Windows opens no folders
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
+    """
+    Returns:
+        what differs although it may, one line each.
+
+    Raises:
+        UsageError: a setting that would make it another run differs; the message names all of them with both values.
+    """
+    changed = differences(checkpoint.config, config.to_dict())
+    shown = {
+        key: f"{key}: {old!r} -> {new!r}" for key, (old, new) in changed.items() if key not in (*MAY_DIFFER, "run.out")
+    }
+    refused = [text for key, text in shown.items() if not key.startswith(MAY_CHANGE)]
+    if refused:
+        raise UsageError(
+            f"--resume: the checkpoint is of another run ({'; '.join(refused)}). Give its settings, or start a new run "
+            "from its weights with network.weights"
+        )
+    drawn = ["cuda" if gpu else "cpu" for gpu in (checkpoint.rng["cuda"], on_gpu(config.compute.device))]
+    return [*shown.values(), *([f"random generator: {drawn[0]} -> {drawn[1]}"] if drawn[0] != drawn[1] else [])]
+
+
+def require_fresh(out: Path) -> None:
+    """
+    Raises:
+        UsageError: the folder holds a run, which a new one would write over; or it may not be entered.
+    """
+    try:
+        holds_run = (out / LAST).exists()
+    except OSError as error:
+        raise _unusable(out, error) from error
+    if holds_run:
+        raise UsageError(f"{out} holds a run: go on with --resume {out / LAST}, or give another folder with --out")
+
+
+def require_writable(out: Path) -> None:
+    """Makes the folder where it is missing, before anything is started for nothing.
+
+    Raises:
+        UsageError: it cannot be made, or nothing can be written there.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise _unusable(out, error) from error
+
+
+def _unusable(out: Path, error: OSError) -> UsageError:
+    return UsageError(f"run.out = {out}: {error.strerror}; give another folder with --out")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,13 +17,16 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from trainer.config import TrainConfig
+from trainer.config_file import show_config
+from trainer.pictures import Image, Video, contact_sheet, write_png
+from trainer.run.checkpoint import replacing
 from trainer.run.distributed import Ranks
-from trainer.run.preview import contact_sheet, write_png, write_video
-from trainer.run.replacing import replacing
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import UsageError
 
 METRICS = "metrics.jsonl"
+CONFIGURATION = "config.yaml"
+FRAMES_PER_SECOND = 8
 
 
 class Meter:
@@ -86,6 +89,7 @@ class Reporter:
         self._first = self._step = step
         self._planned = False
         self._total: int | None = None
+        self._held_out: float | None = None
         self._seconds = 0.0
         self._began = time.perf_counter()
         self._bar = Progress(
@@ -128,15 +132,7 @@ class Reporter:
         """
         if self._board is None:
             return
-        record: dict[str, Any] = {"step": step, "epoch": epoch, "learning_rate": learning_rate, **values}
-        try:
-            with (self._out / METRICS).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record) + "\n")
-        except OSError as error:
-            raise UsageError(f"{self._out / METRICS}: {error.strerror}") from error
-        for name, value in record.items():
-            if name != "step":
-                self._board.add_scalar(f"{_GROUPS.get(name, 'loss')}/{name}", value, step)
+        self._write({"step": step, "epoch": epoch, "learning_rate": learning_rate, **values})
         note = self._note(values)
         self._bar.update(self._task, note=note)
         if self._bar.disable:
@@ -144,15 +140,51 @@ class Reporter:
                 f"step {step}{f'/{self._total}' if self._total else ''}  {note}", markup=False, soft_wrap=True
             )
 
-    def preview(self, step: int, films: list[Any]) -> None:
-        """Films of :func:`trainer.run.preview.side_by_side`, one per sample, equally large."""
+    def held_out(self, step: int, values: Mapping[str, float]) -> None:
+        """Losses of the batch that is not trained on.
+
+        Raises:
+            UsageError: they cannot be written down.
+        """
+        self._held_out = values["total"]
+        self._write({"step": step} | {f"held_out_{name}": value for name, value in values.items()})
+
+    def configuration(self, config: TrainConfig) -> None:
+        """All keys of the run, as a file that ``v2v-train`` takes.
+
+        Raises:
+            UsageError: it cannot be written down.
+        """
+        if self._board is not None:
+            try:
+                (self._out / CONFIGURATION).write_text(show_config(config), "utf-8")
+            except OSError as error:
+                raise UsageError(f"{self._out / CONFIGURATION}: {error.strerror}") from error
+
+    def _write(self, record: Mapping[str, Any]) -> None:
+        if self._board is None:
+            return
+        try:
+            with (self._out / METRICS).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:
+            raise UsageError(f"{self._out / METRICS}: {error.strerror}") from error
+        for name, value in record.items():
+            if name != "step":
+                group = "held_out" if name.startswith("held_out_") else _GROUPS.get(name, "loss")
+                self._board.add_scalar(f"{group}/{name.removeprefix('held_out_')}", value, record["step"])
+
+    def preview(self, step: int, films: Sequence[Image]) -> None:
+        """Films of a task, one per sample, equally large."""
         if self._board is None:
             return
         name = f"step-{step:07d}"
         for number, film in enumerate(films):
             sheet = contact_sheet(film)
             write_png(self._out / "previews" / f"{name}-{number}.png", sheet)
-            write_video(self._out / "previews" / f"{name}-{number}.mp4", film)
+            with Video(self._out / "previews" / f"{name}-{number}.mp4", FRAMES_PER_SECOND) as video:
+                for image in film:
+                    video.add(image)
             self._board.add_image(f"preview/{number}", sheet, step, dataformats="HWC")
         self._board.flush()
 
@@ -162,8 +194,10 @@ class Reporter:
         left = self._seconds - spent if self._seconds else math.inf
         if self._total:
             left = min(left, (self._total - self._step) * spent / max(1, self._step - self._first))
+        # The loss of a step swings with its samples; that of the held-out batch shows what is learnt.
+        held_out = "" if self._held_out is None else f"held out {self._held_out:.4f}  "
         return (
-            f"loss {values['total']:.4f}  {values['steps_per_second']:.2f} it/s  "
+            f"{held_out}loss {values['total']:.4f}  {values['steps_per_second']:.2f} it/s  "
             f"data wait {wait / (wait + compute):.0%}  ETA {_clock(max(0.0, left))}"
         )
 

@@ -25,8 +25,7 @@ import torch
 
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
-from trainer.run.checkpoint import load_checkpoint
-from trainer.run.resume import LAST
+from trainer.run.checkpoint import LAST, load_checkpoint
 from trainer.weights import load_into
 from v2v_bench.records import Column, at_least, parser_of, run, show, write
 from v2v_client import Batch, V2VStreamDataset

@@ -8,7 +8,7 @@ import torch
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
 from tests.trainer.models import numpy_networks as oracle
-from trainer.models import E2VID, NETWORKS, ReconstructionNetwork, normalize_voxels
+from trainer.models import E2VID, NETWORKS, VoxelNetwork, normalize_voxels
 from trainer.models.blocks import TransposedConvLayer
 from v2v_protocol.errors import UsageError
 
@@ -38,7 +38,7 @@ def counts(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(params=sorted(NETWORKS))
-def network(request: pytest.FixtureRequest) -> ReconstructionNetwork:
+def network(request: pytest.FixtureRequest) -> VoxelNetwork:
     """Each network, small, with weights that let the memory matter."""
     torch.manual_seed(0)
     small = {"e2vid": {"base_channels": 4, "encoders": 2}, "firenet": {"base_channels": 4}}
@@ -101,7 +101,7 @@ def test_unknown_settings_are_refused(options: dict[str, str]) -> None:
         E2VID(**options)  # type: ignore[arg-type]
 
 
-def test_pieces_with_their_state_equal_the_whole(network: ReconstructionNetwork) -> None:
+def test_pieces_with_their_state_equal_the_whole(network: VoxelNetwork) -> None:
     voxels = torch.from_numpy(counts((2, 5, 5, 17, 20)))
     with torch.no_grad():
         whole, last = network(voxels)
@@ -114,7 +114,7 @@ def test_pieces_with_their_state_equal_the_whole(network: ReconstructionNetwork)
     torch.testing.assert_close(network(voxels)[0], whole, rtol=0, atol=1e-6)
 
 
-def test_clips_of_a_batch_are_independent_and_in_their_place(network: ReconstructionNetwork) -> None:
+def test_clips_of_a_batch_are_independent_and_in_their_place(network: VoxelNetwork) -> None:
     voxels = torch.from_numpy(counts((3, 4, 5, 16, 16)))
     with torch.no_grad():
         together = network.forward_sequence(voxels)
@@ -124,7 +124,7 @@ def test_clips_of_a_batch_are_independent_and_in_their_place(network: Reconstruc
             )
 
 
-def test_the_past_reaches_the_last_picture_and_the_future_not_the_first(network: ReconstructionNetwork) -> None:
+def test_the_past_reaches_the_last_picture_and_the_future_not_the_first(network: VoxelNetwork) -> None:
     voxels = torch.from_numpy(counts((1, 4, 5, 16, 16))).float().requires_grad_()
     pictures = network.forward_sequence(voxels)
     (of_last,) = torch.autograd.grad(pictures[:, -1].sum(), voxels, retain_graph=True)
@@ -134,7 +134,7 @@ def test_the_past_reaches_the_last_picture_and_the_future_not_the_first(network:
     assert of_first[:, 1:].abs().sum() == 0
 
 
-def test_every_parameter_gets_a_gradient(network: ReconstructionNetwork) -> None:
+def test_every_parameter_gets_a_gradient(network: VoxelNetwork) -> None:
     network.forward_sequence(torch.from_numpy(counts((1, 3, 5, 16, 16)))).square().mean().backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name
@@ -145,7 +145,7 @@ def test_every_parameter_gets_a_gradient(network: ReconstructionNetwork) -> None
     assert moved == len(list(network.parameters()))
 
 
-def test_autocast_gives_float32_pictures_near_the_exact_ones(network: ReconstructionNetwork) -> None:
+def test_autocast_gives_float32_pictures_near_the_exact_ones(network: VoxelNetwork) -> None:
     voxels = torch.from_numpy(counts((1, 6, 5, 16, 16)))
     with torch.no_grad():
         exact = network.forward_sequence(voxels)
@@ -157,7 +157,7 @@ def test_autocast_gives_float32_pictures_near_the_exact_ones(network: Reconstruc
     assert carried.dtype == torch.float32
 
 
-def test_nothing_waits_for_the_device(network: ReconstructionNetwork) -> None:
+def test_nothing_waits_for_the_device(network: VoxelNetwork) -> None:
     """Fake tensors have no values: reading one (``item``, ``if tensor``, boolean indexing) raises."""
     network.normalizes = True
     with FakeTensorMode(allow_non_fake_inputs=True):
@@ -181,7 +181,7 @@ def test_padding_is_cut_off_again() -> None:
 
 
 @pytest.mark.parametrize("shape", [(2, 5, 16, 16), (1, 2, 4, 16, 16), (1, 0, 5, 16, 16)])
-def test_wrong_shapes_are_refused(network: ReconstructionNetwork, shape: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_refused(network: VoxelNetwork, shape: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="5, H, W"):
         network(torch.zeros(shape))
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from trainer.models import E2VID, FireNet
 from trainer.run.checkpoint import Checkpoint, capture_rng, load_checkpoint, restore_rng, save_checkpoint
 from trainer.unpickle import Placeholder, read_torch_file
-from trainer.weights import e2vid_options, load_into, load_weights
+from trainer.weights import load_into, load_network, read_weights
 from v2v_protocol.errors import UsageError
 
 CPU = torch.device("cpu")
@@ -68,8 +68,8 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path, zipped: bool) -> None:
     model, marker = small(), tmp_path / "marker"
     content = {"state_dict": model.state_dict(), "config": MakesFolder(marker)}
     torch.save(content, tmp_path / "trap.pth", _use_new_zipfile_serialization=zipped)
-    state, _ = load_weights(tmp_path / "trap.pth")
-    assert same(state, model.state_dict())
+    state = read_weights(tmp_path / "trap.pth").state
+    assert same(dict(state), model.state_dict())
     assert not marker.exists()
     with pytest.raises(FileNotFoundError):
         marker.rmdir()
@@ -99,9 +99,9 @@ def test_whole_objects_beside_the_weights_do_no_harm(tmp_path: Path, zipped: boo
         "config": ConfigParser({"num_bins": 5, "norm": "none", "kernel_size": 5, "list": [1]}),
     }
     torch.save(content, tmp_path / "whole.pth", _use_new_zipfile_serialization=zipped)
-    state, report = load_weights(tmp_path / "whole.pth")
-    assert same(state, model.state_dict())
-    assert report.settings == {"num_bins": 5, "norm": "none", "kernel_size": 5}
+    file = read_weights(tmp_path / "whole.pth")
+    assert same(dict(file.state), model.state_dict())
+    assert file.settings == {"num_bins": 5, "norm": "none", "kernel_size": 5, "padding": "centred"}
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -
     path = tmp_path / "file.pth"
     path.write_bytes(content)
     with pytest.raises(UsageError, match=message):
-        load_weights(path)
+        read_weights(path)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -133,7 +133,7 @@ def test_damaged_files_give_one_kind_of_error(tmp_path: Path, zipped: bool) -> N
             damaged[place] = rng.integers(256)
         path.write_bytes(damaged)
         try:
-            load_weights(path)
+            read_weights(path)
         except UsageError:
             refused += 1
     assert refused > 20
@@ -141,13 +141,13 @@ def test_damaged_files_give_one_kind_of_error(tmp_path: Path, zipped: bool) -> N
 
 def test_absent_files_and_files_without_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no file"):
-        load_weights(tmp_path / "absent.pth")
+        read_weights(tmp_path / "absent.pth")
     torch.save({"epoch": 1, "losses": [1.0]}, tmp_path / "losses.pth")
     with pytest.raises(UsageError, match="holds epoch, losses"):
-        load_weights(tmp_path / "losses.pth")
+        read_weights(tmp_path / "losses.pth")
     torch.save({"state_dict": small().state_dict()}, tmp_path / "plain.pth")
     with pytest.raises(UsageError, match="under 'ema'"):
-        load_weights(tmp_path / "plain.pth", ema=True)
+        read_weights(tmp_path / "plain.pth", ema=True)
 
 
 # names
@@ -227,7 +227,7 @@ def test_a_misfit_is_refused_whole_and_reported(tmp_path: Path) -> None:
 def test_two_networks_in_one_file_are_refused(tmp_path: Path) -> None:
     torch.save({"a.weight": torch.zeros(1), "module.a.weight": torch.ones(1)}, tmp_path / "two.pth")
     with pytest.raises(UsageError, match="same name"):
-        load_weights(tmp_path / "two.pth")
+        load_into(small(), tmp_path / "two.pth")
 
 
 @pytest.mark.parametrize(
@@ -245,8 +245,8 @@ def test_the_variant_of_e2vid_is_read_from_its_file(tmp_path: Path, options: dic
     if "final_activation" in options:
         content["model"] = {"num_bins": 5, "skip_type": "sum", "recurrent_block_type": "convlstm", "norm": "BN"}
     torch.save(content, tmp_path / "e2vid.pth.tar")
-    state, report = load_weights(tmp_path / "e2vid.pth.tar")
-    found = e2vid_options(state, report.settings)
+    name, found = read_weights(tmp_path / "e2vid.pth.tar").recognised()
+    assert name == "e2vid"
     assert found == {
         "bins": 5,
         "residual_blocks": 2,
@@ -254,35 +254,38 @@ def test_the_variant_of_e2vid_is_read_from_its_file(tmp_path: Path, options: dic
         "upsampling": "bilinear",
         "final_activation": "none",
         "normalize_voxels": False,
+        "padding": "centred" if "model" in content else "bottom-right",
         **options,
     }
     load_into(E2VID(**found), tmp_path / "e2vid.pth.tar")
 
 
-def test_variants_that_are_not_built_are_refused() -> None:
-    with pytest.raises(UsageError, match="not weights of an E2VID"):
-        e2vid_options(FireNet().state_dict(), {})
+def test_variants_that_are_not_built_are_refused(tmp_path: Path) -> None:
+    content = {"state_dict": small().state_dict(), "config": ConfigParser({"num_bins": 5, "skip_type": "concat"})}
+    torch.save(content, tmp_path / "concat.pth")
     with pytest.raises(UsageError, match="skip_type = 'concat'"):
-        e2vid_options(small().state_dict(), {"skip_type": "concat"})
+        load_network(tmp_path / "concat.pth")
 
 
-def test_published_firenet_report(published: Path) -> None:
-    _, report = load_weights(published / "firenet_evreal.pth")
-    assert report.renamed == {}
-    assert report.settings["num_bins"] == 5
-    assert report.settings["recurrent_block_type"] == "convgru"
+def test_published_files_say_how_their_network_was_trained(published: Path) -> None:
+    file = read_weights(published / "firenet_evreal.pth")
+    assert file.named_for(FireNet) == {name: name for name in file.state}
+    assert (file.settings["num_bins"], file.settings["recurrent_block_type"]) == (5, "convgru")
+    first, name = load_network(published / "firenet_evreal.pth")
+    assert (name, first.normalizes, first.padding) == ("firenet", True, "centred")
+    plus, name = load_network(published / "firenet_plus_state_dict.pth")
+    assert (name, plus.normalizes, plus.padding) == ("firenet", False, "bottom-right")
 
 
 # our own checkpoints
 
 
 class Run:
-    """A training run in small: noise from the global generator, a stream position, a scheduler."""
+    """A training run in small: noise from the global generator, and a stream position."""
 
     def __init__(self) -> None:
         self.model = small()
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-2, amsgrad=True)
-        self.scheduler = torch.optim.lr_scheduler.ExponentialLR(self.optimizer, 0.9)
         self.position = 0
 
     def train(self, steps: int) -> list[float]:
@@ -293,7 +296,6 @@ class Run:
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()
-            self.scheduler.step()
             self.position += 1
             losses.append(loss.item())
         return losses
@@ -304,7 +306,6 @@ class Run:
             epoch=1,
             model=self.model.state_dict(),
             optimizer=self.optimizer.state_dict(),
-            scheduler=self.scheduler.state_dict(),
             ema=None,
             rng=capture_rng(CPU),
             stream={
@@ -318,9 +319,7 @@ class Run:
     def restore(self, checkpoint: Checkpoint) -> None:
         self.model.load_state_dict(checkpoint.model)
         self.optimizer.load_state_dict(dict(checkpoint.optimizer))
-        assert checkpoint.scheduler is not None
         assert checkpoint.stream is not None
-        self.scheduler.load_state_dict(dict(checkpoint.scheduler))
         self.position = checkpoint.stream["at"]
         restore_rng(checkpoint.rng, CPU)
 
@@ -418,7 +417,7 @@ def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no file"):
         load_checkpoint(path)
     torch.save({"state_dict": small().state_dict()}, path)
-    with pytest.raises(UsageError, match="for weights alone use load_weights"):
+    with pytest.raises(UsageError, match="for weights alone use read_weights"):
         load_checkpoint(path)
     save_checkpoint(path, Run().checkpoint())
     whole = path.read_bytes()
@@ -426,7 +425,7 @@ def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="or damaged"):
         load_checkpoint(path)
     torch.save(torch.load(_written(path, whole), weights_only=True) | {"format": 99}, path)
-    with pytest.raises(UsageError, match="format 99, this release reads 1"):
+    with pytest.raises(UsageError, match="format 99, this release reads 2"):
         load_checkpoint(path)
 
 

@@ -1,0 +1,75 @@
+"""Colours of events and flow, sizes, and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from trainer.pictures import (
+    GAP_PX,
+    OFF,
+    ON,
+    Video,
+    contact_sheet,
+    draw_events,
+    draw_flow,
+    draw_grey,
+    flow_scale,
+    side_by_side,
+    write_png,
+)
+from v2v_protocol.errors import UsageError
+
+
+def test_events_are_red_blue_and_white() -> None:
+    voxels = np.zeros((1, 2, 2, 3), np.int8)
+    voxels[0, :, 0, 0] = 3
+    voxels[0, :, 1, 2] = -3
+    voxels[0, :, 1, 1] = (2, -2)  # cancels
+    drawn = draw_events(voxels)
+    assert drawn.shape == (1, 2, 3, 3)
+    assert tuple(drawn[0, 0, 0]) == ON
+    assert tuple(drawn[0, 1, 2]) == OFF
+    assert (drawn[0, 0, 1:] == 255).all()
+    assert (drawn[0, 1, 1] == 255).all()
+    assert (draw_events(np.zeros((1, 2, 2, 3), np.int8)) == 255).all()
+
+
+def test_grey_is_rounded_and_clipped() -> None:
+    drawn = draw_grey(np.array([[-1.0, 0.0, 0.499, 1.0, 7.0]]))
+    assert drawn[0, :, 0].tolist() == [0, 0, 127, 255, 255]
+
+
+def test_flow_is_white_at_rest_and_red_to_the_right() -> None:
+    flow = np.zeros((2, 1, 3))
+    flow[:, 0, 1], flow[:, 0, 2] = (4, 0), (40, 0)
+    drawn = draw_flow(flow, scale=4)
+    assert drawn[0].tolist() == [[255, 255, 255], [255, 64, 64], [255, 64, 64]]
+    assert flow_scale(flow) > 4
+    assert flow_scale(np.zeros((2, 3, 3))) > 0
+
+
+def test_a_film_is_large_enough_to_see() -> None:
+    steps, height, width = 7, 20, 30
+    film = side_by_side([np.zeros((steps, height, width, 3), np.uint8)] * 3)
+    factor = 7  # 7 x 20 px is the first multiple that is not below 128 px
+    assert film.shape == (steps, factor * height + GAP_PX, 3 * (factor * width + GAP_PX), 3)
+    assert contact_sheet(film, steps=3).shape == (3 * film.shape[1], film.shape[2], 3)
+    assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
+
+
+def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file"):
+        write_png(tmp_path / "file" / "a.png", np.zeros((2, 2, 3), np.uint8))
+
+
+@pytest.mark.parametrize("fps", [1.0, 65.5354, 149.993, 1000.123])
+def test_a_video_of_any_rate_is_written(tmp_path: Path, fps: float) -> None:
+    """EVAID has 150 pictures a second, and time stamps of microseconds make an odd number of them."""
+    with Video(tmp_path / "a.mp4", fps) as video:
+        video.add(np.zeros((17, 24, 3), np.uint8))
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-2)

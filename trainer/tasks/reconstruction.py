@@ -1,0 +1,159 @@
+"""Reconstruction: pictures from events, judged by LPIPS, L1 and temporal consistency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from trainer import pictures
+from trainer.losses.backbones import BACKBONES
+from trainer.losses.lpips import HEADS_FROM, LPIPS
+from trainer.losses.reconstruction import ReconstructionLoss
+from trainer.losses.temporal import TemporalConsistency
+from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
+from trainer.models.sequence import Guide, VoxelNetwork
+from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
+from v2v_client import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructionSettings:
+    """What is minimised: a weighted sum; a term of weight 0 costs nothing and needs no file.
+
+    Attributes:
+        l1_weight, lpips_weight, temporal_weight: of the terms.
+        lpips_network: "vgg", "alex" or "squeeze".
+        lpips_backbone, lpips_heads: its weight files.
+        temporal_first_step, temporal_rule, temporal_as_published: see
+            :class:`trainer.losses.temporal.TemporalConsistency`.
+        flow: "raft" on this device, or "stream": estimated by the server's workers.
+        raft_size, raft_weights: "small" or "large", and its weight file.
+        guide_epochs: epochs in which a network that sees its own last picture (HyperE2VID) is shown a mixture of that
+            and the true one; the share of the true one falls linearly, from all to nothing. 0: never.
+        guide_as_published: the true picture shown at step t is that of t, which is the very target; else that of t-1.
+    """
+
+    l1_weight: float = limited(1.0, 0, 1e6)
+    lpips_weight: float = limited(0.0, 0, 1e6)
+    temporal_weight: float = limited(0.0, 0, 1e6)
+    lpips_network: str = chosen("vgg", BACKBONES)
+    lpips_backbone: str = ""
+    lpips_heads: str = ""
+    temporal_first_step: int = limited(20, 1, 1_000_000)
+    temporal_rule: Literal["half", "full"] = "half"
+    temporal_as_published: bool = False
+    flow: Literal["raft", "stream"] = "raft"
+    raft_size: str = chosen("small", WHERE_TO_GET_WEIGHTS)
+    raft_weights: str = ""
+    guide_epochs: int = limited(0, 0, 1_000_000)
+    guide_as_published: bool = False
+
+
+class Reconstruction(Task):
+    """See :class:`trainer.tasks.task.Task`. Truth: ``frames`` [B, T, 1, H, W] in 0 .. 1, and ``flow`` where the
+    temporal loss wants it, [B, T - first_step, 2, H, W].
+    """
+
+    Settings = ReconstructionSettings
+
+    def __init__(
+        self, settings: ReconstructionSettings, _network: VoxelNetwork | None, device: torch.device, *, bfloat16: bool
+    ) -> None:
+        self.settings = settings
+        self.device = device
+        self._loss = _loss(settings).to(device)
+        self._raft: RaftFlow | None = None
+        if settings.temporal_weight and settings.flow == "raft":
+            origin = WHERE_TO_GET_WEIGHTS[settings.raft_size]
+            weights = required_file(settings, "raft_weights", "loss.flow = raft (or take loss.flow = stream)", origin)
+            self._raft = RaftFlow(settings.raft_size, weights, device, bfloat16=bfloat16)
+
+    @classmethod
+    def check(cls, settings: ReconstructionSettings, recipe: Recipe) -> None:
+        """See :meth:`Task.check`."""
+        if not settings.l1_weight + settings.lpips_weight + settings.temporal_weight:
+            raise UsageError("loss.l1_weight, lpips_weight and temporal_weight are all 0: nothing would be trained")
+        if settings.temporal_weight and settings.temporal_first_step >= recipe.voxels_per_clip:
+            raise UsageError(
+                f"loss.temporal_first_step = {settings.temporal_first_step}: give less than "
+                f"stream.recipe.voxels_per_clip = {recipe.voxels_per_clip}"
+            )
+
+    @property
+    def asked(self) -> Asked:
+        """Frames, and flow where the stream shall estimate it."""
+        if not self.settings.temporal_weight or self._raft is not None:
+            return Asked(arrays=("voxels", "frames"))
+        # The loss wants to know where each pixel was; the released code takes negated forward flow for that.
+        direction = "forward" if self.settings.temporal_as_published else "backward"
+        return Asked(
+            arrays=("voxels", "frames", "flow"),
+            flow_direction=direction,
+            flow_from=self.settings.temporal_first_step,
+        )
+
+    def prepare(self, batch: Batch, epoch: int | None) -> Work:
+        """See :meth:`Task.prepare`."""
+        frames = batch.arrays["frames"].to(self.device) / 255.0
+        truth = {"frames": frames}
+        if self._loss.temporal is not None:
+            truth["flow"] = self._flow(batch, frames)
+        return Work(voxels=batch.arrays["voxels"].to(self.device), truth=truth, guide=self._guide(frames, epoch))
+
+    def _flow(self, batch: Batch, frames: Tensor) -> Tensor:
+        first = self.settings.temporal_first_step
+        if self._raft is None:
+            return batch.arrays["flow"].to(self.device)[:, first:].float()
+        before, now = frames[:, first - 1 : -1].flatten(0, 1), frames[:, first:].flatten(0, 1)
+        pair = (before, now) if self.settings.temporal_as_published else (now, before)
+        return torch.unflatten(self._raft(*pair), 0, (len(frames), -1))
+
+    def _guide(self, frames: Tensor, epoch: int | None) -> Guide | None:
+        if epoch is None or epoch >= self.settings.guide_epochs:
+            return None
+        if not self.settings.guide_as_published:
+            # Nothing is before the first step, as after a reset.
+            frames = torch.cat([torch.zeros_like(frames[:, :1]), frames[:, :-1]], dim=1)
+        return Guide(frames, 1 - epoch / self.settings.guide_epochs)
+
+    def losses(self, prediction: Tensor, work: Work) -> dict[str, Tensor]:
+        """Terms "lpips", "l1", "temporal", as far as they are on."""
+        losses: dict[str, Tensor] = self._loss(prediction, work.truth["frames"], work.truth.get("flow"))
+        return losses
+
+    def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
+        """Events, target, reconstruction."""
+        panels = [
+            pictures.draw_events(voxels[sample].cpu().numpy()),
+            *(pictures.draw_grey(x[sample, :, 0].cpu().numpy()) for x in (work.truth["frames"], prediction)),
+        ]
+        return pictures.side_by_side(panels)
+
+
+def _loss(settings: ReconstructionSettings) -> ReconstructionLoss:
+    lpips = temporal = None
+    if settings.lpips_weight:
+        net, why = settings.lpips_network, f"loss.lpips_weight = {settings.lpips_weight:g}"
+        lpips = LPIPS.from_files(
+            net,
+            required_file(settings, "lpips_backbone", why, BACKBONES[net].weights_from),
+            required_file(settings, "lpips_heads", why, HEADS_FROM.format(net=net)),
+        )
+    if settings.temporal_weight:
+        temporal = TemporalConsistency(
+            first_step=settings.temporal_first_step,
+            rule=settings.temporal_rule,
+            as_published=settings.temporal_as_published,
+        )
+    return ReconstructionLoss(
+        lpips=lpips,
+        temporal=temporal,
+        lpips_weight=settings.lpips_weight,
+        l1_weight=settings.l1_weight,
+        temporal_weight=settings.temporal_weight,
+    )
