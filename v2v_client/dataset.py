@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -15,7 +14,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
 from v2v_client.delivery import deliver
-from v2v_client.loader_exit import send_before_exit
+from v2v_client.loaders import require_epoch_of_ours, require_in_step_with_lightning, send_before_exit
 from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options
 from v2v_client.position.position import Consumer, Iteration, Position
@@ -31,12 +30,6 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
     "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
-)
-
-_ACCELERATE = (
-    "this dataset's loader went through accelerate's prepare(), which cuts batches up among processes that have their "
-    "own already, and counts epochs from 0 after a resume: leave the loader out of prepare(), and take "
-    "batch.to(accelerator.device); ranks come from torch.distributed"
 )
 
 
@@ -207,7 +200,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         }
 
     def __len__(self) -> int:
-        """Batches of the next iteration. Before the first one, the server is asked.
+        """Batches of a whole epoch, also where the next iteration goes on in the middle of one: loops that resume count
+        from its beginning. Before the first iteration, the server is asked.
 
         Raises:
             V2VError: no server answers, or it refuses: see iterating.
@@ -219,7 +213,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 connection.open()
                 # Not pinned: the spacing of siblings is settled by how many loader workers iterate.
                 stream = self._offered = connection.stream
-        return self._consumer.plan(stream, standing.state).batches
+        return self._consumer.plan(stream, None).batches
 
     @property
     def _consumer(self) -> Consumer:
@@ -236,8 +230,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             UsageError: no such epoch; or it is accelerate that sets it.
         """
-        if str(sys._getframe(1).f_globals.get("__name__")).startswith("accelerate."):
-            raise UsageError(_ACCELERATE)
+        require_epoch_of_ours()
         self._position.set_epoch(_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
@@ -279,6 +272,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:
         consumer, epoch, state = self._consumer, begun.epoch, begun.state
+        if state is None:
+            require_in_step_with_lightning(epoch)
         pinned = self.stream
         with closing(self._connection(epoch, state, begun.workers)) as connection:
             connection.open()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from torch.utils.data import DataLoader
@@ -56,6 +58,38 @@ def test_a_loader_prepared_by_accelerate_is_refused(server: FakeServer) -> None:
         exec("stream.set_epoch(0)", theirs)
 
 
+LIGHTNING = """
+class FitLoop:
+    def __init__(self, epoch, batch, restarting):
+        self.trainer = Namespace(current_epoch=epoch)
+        self.restarting = restarting
+        self.epoch_loop = Namespace(batch_progress=Namespace(current=Namespace(ready=batch)))
+
+    def advance(self, loader):
+        iter(loader)
+        return next(iter(loader))
+"""
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_lightning_may_not_begin_a_plain_loader_again(server: FakeServer, workers: int) -> None:
+    """Its loop calls iter() itself, and knows how far it is."""
+    theirs: dict[str, Any] = {"__name__": "lightning.pytorch.loops.fit_loop", "Namespace": SimpleNamespace}
+    exec(LIGHTNING, theirs)
+    stream = dataset(server)
+    loader = DataLoader(
+        stream, batch_size=None, num_workers=workers, multiprocessing_context="fork" if workers else None
+    )
+    state = theirs["FitLoop"](0, 0, False).advance(loader).resume_state
+    for epoch, batch, restarting in ((0, 1, True), (1, 0, False)):
+        with pytest.raises(UsageError, match=r"Give fit\(\) the dataset itself"):
+            theirs["FitLoop"](epoch, batch, restarting).advance(loader)
+    stream.load_state_dict(state)
+    assert theirs["FitLoop"](0, 1, True).advance(loader).indices == (4, 5, 6, 7)
+    stream.set_epoch(3)
+    assert theirs["FitLoop"](3, 0, False).advance(loader).epoch == 3
+
+
 def test_a_child_that_was_forked_may_not_read_on(server: FakeServer) -> None:
     batches = iter(dataset(server))
     next(batches)
@@ -73,7 +107,7 @@ def test_a_child_that_was_forked_may_not_read_on(server: FakeServer) -> None:
     assert next(batches).indices == (4, 5, 6, 7)
 
 
-def _read_on(batches: Iterator[Batch], there: multiprocessing.connection.Connection) -> None:
+def _read_on(batches: Iterator[Batch], there: Any) -> None:
     try:
         there.send(str(next(batches)))
     except UsageError as error:

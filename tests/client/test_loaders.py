@@ -9,7 +9,7 @@ import os
 import threading
 from typing import Any
 
-from v2v_client.loader_exit import send_before_exit
+from v2v_client.loaders import send_before_exit
 
 _the_end_has_come = threading.Event()
 
