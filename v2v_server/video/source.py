@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -16,6 +17,33 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 
+FORMATS = (
+    "mov", "matroska", "avi", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264", "hevc",
+    "obu", "av1", "mjpeg", "yuv4mpegpipe",
+)  # fmt: skip
+"""FFmpeg's names of the containers that are read ("mov" is mp4 as well, "matroska" webm). None of them names other
+files; playlists (concat, HLS, DASH), picture sequences and devices are not among them."""
+
+CODECS = (
+    "h264", "hevc", "vp8", "vp9", "libdav1d", "av1", "mpeg1video", "mpeg2video", "mpegvideo", "mpeg4", "msmpeg4v1",
+    "msmpeg4v2", "msmpeg4", "wmv1", "wmv2", "wmv3", "vc1", "h263", "h263p", "flv", "vp6", "vp6f", "theora", "mjpeg",
+    "dvvideo", "prores", "dnxhd", "cfhd", "ffv1", "huffyuv", "ffvhuff", "utvideo", "png", "rawvideo",
+)  # fmt: skip
+"""FFmpeg's names of the decoders that are used: those of formats that people have videos in. It has hundreds more, of
+which some are hardly ever tested against damage."""
+
+LARGEST_PICTURE_PX = 2**26
+"""Most pixels of a picture, 8192 x 8192: a decoder may keep 16 of them, 1.6 GB."""
+
+MOST_STREAMS = 100
+
+_OPTIONS = {
+    "protocol_whitelist": "file",
+    "format_whitelist": ",".join(FORMATS),
+    "codec_whitelist": ",".join(CODECS),
+    "max_streams": str(MOST_STREAMS),
+    "max_pixels": str(LARGEST_PICTURE_PX),
+}
 _SKIP = {"skip-unreferenced": "noref", "skip": "all"}
 _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
@@ -26,7 +54,8 @@ def opened(
 ) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
-    Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only.
+    Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only. A file is opened by
+    itself: nothing that it names.
 
     Args:
         path: the file.
@@ -34,12 +63,18 @@ def opened(
         track: which of the video tracks: a tile, see :mod:`v2v_server.video.tiles`.
 
     Raises:
-        VideoError: the file cannot be opened, or has no such video track.
+        VideoError: the file cannot be opened, has no such video track, or is of a format or size that is not read.
     """
     name = os.fspath(path)
     try:
+        # To open a named pipe waits for somebody to write into it, and a device may not end.
+        if not stat.S_ISREG(os.stat(name).st_mode):
+            raise VideoError(name, None, "is no regular file")
         # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one.
-        container = av.open(os.path.abspath(name), "r")
+        container = av.open(os.path.abspath(name), "r", options=_OPTIONS)
+    except av.ArgumentError as error:
+        why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
+        raise VideoError(name, None, why) from error
     except (av.FFmpegError, OSError) as error:
         raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
     except UnicodeError as error:
@@ -51,13 +86,19 @@ def opened(
         stream = tracks[track]
         if stream.codec_context is None:
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
+        decoder = stream.codec_context
+        if decoder.codec.name not in CODECS:
+            raise VideoError(name, None, f"holds {decoder.codec.name} video, which is not read here")
+        if decoder.width * decoder.height > LARGEST_PICTURE_PX:
+            size = f"{decoder.width}x{decoder.height} px"
+            raise VideoError(name, None, f"its picture of {size} is larger than {LARGEST_PICTURE_PX} pixels")
         for other in tracks:
-            if other is not stream and hasattr(other, "discard"):  # PyAV 17 and later
+            if other is not stream:
                 other.discard = type(other.discard).all  # the demuxer need not read it
         stream.thread_type = "NONE"
-        stream.codec_context.thread_count = 1
-        if loop_filter != "exact":
-            stream.codec_context.options = {"skip_loop_filter": _SKIP[loop_filter]}
+        decoder.thread_count = 1
+        filtering = {} if loop_filter == "exact" else {"skip_loop_filter": _SKIP[loop_filter]}
+        decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX), **filtering}
         yield container, stream
     finally:
         container.close()

@@ -1,0 +1,98 @@
+"""Files that a stranger made: each is refused with its reason before much is allocated, and none opens another."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from v2v_protocol.errors import VideoError
+from v2v_server.video import source
+from v2v_server.video.probe import probe
+from v2v_server.video.source import CODECS, FORMATS
+
+PLAYLISTS = {
+    "concat.mp4": "ffconcat version 1.0\nfile {clip}\n",
+    "hls.ts": "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{clip}\n#EXT-X-ENDLIST\n",
+    "dash.mp4": '<?xml version="1.0"?>\n<MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"><Period>'
+    '<AdaptationSet contentType="video"><Representation id="0" mimeType="video/mp4"><BaseURL>{clip}</BaseURL>'
+    "</Representation></AdaptationSet></Period></MPD>\n",
+    "image2.mkv": "%d.png\n",
+    "sdp.avi": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n",
+}
+
+
+@pytest.mark.parametrize("name", PLAYLISTS)
+def test_a_file_that_names_others_is_refused_and_opens_none(tmp_path: Path, name: str) -> None:
+    clip = write_clip(tmp_path / "clip.mp4", panned_luma(5))
+    os.utime(clip, ns=(0, 0))  # reading it would set the access time, where the file system keeps one
+    (tmp_path / name).write_text(PLAYLISTS[name].format(clip="clip.mp4"))
+    with pytest.raises(VideoError, match=r"is of no format that is read here|Invalid data"):
+        probe(tmp_path / name)
+    assert clip.stat().st_atime_ns == 0
+
+
+def test_a_playlist_that_ffmpeg_would_open_is_refused_by_the_list_of_formats(tmp_path: Path) -> None:
+    """The test above would pass as well if FFmpeg did not know the file for a playlist, or no time were kept."""
+    clip = write_clip(tmp_path / "clip.mp4", panned_luma(5))
+    os.utime(clip, ns=(0, 0))
+    path = tmp_path / "concat.mp4"
+    path.write_text(PLAYLISTS["concat.mp4"].format(clip="clip.mp4"))
+    with av.open(str(path)) as container:
+        assert container.format.name == "concat"
+    if not os.statvfs(tmp_path).f_flag & os.ST_NOATIME:
+        assert clip.stat().st_atime_ns > 0
+    with pytest.raises(VideoError, match=r"is of no format that is read here.*matroska"):
+        probe(path)
+
+
+@pytest.mark.parametrize("codec", ["magicyuv", "cinepak", "snow"])
+def test_a_codec_that_is_not_on_the_list_is_refused_by_name(tmp_path: Path, codec: str) -> None:
+    options = {"strict": "-2"} if codec == "snow" else None
+    pixels = "rgb24" if codec == "cinepak" else "gbrp" if codec == "magicyuv" else "yuv420p"
+    path = write_clip(tmp_path / "clip.avi", panned_luma(3), codec=codec, pixel_format=pixels, options=options)
+    with pytest.raises(VideoError, match=f"holds {codec} video, which is not read here"):
+        probe(path)
+
+
+def test_every_name_on_the_lists_is_one_of_ffmpegs() -> None:
+    known = {name for names in av.formats_available for name in names.split(",")}
+    assert set(FORMATS) <= known
+    assert set(CODECS) <= set(av.codec.codecs_available)
+    assert not set(FORMATS) & {"concat", "hls", "dash", "image2", "lavfi", "sdp", "rtsp", "imf", "webm_dash_manifest"}
+
+
+def test_a_picture_with_too_many_pixels_is_refused_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large = write_clip(tmp_path / "large.mkv", np.zeros((1, 8704, 8704), np.uint8), options={"preset": "ultrafast"})
+    with pytest.raises(VideoError, match=r"8704x8704 px is larger than 67108864 pixels"):
+        probe(large)
+    # Where only the stream itself states the size, the decoder refuses it.
+    raw = write_clip(tmp_path / "raw.h264", panned_luma(3))
+    monkeypatch.setattr(source, "LARGEST_PICTURE_PX", 64 * 48 - 1)
+    with pytest.raises(VideoError, match=r"64x48 px is larger than 3071 pixels|no frame decodes"):
+        probe(raw)
+
+
+def test_no_more_streams_are_made_than_the_limit(tmp_path: Path) -> None:
+    path = tmp_path / "many.mkv"
+    with av.open(str(path), "w") as output:
+        streams = [output.add_stream("ffv1", rate=25) for _ in range(source.MOST_STREAMS + 20)]
+        for stream in streams:
+            stream.width, stream.height, stream.pix_fmt = 2, 2, "gray"  # type: ignore[attr-defined]
+        for stream in streams:
+            output.mux(stream.encode(av.VideoFrame(2, 2, "gray")))  # type: ignore[attr-defined]
+    with source.opened(path) as (container, _):
+        assert len(container.streams) == source.MOST_STREAMS
+    assert probe(path).frames == 1
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mp4")
+    with pytest.raises(VideoError, match="is no regular file"):
+        probe(tmp_path / "pipe.mp4")
