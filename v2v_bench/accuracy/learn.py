@@ -1,4 +1,4 @@
-"""What networks make of clips that they never saw: simulated samples of held-out videos, judged by LPIPS and correlation.
+"""What networks make of clips they never saw: simulated samples of held-out videos, by LPIPS and correlation.
 
     v2v-bench learn --held-out DIR --lpips squeeze BACKBONE HEADS \\
         --weights ours=runs/firenet/last.pt --ema-weights average=runs/firenet/last.pt \\
@@ -82,7 +82,7 @@ def _samples(address: str, recipe: Recipe, samples: int) -> tuple[Tensor, Tensor
 @torch.no_grad()
 def score(predict: Predict, voxels: Tensor, frames: Tensor, lpips: LPIPS | None) -> dict[str, float]:
     """How far pictures are from the true ones: see the module; the pictures are clamped to 0 .. 1 first."""
-    prediction = torch.cat([predict(piece) for piece in voxels.split(_BATCH)]).clamp(0, 1)
+    prediction = torch.cat([predict(piece) for piece in torch.split(voxels, _BATCH)]).clamp(0, 1)
     later = frames.shape[1] // 2
     made, true = prediction[:, later:], frames[:, later:]
     found = {
@@ -90,7 +90,7 @@ def score(predict: Predict, voxels: Tensor, frames: Tensor, lpips: LPIPS | None)
         "mean_absolute_error": float((made - true).abs().mean()),
     }
     if lpips is not None:
-        pairs = zip(made.split(_BATCH), true.split(_BATCH), strict=True)
+        pairs = zip(torch.split(made, _BATCH), torch.split(true, _BATCH), strict=True)
         found["lpips"] = float(torch.cat([lpips(*pair) for pair in pairs]).mean())
     return found
 
@@ -128,7 +128,7 @@ def compare(asked: argparse.Namespace) -> list[Record]:
     """One flat record for each network and sort of cameras."""
     judged = networks(asked)
     lpips = None if asked.lpips is None else LPIPS.from_files(*asked.lpips)
-    records = []
+    records: list[Record] = []
     for cameras, (voxels, frames) in held_out(asked.held_out, asked.samples).items():
         predictors: dict[str, Predict] = {_GREY: _grey(frames)}
         predictors |= {name: network.forward_sequence for name, network in judged.items()}
