@@ -21,9 +21,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from trainer.evaluation.network import load_network
 from trainer.losses.lpips import LPIPS
-from trainer.models import ReconstructionNetwork
+from trainer.models import VoxelNetwork
+from trainer.weights import load_network
 from v2v_bench.records import Column, Record, at_least, show, write
 from v2v_bench.tradeoff.training_trade import judge
 from v2v_client import Batch, V2VStreamDataset
@@ -100,13 +100,13 @@ def _grey(frames: Tensor) -> Predict:
     return lambda voxels: torch.full_like(voxels[:, :, :1], level, dtype=torch.float32)
 
 
-def networks(asked: argparse.Namespace) -> dict[str, ReconstructionNetwork]:
+def networks(asked: argparse.Namespace) -> dict[str, VoxelNetwork]:
     """What is to be judged, by the name on the command line.
 
     Raises:
         UsageError: nothing is, a name is given twice, or a file holds no network.
     """
-    found: dict[str, ReconstructionNetwork] = {}
+    found: dict[str, VoxelNetwork] = {}
     for entries, options, ema in (
         (asked.weights, {}, False),
         (asked.ema_weights, {}, True),
