@@ -62,7 +62,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
         preset: speed against accuracy: "exact", "balanced" or "fast" (:data:`v2v_protocol.spec.SPEED_PRESETS`); the
             options below may change what it sets.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, samples_per_decode, sibling_spacing,
             flow_*, scene: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
         shared_memory: whether server workers on this host may put samples into memory of this process, which saves
             most of what moving them costs; where they cannot, samples come in messages by themselves.
@@ -109,7 +109,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
         shuffle: bool | None = None,
         max_sequences_per_video: int | None = None,
         on_bad_video: str | None = None,
-        loop_filter: str | None = None,
         samples_per_decode: int | None = None,
         sibling_spacing: int | None = None,
         flow_method: str | None = None,
@@ -136,7 +135,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
             shuffle=shuffle,
             max_sequences_per_video=max_sequences_per_video,
             on_bad_video=on_bad_video,
-            loop_filter=loop_filter,
             samples_per_decode=samples_per_decode,
             sibling_spacing=sibling_spacing,
             flow_method=flow_method,

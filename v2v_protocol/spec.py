@@ -16,7 +16,6 @@ from v2v_protocol.settings import check_settings, nearest, require_known, settin
 
 VoxelDtype = Literal["int8", "int16", "float32"]
 OnBadVideo = Literal["substitute", "raise"]
-LoopFilter = Literal["exact", "skip-unreferenced", "skip"]
 FlowMethod = Literal[
     "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-lean", "dis-fast-1",
     "dis-fast-1-stride-6", "dis-medium", "dis-medium-0",
@@ -25,7 +24,6 @@ FlowMethod = Literal[
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
-LOOP_FILTERS: tuple[LoopFilter, ...] = get_args(LoopFilter)
 FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
 ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
 FLOW_DIRECTIONS: tuple[FlowDirection, ...] = get_args(FlowDirection)
@@ -65,9 +63,6 @@ class StreamSpec:
         "what becomes of a sample whose video fails: substitute makes it from the next candidate and says so in the "
         "provenance; raise makes the consumer raise SampleUnavailable",
     )  # fmt: skip
-    loop_filter: LoopFilter = word(
-        "exact", LoopFilter, "deblocking: of all frames, not of those that no other refers to, or of none"
-    )
     samples_per_decode: int = whole(
         1, 1, MOST_SAMPLES_PER_DECODE,
         "K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its own",
@@ -176,9 +171,9 @@ def _digest(spec: StreamSpec) -> str:
 
 
 SPEED_PRESETS: dict[str, dict[str, Any]] = {
-    "exact": {"samples_per_decode": 1, "loop_filter": "exact"},
-    "balanced": {"samples_per_decode": 2, "loop_filter": "exact"},
-    "fast": {"samples_per_decode": 4, "loop_filter": "exact"},
+    "exact": {"samples_per_decode": 1},
+    "balanced": {"samples_per_decode": 2},
+    "fast": {"samples_per_decode": 4},
 }
 """What speed is bought with: the fields of the spec that each preset sets. `docs/accuracy.md` says why these."""
 

@@ -40,7 +40,7 @@ class ServeConfig:
         list_refused: name every video that cannot be used at the start, not only the first five.
         preset: speed preset ("exact", "balanced", "fast"), see :data:`v2v_protocol.spec.SPEED_PRESETS`.
         recipe: recipe preset name, or a mapping of recipe fields: the default for consumers that ask for none.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, loop_filter, samples_per_decode, sibling_spacing,
+        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, samples_per_decode, sibling_spacing,
             flow_method, flow_direction, flow_from, flow_margin_px, scene: defaults of the other spec fields, see
             :class:`v2v_protocol.spec.StreamSpec`.
         lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
@@ -69,7 +69,6 @@ class ServeConfig:
     shuffle: bool = True
     max_sequences_per_video: int = 10
     on_bad_video: str = "substitute"
-    loop_filter: str | None = None
     samples_per_decode: int | None = None
     sibling_spacing: int | None = None
     flow_method: str = "auto"

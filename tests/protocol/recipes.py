@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import RecipeError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.spec import LOOP_FILTERS, MOST_SAMPLES_PER_DECODE, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
 
 
 def _range(low: float, high: float) -> st.SearchStrategy[tuple[float, float]]:
@@ -77,6 +77,5 @@ specs = st.builds(
     shuffle=st.booleans(),
     max_sequences_per_video=st.integers(1, 1_000_000),
     on_bad_video=st.sampled_from(ON_BAD_VIDEO),
-    loop_filter=st.sampled_from(LOOP_FILTERS),
     samples_per_decode=st.integers(1, MOST_SAMPLES_PER_DECODE),
 )

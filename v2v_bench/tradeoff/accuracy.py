@@ -105,13 +105,12 @@ def accuracy(works: Mapping[str, tuple[Path, Sequence[Lease]]], reference: str) 
     return tallies
 
 
-def spurious(stills: Catalogue, crop_px: tuple[int, int], loop_filter: str) -> dict[float, float]:
+def spurious(stills: Catalogue, crop_px: tuple[int, int]) -> dict[float, float]:
     """Events of noise-free cameras on still scenes, per pixel and frame, by contrast threshold.
 
     Args:
         stills: the scenes.
         crop_px: height and width of the part that is simulated, in the middle.
-        loop_filter: how to decode.
     """
     events = dict.fromkeys(THRESHOLDS, 0.0)
     steps = 0
@@ -119,9 +118,7 @@ def spurious(stills: Catalogue, crop_px: tuple[int, int], loop_filter: str) -> d
     for number, video in enumerate(stills.videos):
         top, bottom = stills.rows.bounds(video.height_px)
         window = (top + (bottom - top - height) // 2, (video.width_px - width) // 2, height, width)
-        (clip,) = decode_cuts(
-            stills.path(video.id), stills.frame_index(video.id), 0, [Cut(video.frames, window)], loop_filter=loop_filter
-        )  # fmt: skip
+        (clip,) = decode_cuts(stills.path(video.id), stills.frame_index(video.id), 0, [Cut(video.frames, window)])
         steps += (len(clip.frames) - 1) * height * width
         for threshold in THRESHOLDS:
             made = simulate(clip.frames, threshold_pos=threshold, bins=1, seed=number, dtype="float32").voxels

@@ -27,7 +27,7 @@ _ERRORS: tuple[Column, ...] = (
     *((f"rising_share_at_{c:g}", f"rising {c:g}", "{:.2f}", 100) for c in (0.2,)),
 )
 _DECODINGS: tuple[Column, ...] = (
-    ("decoding", "per cent, at c", "{}", 1),
+    ("form", "per cent, at c", "{}", 1),
     *_ERRORS,
     *((f"events_on_still_at_{c:g}", f"still {c:g}", "{:.2f}", 1000) for c in (0.05, 0.2, 1)),
 )
@@ -115,7 +115,7 @@ def print_tables(records: Sequence[Record]) -> None:
     """What is measured, as four tables."""
     of = {kind: [r for r in records if r["measure"] == kind] for kind in ("setting", "scale", "other", "diversity")}
     ways = [record for record in of["setting"] if record["samples_per_decode"] == 1]
-    show([*ways, *({**record, "decoding": record["name"]} for record in of["scale"])], _DECODINGS)
+    show([*ways, *({**record, "form": record["name"]} for record in of["scale"])], _DECODINGS)
     print("L1: voxel error; still: events a pixel in 1000 frames of a still scene, no noise")
     print()
     show(of["setting"], _SETTINGS)
@@ -132,14 +132,14 @@ def plot(records: Sequence[Record], file: Path) -> None:
     where dominated."""
     shown = [record for record in records if record["measure"] == "setting"]
     scale = {record["name"]: record[ERROR_KEY] for record in records if record["measure"] == "scale"}
-    markers = dict(zip(dict.fromkeys(record["decoding"] for record in shown), _MARKERS, strict=False))
+    markers = dict(zip(dict.fromkeys(record["form"] for record in shown), _MARKERS, strict=False))
     with plots.panels(file, height_inches=5.5) as (axes,):
         for record in shown:
             color = _COLORS[record["samples_per_decode"]]
             axes.scatter(
                 record["samples_per_core_second"],
                 100 * record[ERROR_KEY],
-                marker=markers[record["decoding"]],
+                marker=markers[record["form"]],
                 facecolors=color if record["dominated_by"] is None else "none",
                 edgecolors=color,
                 s=40,

@@ -36,7 +36,6 @@ from v2v_bench.tradeoff.other import knobs
 from v2v_bench.tradeoff.report import ERROR_KEY, error_fields, name_dominated, other_records, plot, print_tables
 from v2v_bench.tradeoff.speed import Speed, Work, leases_of, making, measure
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation.clip import warm_up
 from v2v_server.system.process import keep_freed_memory
@@ -57,32 +56,23 @@ def measured(corpus: Mapping[str, Form], spec: StreamSpec, places: int, until: f
         until: reading of ``time.monotonic`` at which the timing ends.
     """
     chosen = settings([name for name in corpus if name != SOURCE])
-    decodings: dict[str, tuple[Path, tuple[Lease, ...]]] = {}
-    for setting in chosen:
-        if setting.decoding not in decodings:
-            clips = corpus[setting.form].clips
-            leases = leases_of(clips, dataclasses.replace(spec, loop_filter=setting.loop_filter), places)
-            decodings[setting.decoding] = clips.root, leases
-    say(f"comparing {len(decodings)} ways to decode")
-    tallies = accuracy(decodings, EXACT.decoding)
+    sources = {name: (form.clips.root, leases_of(form.clips, spec, places)) for name, form in corpus.items()}
+    say(f"comparing {len(sources)} forms of the corpus")
+    tallies = accuracy(sources, SOURCE)
     recipe = spec.recipe
     crop = recipe.crop_height_px, recipe.crop_width_px
-    still = {
-        setting.decoding: spurious(corpus[setting.form].stills, crop, setting.loop_filter)
-        for setting in chosen
-        if setting.samples_per_decode == 1
-    }
+    still = {name: spurious(form.stills, crop) for name, form in corpus.items()}
     say(f"timing {len(chosen)} settings")
     works: dict[str, Work] = {}
     for setting in chosen:
-        root, leases = decodings[setting.decoding]
+        root, leases = sources[setting.form]
         works[setting.name] = making(root, leases, setting.samples_per_decode)
     speeds = measure(works, until=until)
     exact = speeds[EXACT.name]
     records = [
         _record(setting, speeds[setting.name], exact, corpus)
-        | error_fields(tallies[setting.decoding])
-        | {f"events_on_still_at_{threshold:g}": rate for threshold, rate in still[setting.decoding].items()}
+        | error_fields(tallies[setting.form])
+        | {f"events_on_still_at_{threshold:g}": rate for threshold, rate in still[setting.form].items()}
         for setting in chosen
     ]
     name_dominated(records)
@@ -95,7 +85,6 @@ def _record(setting: Setting, speed: Speed, exact: Speed, corpus: Mapping[str, F
     return {
         "measure": "setting",
         "name": setting.name,
-        "decoding": setting.decoding,
         **dataclasses.asdict(setting),
         "samples_per_core_second": 1.0 / speed.fastest,
         "cpu_seconds_per_sample": speed.fastest,

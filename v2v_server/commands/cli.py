@@ -17,7 +17,6 @@ from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_protocol.spec import (
     FLOW_DIRECTIONS,
     FLOW_METHODS,
-    LOOP_FILTERS,
     ON_BAD_VIDEO,
     SCENES,
     SPEED_PRESETS,
@@ -157,7 +156,7 @@ def new_parser(name: str, description: str) -> argparse.ArgumentParser:
 
 _SPEC_FLAGS = (
     "preset", "voxel_dtype", "shuffle", "max_sequences_per_video", "on_bad_video",
-    "loop_filter", "samples_per_decode", "sibling_spacing",
+    "samples_per_decode", "sibling_spacing",
     "flow_method", "flow_direction", "flow_from", "flow_margin_px", "scene",
 )  # fmt: skip
 
@@ -177,7 +176,6 @@ def _add_spec(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-shuffle", dest="shuffle", action="store_false", default=None, help="catalogue order")
     parser.add_argument("--max-sequences-per-video", type=int, metavar="N", help="per epoch (default 10)")
     parser.add_argument("--on-bad-video", choices=ON_BAD_VIDEO, help="default substitute")
-    parser.add_argument("--loop-filter", choices=LOOP_FILTERS, help="how exactly to decode (default exact)")
     parser.add_argument("--samples-per-decode", type=int, metavar="K", help="samples made from each decoded clip (1)")
     parser.add_argument(
         "--sibling-spacing", type=int, metavar="S", help="how far apart those are (default: one batch of the consumer)"

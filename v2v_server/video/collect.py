@@ -38,7 +38,7 @@ class Task:
     """Which frames of a file are to be decoded.
 
     Attributes:
-        path, index, start, stride, loop_filter: see :func:`v2v_server.video.decode.decode_cuts`; the index is
+        path, index, start, stride: see :func:`v2v_server.video.decode.decode_cuts`; the index is
             that of the track.
         track: of the file.
     """
@@ -47,7 +47,6 @@ class Task:
     index: FrameIndex
     start: int
     stride: int
-    loop_filter: str
     track: int = 0
 
 

@@ -75,7 +75,6 @@ def decode_cuts(
     cuts: Sequence[Cut],
     *,
     stride: int = 1,
-    loop_filter: str = "exact",
 ) -> tuple[DecodedClip, ...]:
     """Several cuts of the frames from ``start`` on, from one pass of the decoder (one a tile, where there are tiles).
 
@@ -87,7 +86,6 @@ def decode_cuts(
         start: ordinal of the first frame, presentation order.
         cuts: at least one.
         stride: takes frames start, start + stride ...
-        loop_filter: one of ``v2v_protocol.spec.LOOP_FILTERS``.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
@@ -99,7 +97,7 @@ def decode_cuts(
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
     decode = _decode_tiles if index.tiles else _decode_track
-    taken, codec = decode(Task(os.fspath(path), index, start, stride, loop_filter), checked)
+    taken, codec = decode(Task(os.fspath(path), index, start, stride), checked)
     return tuple(
         DecodedClip(
             grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
@@ -171,7 +169,7 @@ def _decode_quickly(stack: Stack) -> bool:
     which = int(np.searchsorted(index.keyframes, task.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
     begin = int(index.pts[index.position(task.start, 1)])
-    with opened(task.path, task.loop_filter, task.track) as (container, stream):
+    with opened(task.path, task.track) as (container, stream):
         codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
@@ -194,7 +192,7 @@ def _decode_quickly(stack: Stack) -> bool:
 def _decode_plainly(stack: Stack) -> None:
     """Decode every frame from the beginning of the file."""
     task = stack.task
-    with opened(task.path, task.loop_filter, task.track) as (container, stream):
+    with opened(task.path, task.track) as (container, stream):
         try:
             _fill(stack, _decoded(stream, packets(container, stream)))
         except av.FFmpegError as error:

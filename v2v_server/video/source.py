@@ -44,14 +44,11 @@ _OPTIONS = {
     "max_streams": str(MOST_STREAMS),
     "max_pixels": str(LARGEST_PICTURE_PX),
 }
-_SKIP = {"skip-unreferenced": "noref", "skip": "all"}
 _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
 
 @contextmanager
-def opened(
-    path: str | os.PathLike[str], loop_filter: str = "exact", track: int = 0
-) -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened(path: str | os.PathLike[str], track: int = 0) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
     Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only. A file is opened by
@@ -59,7 +56,6 @@ def opened(
 
     Args:
         path: the file.
-        loop_filter: one of ``v2v_protocol.spec.LOOP_FILTERS``.
         track: which of the video tracks: a tile, see :mod:`v2v_server.video.tiles`.
 
     Raises:
@@ -97,8 +93,7 @@ def opened(
                 other.discard = type(other.discard).all  # the demuxer need not read it
         stream.thread_type = "NONE"
         decoder.thread_count = 1
-        filtering = {} if loop_filter == "exact" else {"skip_loop_filter": _SKIP[loop_filter]}
-        decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX), **filtering}
+        decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX)}
         yield container, stream
     finally:
         container.close()

@@ -117,7 +117,6 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decode
             lease.start_frame,
             [draft.cut for draft in drafts],
             stride=spec.recipe.frame_stride,
-            loop_filter=spec.loop_filter,
         )
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.

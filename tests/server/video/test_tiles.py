@@ -226,9 +226,9 @@ def test_only_the_tiles_that_are_touched_are_opened(
 ) -> None:
     read, opened_before = [], decode.opened
 
-    def counting(path: str, loop_filter: str, track: int):  # type: ignore[no-untyped-def]
+    def counting(path: str, track: int):  # type: ignore[no-untyped-def]
         read.append(track)
-        return opened_before(path, loop_filter, track)
+        return opened_before(path, track)
 
     monkeypatch.setattr(decode, "opened", counting)
     for path, left, width, tracks in (
