@@ -323,6 +323,13 @@ def _snapshot(
             f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
             "them; run it once for all to have them served",
         ]
+    if woven := [record.id for record in used if record.interlaced]:
+        notes = [
+            *notes,
+            f"{len(woven)} videos are interlaced ({woven[0]}): their frames are served as they are stored, two fields "
+            "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
+            "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
+        ]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     digest = _digest(rows, videos)

@@ -13,11 +13,13 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
 
 _BUSY_SECONDS = 30.0
-_COLUMNS = "id, size_bytes, mtime_ns, fingerprint, frames, width_px, height_px, frames_per_second, codec, problem"
+_COLUMNS = (
+    "id, size_bytes, mtime_ns, fingerprint, frames, width_px, height_px, frames_per_second, codec, interlaced, problem"
+)
 _TABLE = """
 CREATE TABLE video (
     id TEXT PRIMARY KEY,
@@ -29,6 +31,7 @@ CREATE TABLE video (
     height_px INTEGER NOT NULL,
     frames_per_second REAL,
     codec TEXT NOT NULL,
+    interlaced INTEGER NOT NULL,
     problem TEXT,
     frame_index BLOB
 )"""
@@ -52,8 +55,8 @@ class Record:
         id: relative POSIX path.
         size_bytes, mtime_ns: of the file when it was probed.
         fingerprint: size and hash of head and tail.
-        frames, width_px, height_px, frames_per_second, codec: see :class:`v2v_server.video.probe.VideoFacts`;
-            frames_per_second is None where unknown.
+        frames, width_px, height_px, frames_per_second, codec, interlaced: see
+            :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
         problem: why the file cannot be used; None if it can.
         frame_index: ``FrameIndex.to_bytes()``; None with a problem, and in what :meth:`Store.records` returns.
     """
@@ -67,6 +70,7 @@ class Record:
     height_px: int = 0
     frames_per_second: float | None = None
     codec: str = ""
+    interlaced: bool = False
     problem: str | None = None
     frame_index: bytes | None = None
 
@@ -162,7 +166,7 @@ class Store:
             sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
         """
         rows = [tuple(getattr(record, name) for name in Record.__slots__) for record in records]
-        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({'?, ' * 10}?)", rows)
+        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({'?, ' * 11}?)", rows)
 
     def forget(self, ids: Iterable[str]) -> None:
         """Drop records, in one transaction.

@@ -54,6 +54,7 @@ def examine(root: str, id: str) -> Record:
         height_px=facts.height_px,
         frames_per_second=None if math.isnan(facts.frames_per_second) else facts.frames_per_second,
         codec=facts.codec,
+        interlaced=facts.interlaced,
         frame_index=facts.index.to_bytes(),
     )
 

@@ -28,8 +28,8 @@ from av.video.stream import VideoStream
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.collect import Cut, Stack, Task, window_of
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
-from v2v_server.video.h264 import is_unreferenced, length_bytes
 from v2v_server.video.orientation import Window
+from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
 from v2v_server.video.tiles import Part, parts
 

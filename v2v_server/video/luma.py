@@ -7,8 +7,9 @@ No colour conversion takes place; where a picture has a luma plane, that plane i
 * full ("pc", "jpeg") range:            grey = Y at 8 bit, round(Y 255 / (2**b - 1)) at b bit.
 
 A file that does not state its range has full range if its pixel format is ``yuvj*`` or ``gray*``, else limited range.
-For 8-bit formats this equals swscale's conversion to ``gray`` level for level. It is not the grey of OpenCV, which goes
-through BGR and rounds and clips on the way: the two differ by 0 to 2 levels mostly.
+Conversions that go through red, green and blue give another grey: swscale's to ``gray`` is this one for 8-bit clips
+that state BT.601 or nothing, and for BT.709 it differs, by up to tens of levels in coloured places, since FFmpeg 8;
+OpenCV's, from BGR, rounds and clips on the way. What a file stores is the same under every version of every library.
 
 Formats without a luma plane (RGB, palettes, packed YUV) go through swscale's ``gray``.
 """

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+import time
+from array import array
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import av
@@ -16,11 +18,15 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
-from v2v_server.video.hidden import is_hidden
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
+from v2v_server.video.packets import Fields, is_hidden
 from v2v_server.video.source import opened, packets, pictures, reason, time_base
 from v2v_server.video.tiles import tiles_of
+
+LONGEST_CPU_SECONDS = 1200.0
+"""Processor time that listing the frames of a file may take: of the longest films it is seconds, and some minutes where
+they have to be decoded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +41,8 @@ class VideoFacts:
         frames_per_second: average rate: from the first and last time stamps, else the container's; NaN if unknown.
         rotation_degrees: of the display matrix, counter-clockwise as FFmpeg reports it (-90 .. 180).
         full_range: whether luma spans 0 .. 255 (see :mod:`v2v_server.video.luma`).
+        interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
+            taken at different times.
         index: the frames.
     """
 
@@ -46,6 +54,7 @@ class VideoFacts:
     frames_per_second: float
     rotation_degrees: int
     full_range: bool
+    interlaced: bool
     index: FrameIndex
 
 
@@ -53,8 +62,8 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     """Open, decode the first frame, and walk over all packets.
 
     Frames that the decoder does not deliver are not counted: hidden reference frames, frames outside the edit list,
-    and those in front of the first one that can be decoded in a file cut in mid-GOP. A file whose time stamps cannot
-    be trusted is decoded once to be counted, as far as it decodes.
+    and those in front of the first one that can be decoded in a file cut in mid-GOP. Two fields are one frame. A file
+    whose time stamps cannot be trusted is decoded once to be counted, as far as it decodes.
 
     Raises:
         VideoError: the file does not open, has no video track, or not one frame of it decodes.
@@ -83,8 +92,8 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         index = replace(index, tiles=tiles)
     if index is None:
         index = unseekable(_count_by_decoding(name), base, height, width)
-    if not 1 <= len(index) <= LARGEST_FRAMES:
-        raise VideoError(name, None, f"holds {len(index)} frames; this program serves 1 .. {LARGEST_FRAMES}")
+    if not len(index):
+        raise VideoError(name, None, "holds no frame that decodes")
     return VideoFacts(
         frames=len(index),
         height_px=height,
@@ -94,35 +103,63 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         frames_per_second=_rate(index, rate),
         rotation_degrees=head.rotation,
         full_range=LumaFormat.of(head).full_range,
+        interlaced=head.interlaced_frame or shown.fields,
         index=index,
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Shown:
-    """A packet that gives one frame."""
+    """The packets that begin a frame, in stored order: 17 bytes each. :data:`NO_TIMESTAMP` where there is none."""
 
-    pts: int | None
-    dts: int | None
-    keyframe: bool
+    pts: array[int] = field(default_factory=lambda: array("q"))
+    dts: array[int] = field(default_factory=lambda: array("q"))
+    is_keyframe: bytearray = field(default_factory=bytearray)
+    fields: bool = False
+
+    def add(self, packet: Packet[VideoStream]) -> None:
+        self.pts.append(NO_TIMESTAMP if packet.pts is None else packet.pts)
+        self.dts.append(NO_TIMESTAMP if packet.dts is None else packet.dts)
+        self.is_keyframe.append(packet.is_keyframe)
 
 
-def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[VideoFrame, list[_Shown]]:
-    """The first frame that decodes without error, and every packet that gives a frame, in stored order."""
+def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[VideoFrame, _Shown]:
+    """The first frame that decodes without error, and every packet that begins a frame."""
     codec = stream.codec_context.codec.canonical_name
+    fields = Fields(stream.codec_context.extradata) if codec == "h264" else None
     head: VideoFrame | None = None
     failure: av.FFmpegError | None = None
-    shown: list[_Shown] = []
+    shown, effort = _Shown(), _Effort(name)
     for packet in packets(container, stream):
+        effort.check(len(shown.pts))
         if head is None:
             head, failure = _first_sound(stream, packet, failure)
-        if not packet.is_discard and not is_hidden(codec, memoryview(packet)):
-            shown.append(_Shown(packet.pts, packet.dts, packet.is_keyframe))
+        content = memoryview(packet)
+        begins = not is_hidden(codec, content) if fields is None else fields.begins_frame(content)
+        if begins and not packet.is_discard:
+            shown.add(packet)
     if head is None:
         head, failure = _first_sound(stream, None, failure)
     if head is None:
         raise VideoError(name, 0, f"no frame decodes: {reason(failure) if failure else 'its track is empty'}")
+    shown.fields = fields is not None and fields.seen
     return head, shown
+
+
+class _Effort:
+    """Gives up on a file that would never end, or whose list of frames would fill the memory."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._until = name, time.process_time() + LONGEST_CPU_SECONDS
+
+    def check(self, frames: int) -> None:
+        """Raises VideoError where there is more than may be, after so many frames."""
+        if frames > LARGEST_FRAMES:
+            why = f"holds more than {LARGEST_FRAMES} frames, the most that this program serves"
+            raise VideoError(self._name, None, why)
+        if time.process_time() > self._until:
+            why = f"takes more than {LONGEST_CPU_SECONDS:.0f} s of processor time to list its frames"
+            raise VideoError(self._name, None, why)
 
 
 def _first_sound(
@@ -145,22 +182,23 @@ def _reorders_without_pts(container: InputContainer, stream: VideoStream) -> boo
     return stores_none and bool(stream.codec_context.has_b_frames)
 
 
-def _index(shown: list[_Shown], head: VideoFrame, base: tuple[int, int], size: tuple[int, int]) -> FrameIndex | None:
+def _index(shown: _Shown, head: VideoFrame, base: tuple[int, int], size: tuple[int, int]) -> FrameIndex | None:
     """The index by presentation time; None when the time stamps do not name the frames."""
-    if head.pts is None or any(packet.pts is None for packet in shown):
+    pts = np.array(shown.pts, np.int64)
+    if head.pts is None or np.any(pts == NO_TIMESTAMP):
         return None
     # The decoder delivers in order of presentation: what lies before its first frame never comes.
-    kept = sorted((p for p in shown if p.pts is not None and p.pts >= head.pts), key=lambda p: p.pts or 0)
-    pts = np.array([p.pts for p in kept], np.int64)
+    order = np.argsort(pts, kind="stable")
+    order = order[pts[order] >= head.pts]
+    pts = pts[order]
     if not len(pts) or pts[0] != head.pts or np.any(pts[1:] == pts[:-1]):
         return None
-    keys = [ordinal for ordinal, packet in enumerate(kept) if packet.keyframe]
-    dts = [kept[ordinal].dts for ordinal in keys]
+    keys = np.flatnonzero(np.frombuffer(shown.is_keyframe, np.uint8)[order])
     return FrameIndex(
         first=0,
         pts=pts,
-        keyframes=np.array(keys, np.int64),
-        keyframe_dts=np.array([NO_TIMESTAMP if value is None else value for value in dts], np.int64),
+        keyframes=keys.astype(np.int64),
+        keyframe_dts=np.array(shown.dts, np.int64)[order[keys]],
         time_base=base,
         height_px=size[0],
         width_px=size[1],
@@ -170,10 +208,11 @@ def _index(shown: list[_Shown], head: VideoFrame, base: tuple[int, int], size: t
 
 def _count_by_decoding(name: str) -> int:
     """How many sound frames the decoder delivers before the first error."""
-    count = 0
+    count, effort = 0, _Effort(name)
     with opened(name) as (container, stream):
         try:
             for frame in pictures(container, stream):
+                effort.check(count)
                 if frame.is_corrupt:
                     break
                 count += 1

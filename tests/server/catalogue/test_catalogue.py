@@ -257,6 +257,15 @@ def test_lists(corpus: Path, opener: Opener) -> None:
     assert opener.probed == [3, 1, 1, 1]
 
 
+def test_interlaced_videos_are_said_at_each_start(corpus: Path, opener: Opener) -> None:
+    write_clip(corpus / "fields.mp4", panned_luma(30, 64, 64), options={"x264-params": "interlaced=1"})
+    for catalogue in (opener(corpus), opener(corpus)):
+        assert len(catalogue.videos) == 4
+        (note,) = catalogue.notes
+        assert note.startswith("1 videos are interlaced (fields.mp4): their frames are served as they are stored")
+    assert opener.probed == [4, 0]
+
+
 def test_a_single_video(corpus: Path, opener: Opener) -> None:
     catalogue = opener(corpus / "a.mp4")
     assert (ids(catalogue), catalogue.root) == (["a.mp4"], corpus.resolve())

@@ -7,9 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange
+from av.video.reformatter import ColorRange, Colorspace
 
-from v2v_server.video.luma import LumaFormat, range_table, stretch
+from v2v_server.video.luma import LumaFormat, luma_plane, range_table, stretch
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])
@@ -33,6 +33,16 @@ def test_limited_range_equals_swscale_for_every_value() -> None:
     frame.color_range = ColorRange.MPEG
     grey = frame.reformat(format="gray").to_ndarray()
     np.testing.assert_array_equal(range_table(8, False)[luma], grey)
+
+
+def test_the_colours_beside_it_and_the_matrix_that_a_file_states_change_nothing() -> None:
+    """They would in a conversion by way of red, green and blue."""
+    luma = np.tile(np.arange(16, 236, dtype=np.uint8), (16, 1))
+    chroma = [np.full((4, 220), value, np.uint8) for value in (90, 200)]
+    frame = VideoFrame.from_ndarray(np.concatenate([luma, *chroma]), format="yuv420p")
+    frame.color_range, frame.colorspace = ColorRange.MPEG, Colorspace.ITU709
+    np.testing.assert_array_equal(luma_plane(frame, LumaFormat.of(frame)), luma)
+    assert np.any(frame.reformat(format="gray").to_ndarray() != range_table(8, False)[luma])
 
 
 def test_stretching_is_the_table_for_every_value_in_every_layout() -> None:

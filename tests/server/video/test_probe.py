@@ -12,7 +12,7 @@ from av.stream import Disposition
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import VideoError
 from v2v_server.video.decode import decode_luma
-from v2v_server.video.hidden import is_hidden
+from v2v_server.video.packets import is_hidden
 from v2v_server.video.probe import probe
 
 

@@ -1,0 +1,243 @@
+"""What a packet says without being decoded: whether it gives a frame of its own, and whether anything refers to it.
+
+VP8 and VP9 hide alternate reference frames, which a decoder swallows without output. H.264 may store a picture as two
+fields (PAFF, as AVCHD cameras do), each in a packet of its own, of which a decoder makes one frame. AV1 puts what it
+hides into the unit of a shown frame; HEVC's fields are pictures of their own; of MPEG-2 and VC-1 libavformat puts both
+fields into one packet. Sources: RFC 6386, 9.1; VP9 bitstream specification, 6.2 and annex B; ITU-T H.264, 7.3 and 7.4.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+_SLICE, _IDR, _SPS, _PPS = 1, 5, 7, 8
+_NO_PICTURE = frozenset({6, 9, 12})  # supplemental information, access unit delimiter, filler
+_CHROMA_PROFILES = frozenset({44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244})
+_START_CODE = re.compile(b"\0\0\1")
+_HEADER_BYTES = 32
+_LARGEST_SPS_BYTES = 512
+
+_Picture = tuple[int, int]
+"""(frame_num, structure) of a coded picture: 0 a frame, 1 a top, 2 a bottom field."""
+
+
+def is_hidden(codec: str, packet: memoryview) -> bool:
+    """Whether a packet of VP8 or VP9 decodes to nothing; False of other codecs."""
+    if codec == "vp8":
+        return not packet[0] & 0x10  # show_frame is bit 4 of the frame tag
+    if codec == "vp9":
+        return not _vp9_shown(packet)
+    return False
+
+
+def _vp9_shown(packet: memoryview) -> bool:
+    if packet[-1] & 0xE0 == 0xC0:  # a superframe's index ends the packet; one of its frames is shown
+        return True
+    # Bits of the uncompressed header: marker (2), profile (2), reserved (profile 3 only), show_existing, type, show.
+    first = packet[0]
+    at = 5 if first & 0x30 == 0x30 else 4
+    show_existing, show = first >> (7 - at) & 1, first >> (5 - at) & 1
+    return bool(show_existing or show)
+
+
+def length_bytes(extradata: bytes | None) -> int:
+    """Size of the length field in front of each NAL unit; 0 if the stream is not in AVC form (ISO/IEC 14496-15,
+    5.3.3)."""
+    return (extradata[4] & 3) + 1 if extradata and len(extradata) > 6 and extradata[0] == 1 else 0
+
+
+def is_unreferenced(packet: memoryview, length_bytes: int) -> bool:
+    """Whether the packet is well formed, in AVC form, and holds slices of non-reference pictures only (nal_ref_idc 0,
+    7.4.1), so that it need not be decoded on the way to a later frame.
+
+    The decoder's own option for this (``skip_frame``) also turns damaged packets into skipped ones without a word.
+    """
+    at, slices = 0, 0
+    while at + length_bytes < len(packet):
+        size = int.from_bytes(packet[at : at + length_bytes], "big")
+        header = packet[at + length_bytes]
+        kind = header & 0x1F
+        if kind == _SLICE and not header & 0xE0:  # forbidden_zero_bit and nal_ref_idc
+            slices += 1
+        elif kind not in _NO_PICTURE:
+            return False
+        at += length_bytes + size
+    return slices > 0 and at == len(packet)
+
+
+class Fields:
+    """Tells the second field of an H.264 picture from what begins a frame.
+
+    Attributes:
+        seen: whether any field has been met.
+
+    Args:
+        extradata: of the track: parameter sets in AVC form or behind start codes.
+    """
+
+    def __init__(self, extradata: bytes | None) -> None:
+        self.seen = False
+        self._length_bytes = length_bytes(extradata)
+        self._sps: dict[int, tuple[int, bool, bool]] = {}  # bits of frame_num, colour planes apart, fields allowed
+        self._pps: dict[int, int] = {}  # which SPS
+        self._open: _Picture | None = None  # a field that waits for its other one
+        if extradata and self._length_bytes:
+            self._read_configuration(memoryview(extradata))
+        elif extradata:
+            for nal in _behind_start_codes(memoryview(extradata)):
+                self._learn(nal)
+
+    def begins_frame(self, packet: memoryview) -> bool:
+        """Whether the packet's first picture is not the second field of a frame that an earlier packet began."""
+        pictures = self._pictures(packet)
+        first = next(pictures, None)
+        if first is None or not first[1]:
+            self._open = None
+            return True
+        self.seen = True
+        begins = not (self._open and _complementary(self._open, first))
+        self._open = first if begins else None
+        for picture in pictures:  # both fields may share a packet
+            if self._open and _complementary(self._open, picture):
+                self._open = None
+        return begins
+
+    def _pictures(self, packet: memoryview) -> Iterator[_Picture]:
+        nals = _behind_lengths(packet, self._length_bytes) if self._length_bytes else _behind_start_codes(packet)
+        for nal in nals:
+            if (kind := nal[0] & 0x1F) in (_SPS, _PPS):
+                self._learn(nal)
+            elif kind in (_SLICE, _IDR):
+                if not any(fields for _, _, fields in self._sps.values()):
+                    return
+                try:
+                    picture = self._picture(_Bits(nal[1:_HEADER_BYTES]))
+                except (IndexError, KeyError):
+                    return  # the decoder has the last word on what is damaged
+                yield picture
+                if not picture[1]:
+                    return
+
+    def _picture(self, bits: _Bits) -> _Picture:
+        """7.3.3, up to bottom_field_flag."""
+        bits.ue()
+        bits.ue()
+        frame_num_bits, planes_apart, fields = self._sps[self._pps[bits.ue()]]
+        if planes_apart:
+            bits.u(2)
+        frame_num = bits.u(frame_num_bits)
+        structure = 1 + bits.u(1) if fields and bits.u(1) else 0
+        return frame_num, structure
+
+    def _read_configuration(self, data: memoryview) -> None:
+        """The AVCDecoderConfigurationRecord: so many SPS behind their lengths of two bytes, then PPS alike."""
+        at = 5
+        for mask in (0x1F, 0xFF):
+            if at >= len(data):
+                return
+            count, at = data[at] & mask, at + 1
+            for _ in range(count):
+                size = int.from_bytes(data[at : at + 2], "big")
+                if size:
+                    self._learn(data[at + 2 : at + 2 + size])
+                at += 2 + size
+
+    def _learn(self, nal: memoryview) -> None:
+        try:
+            kind, bits = nal[0] & 0x1F, _Bits(nal[1:_LARGEST_SPS_BYTES])
+            if kind == _SPS:
+                id, sps = _sequence_parameters(bits)
+                self._sps[id] = sps
+            elif kind == _PPS:
+                id = bits.ue()
+                self._pps[id] = bits.ue()
+        except IndexError:
+            return  # damaged: see _pictures
+
+
+def _complementary(first: _Picture, second: _Picture) -> bool:
+    """7.4.1.2.4: fields of opposite parity and the same frame_num make up a frame."""
+    return {first[1], second[1]} == {1, 2} and first[0] == second[0]
+
+
+def _sequence_parameters(bits: _Bits) -> tuple[int, tuple[int, bool, bool]]:
+    """(id, (bits of frame_num, whether colour planes are apart, whether pictures may be fields)): 7.3.2.1.1."""
+    profile = bits.u(8)
+    bits.u(16)
+    id, planes_apart = bits.ue(), False
+    if profile in _CHROMA_PROFILES:
+        chroma = bits.ue()
+        planes_apart = chroma == 3 and bool(bits.u(1))
+        bits.ue()
+        bits.ue()
+        bits.u(1)
+        if bits.u(1):
+            for number in range(12 if chroma == 3 else 8):
+                if bits.u(1):
+                    _skip_scaling_list(bits, 16 if number < 6 else 64)
+    frame_num_bits = bits.ue() + 4
+    order = bits.ue()
+    if order == 0:
+        bits.ue()
+    elif order == 1:
+        bits.u(1)
+        bits.ue()
+        bits.ue()
+        for _ in range(min(bits.ue(), 255)):
+            bits.ue()
+    bits.ue()
+    bits.u(1)
+    bits.ue()
+    bits.ue()
+    return id, (frame_num_bits, planes_apart, not bits.u(1))
+
+
+def _skip_scaling_list(bits: _Bits, size: int) -> None:
+    last = following = 8
+    for _ in range(size):
+        if following:
+            code = bits.ue()
+            following = (last + ((code + 1) // 2 if code % 2 else -(code // 2))) % 256
+        last = following or last
+
+
+class _Bits:
+    """Reads the bits of a NAL unit without the bytes that keep start codes out (7.4.1.1). IndexError at the end, and at
+    a code that no sound stream has."""
+
+    def __init__(self, data: memoryview) -> None:
+        content = bytes(data).replace(b"\0\0\3", b"\0\0")
+        self._value, self._left = int.from_bytes(content, "big"), 8 * len(content)
+
+    def u(self, bits: int) -> int:
+        """The next bits as a whole number."""
+        self._left -= bits
+        if self._left < 0:
+            raise IndexError
+        return self._value >> self._left & ((1 << bits) - 1)
+
+    def ue(self) -> int:
+        """The next Exp-Golomb code, 9.1."""
+        zeros = 0
+        while not self.u(1):
+            zeros += 1
+            if zeros > 32:
+                raise IndexError
+        return (1 << zeros) - 1 + self.u(zeros)
+
+
+def _behind_lengths(packet: memoryview, length_bytes: int) -> Iterator[memoryview]:
+    at = 0
+    while at + length_bytes < len(packet):
+        size = int.from_bytes(packet[at : at + length_bytes], "big")
+        if size:
+            yield packet[at + length_bytes : at + length_bytes + size]
+        at += length_bytes + size
+
+
+def _behind_start_codes(packet: memoryview) -> Iterator[memoryview]:
+    """Each from behind its start code to the end of the packet: what is read of it ends by itself."""
+    for code in _START_CODE.finditer(packet):
+        if code.end() < len(packet):
+            yield packet[code.end() :]
