@@ -49,6 +49,8 @@ LARGEST_SIDE_PX = 16_384
 LARGEST_SCALE = 100.0
 EFFECTS = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
+TIME_UNITS = ("Hz", "s")
+"""An effect in one of these needs the time between frames."""
 _LARGEST_FRAMES = 1_000_001
 SMALLEST_THRESHOLD_SHARE = 0.25
 """No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
@@ -154,7 +156,7 @@ class Recipe:
     def timed_effects(self) -> bool:
         """True where a draw may switch on an effect that is stated in Hz or seconds."""
         return any(
-            getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in ("Hz", "s")
+            getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import Recipe, effect_settings
 
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
@@ -55,39 +55,6 @@ class SampleId:
 
 
 @dataclass(frozen=True, slots=True)
-class Effects:
-    """What a camera does beyond the paper's pixel model, one draw; zero is off. Equations: ``docs/effects.md``.
-
-    Attributes:
-        threshold_mismatch_sigma: standard deviation of a pixel's thresholds, as a share of the nominal ones.
-        shot_noise_hz: events a second of a black pixel, both polarities together.
-        leak_hz: positive events a second of every pixel.
-        refractory_seconds: how long a pixel is blind after an event.
-        photoreceptor_hz: corner frequency of a white pixel's low-pass; 0.0 for none.
-        dead_pixel_count: pixels of the crop that never fire.
-    """
-
-    threshold_mismatch_sigma: float = 0.0
-    shot_noise_hz: float = 0.0
-    leak_hz: float = 0.0
-    refractory_seconds: float = 0.0
-    photoreceptor_hz: float = 0.0
-    dead_pixel_count: int = 0
-
-    @property
-    def need_seconds(self) -> bool:
-        """True where the time between frames has to be known."""
-        return any((self.shot_noise_hz, self.leak_hz, self.refractory_seconds, self.photoreceptor_hz))
-
-    def __bool__(self) -> bool:
-        """True where any effect is on."""
-        return self.need_seconds or any((self.threshold_mismatch_sigma, self.dead_pixel_count))
-
-
-NO_EFFECTS = Effects()
-
-
-@dataclass(frozen=True, slots=True)
 class SampleParams:
     """One draw from a recipe.
 
@@ -102,7 +69,8 @@ class SampleParams:
         flip: True mirrors left and right.
         contrast: the degrade scale s, or 0.0 when the picture is left alone.
         noise_key: four 32-bit words that key every per-pixel random number of this sample.
-        effects: what the camera does beyond the paper's pixel model.
+        effects: what the camera does beyond the paper's pixel model: the values drawn for those fields of the recipe
+            that switch an effect on; empty for the paper's pixel.
     """
 
     threshold_pos: float
@@ -117,7 +85,7 @@ class SampleParams:
     flip: bool
     contrast: float
     noise_key: tuple[int, int, int, int]
-    effects: Effects = NO_EFFECTS
+    effects: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
         """Which decoded frame each position of the clip shows.
@@ -134,9 +102,8 @@ class SampleParams:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for the provenance; ``effects`` only where there are any."""
         values = _fields(self)
-        del values["effects"]
-        if self.effects:
-            values["effects"] = _fields(self.effects)
+        if not self.effects:
+            del values["effects"]
         return values
 
 
@@ -210,14 +177,17 @@ class Provenance:
             params = dict(rest.pop("params"))
             params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
-            params["effects"] = Effects(**params.get("effects", {}))
+            known = effect_settings()
+            params["effects"] = {
+                name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()
+            }
             return cls(
                 id=SampleId(**rest.pop("id")),
                 refusals=tuple(Refusal(**item) for item in rest.pop("refusals")),
                 params=SampleParams(**params),
                 **rest,
             )
-        except (KeyError, TypeError, ValueError, OverflowError, UsageError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError, UsageError) as error:
             raise ProtocolError(f"provenance of a sample does not fit its form: {error}") from error
 
 

@@ -65,6 +65,11 @@ class Setting:
         unit = f" {self.unit}" if self.unit else ""
         return f"{plain} from {_limit(self.low)} to {_limit(self.high)}{unit}" + (", or 0 for off" if self.off else "")
 
+    @property
+    def single(self) -> Setting:
+        """Of a range: one number drawn from it."""
+        return dataclasses.replace(self, kind="number")
+
     def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:
         """``value`` in the field's own type: a float for a number, two for a range.
 

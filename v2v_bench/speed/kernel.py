@@ -39,7 +39,7 @@ STEPS, SIDE_PX = 200, 128
 HOT_PIXELS = 16
 EFFECTS: dict[str, Any] = {
     "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 5.0, "leak_hz": 0.1, "refractory_seconds": 5e-4,
-    "photoreceptor_hz": 100.0, "dead_pixel_count": 2, "frames_per_second": 25.0,
+    "photoreceptor_hz": 100.0, "dead_pixel_share": 2 / 128**2, "frames_per_second": 25.0,
 }  # fmt: skip
 RUNS_PER_TURN = {"released": 1, "kernel": 30, "kernel_without_noise": 30, "kernel_all_effects": 10}
 CONTENDERS = tuple(RUNS_PER_TURN)

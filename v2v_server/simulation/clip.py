@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe, most_events, pixel_thresholds
-from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
+from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.settings import require_known
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.effect_pixel import simulate_pixels_with_effects
-from v2v_server.simulation.effects import Prepared, prepare
+from v2v_server.simulation.effects import prepare
+from v2v_server.simulation.effects.kernel import simulate_pixels_with_effects
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
-from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_effects, check_thresholds, choose, noise_sum
+from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
 
 
@@ -52,12 +54,7 @@ def simulate(
     dtype: str = "int8",
     precision: str = AUTO,
     frames_per_second: float | None = None,
-    threshold_mismatch_sigma: float = 0.0,
-    shot_noise_hz: float = 0.0,
-    leak_hz: float = 0.0,
-    refractory_seconds: float = 0.0,
-    photoreceptor_hz: float = 0.0,
-    dead_pixel_count: int = 0,
+    **effects: float,
 ) -> Voxels:
     """Simulate an event camera that watches a clip.
 
@@ -76,8 +73,8 @@ def simulate(
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
             below half a threshold (``precision.py``).
         frames_per_second: of the frames; needed for an effect in Hz or seconds.
-        threshold_mismatch_sigma, shot_noise_hz, leak_hz, refractory_seconds, photoreceptor_hz, dead_pixel_count:
-            effects beyond the paper's model, see ``v2v_protocol.sample.Effects``; zero is off.
+        effects: values for what a camera does beyond the paper's model, by the recipe's names (``leak_hz=0.1``);
+            zero is off.
 
     Returns:
         voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins.
@@ -90,13 +87,12 @@ def simulate(
         raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give uint8 [n, H, W]")
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
-    effects = Effects(
-        threshold_mismatch_sigma, shot_noise_hz, leak_hz, refractory_seconds, photoreceptor_hz, dead_pixel_count
-    )
-    check_effects(effects, frames[0].size if len(frames) else 0)
+    known = effect_settings()
+    require_known(effects, known, "effect")
+    effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name])) > 0.0}
     if frames_per_second is not None:
         _check_number("frames_per_second", frames_per_second, positive=True)
-    elif effects.need_seconds:
+    elif any(known[name].unit in TIME_UNITS for name in effects):
         raise UsageError("frames_per_second is missing: effects in Hz or seconds need the time between frames")
     return _simulate_array(
         frames, (gamma, log_eps), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
@@ -185,7 +181,7 @@ def simulate_clip(
     real = choose(AUTO, _most_events(params, _log_ends(*intensity), noise_durations, step_seconds))
     prepared = None
     if params.effects:
-        prepared = prepare(params, intensity, step_seconds, frames[0].size, real, _compiled_words)
+        prepared = _prepared(params, intensity, step_seconds, frames[0].size, real)
     return _run(
         frames, _table(*intensity, real), source_index, params, noise_durations,
         recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared, out=out,
@@ -202,8 +198,7 @@ def warm_up() -> None:
     params = _params(0.2, 0.2, 0.1, 1, 1.0, 0)
     for dtype in VOXEL_DTYPES:
         _run(frames, table, np.arange(2), params, steps, 1, 1, dtype)
-    params = replace(params, effects=Effects(shot_noise_hz=1.0))
-    prepared = prepare(params, (2.2, 1e-3), steps, 1, np.float32, _compiled_words)
+    prepared = _prepared(params, (2.2, 1e-3), steps, 1, np.float32)
     _run(frames, table, np.arange(2), params, steps, 1, 1, "int8", prepared=prepared)
 
 
@@ -221,7 +216,7 @@ def _simulate_array(
     seed: int,
     dtype: str,
     precision: str,
-    effects: Effects = NO_EFFECTS,
+    effects: Mapping[str, float] = MappingProxyType({}),
     frame_seconds: float = 1.0,
 ) -> Voxels:
     """``intensity``: gamma and log_eps of grey levels, None where the frames are log intensities (without effects)."""
@@ -257,7 +252,7 @@ def _simulate_array(
     else:
         table = _table(*intensity, real)
         if effects:
-            prepared = prepare(params, intensity, step_seconds, height * width, real, _compiled_words)
+            prepared = _prepared(params, intensity, step_seconds, height * width, real)
     return _run(
         frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual, prepared
     )
@@ -274,9 +269,8 @@ def _most_events(
     noise_total = noise_sum(params.noise_sigma, hot_sigma, noise_durations)
     if not params.effects:
         return most_events(len(noise_durations), log_ends, thresholds, noise_total)
-    effects = params.effects
-    thresholds = pixel_thresholds(min(thresholds), max(thresholds), effects.threshold_mismatch_sigma)
-    noise_total += effects.leak_hz * thresholds[1] * math.fsum(step_seconds)
+    thresholds = pixel_thresholds(min(thresholds), max(thresholds), params.effects.get("threshold_mismatch_sigma", 0.0))
+    noise_total += params.effects.get("leak_hz", 0.0) * thresholds[1] * math.fsum(step_seconds)
     return EFFECTS_MARGIN * most_events(len(noise_durations), log_ends, thresholds, noise_total)
 
 
@@ -296,7 +290,7 @@ def _run(
     frames_per_bin: int,
     dtype: str,
     start_residual: float | None = None,
-    prepared: Prepared | None = None,
+    prepared: tuple[Any, ...] | None = None,
     out: npt.NDArray[Any] | None = None,
 ) -> Voxels:
     """``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: None without effects."""
@@ -321,7 +315,7 @@ def _run(
     limit, stored = real(LARGEST_COUNT[dtype]), voxels.reshape(steps // frames_per_bin, pixels)
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
     if prepared is not None:
-        sigma = params.effects.threshold_mismatch_sigma
+        sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
         smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
         saturated = simulate_pixels_with_effects(
             *shared,
@@ -333,7 +327,7 @@ def _run(
             frames_per_bin,
             limit,
             stored,
-            *prepared,
+            prepared,
         )
         return Voxels(voxels, int(saturated))
     if start_residual is None:
@@ -365,7 +359,7 @@ def _params(
     hot_count: int,
     hot_sigma: float,
     seed: int,
-    effects: Effects = NO_EFFECTS,
+    effects: Mapping[str, float] = MappingProxyType({}),
 ) -> SampleParams:
     """A camera without a view."""
     return SampleParams(
@@ -381,8 +375,18 @@ def _params(
         flip=False,
         contrast=0.0,
         noise_key=noise_key_of_seed(seed),
-        effects=effects,
+        effects=dict(effects),
     )
+
+
+def _prepared(
+    params: SampleParams,
+    intensity: tuple[float, float],
+    step_seconds: npt.NDArray[np.float64],
+    pixels: int,
+    real: type[np.floating[Any]],
+) -> tuple[Any, ...]:
+    return prepare(params.effects, params.noise_key, intensity, step_seconds, pixels, real, _compiled_words)
 
 
 def _table(gamma: float, log_eps: float, real: type[np.floating[Any]]) -> npt.NDArray[Any]:

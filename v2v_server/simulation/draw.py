@@ -22,8 +22,8 @@ from enum import IntEnum
 import numpy as np
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Range, Recipe
-from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
+from v2v_protocol.recipe import Range, Recipe, effect_settings
+from v2v_protocol.sample import SampleParams
 
 _SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
@@ -31,7 +31,7 @@ _LEAST_CONTRAST = 2.0**-60
 
 
 class Purpose(IntEnum):
-    """The counter stream of each draw. Numbers are never reused."""
+    """The counter stream of each draw. Numbers are never reused; 10 to 15 belong to the first effects."""
 
     THRESHOLD = 1
     NOISE_SIGMA = 2
@@ -42,15 +42,16 @@ class Purpose(IntEnum):
     FLIP = 7
     CONTRAST = 8
     NOISE_KEY = 9
-    THRESHOLD_MISMATCH = 10
-    SHOT_NOISE = 11
-    LEAK = 12
-    REFRACTORY = 13
-    PHOTORECEPTOR = 14
-    DEAD_PIXELS = 15
 
 
-_Stream = Callable[[Purpose, int], list[int]]
+_FIRST_EFFECTS = {
+    name: number
+    for number, name in enumerate(
+        ("threshold_mismatch_sigma", "shot_noise_hz", "leak_hz", "refractory_seconds", "photoreceptor_hz",
+         "dead_pixel_share"), 10,
+    )
+}  # fmt: skip
+_Stream = Callable[[int, int], list[int]]
 
 
 def draw(
@@ -87,7 +88,7 @@ def draw(
             f"{recipe.resize_scale[1]}: raise its upper end to {needed:.6g} or more, or make the crop smaller"
         )
 
-    def stream(purpose: Purpose, count: int) -> list[int]:
+    def stream(purpose: int, count: int) -> list[int]:
         return _raw((seed, _SAMPLE_KEY), (0, purpose, index, epoch), count)
 
     crop = recipe.crop_height_px * recipe.crop_width_px
@@ -118,7 +119,11 @@ def draw(
             else 0.0
         ),
         noise_key=(first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32),
-        effects=_effects(recipe, stream),
+        effects={
+            name: value
+            for name in (effect_settings() if recipe.has_effects else ())
+            if (value := _in_range(getattr(recipe, name), stream(_stream_of(name), 1)[0])) > 0.0
+        },
     )
 
 
@@ -161,22 +166,10 @@ def _thresholds(
     return (first, second) if raw[2] >> 63 else (second, first)
 
 
-def _effects(recipe: Recipe, stream: _Stream) -> Effects:
-    if not recipe.has_effects:
-        return NO_EFFECTS
-
-    def drawn(ends: Range, purpose: Purpose) -> float:
-        return _in_range(ends, stream(purpose, 1)[0])
-
-    dead_share = drawn(recipe.dead_pixel_share, Purpose.DEAD_PIXELS)
-    return Effects(
-        threshold_mismatch_sigma=drawn(recipe.threshold_mismatch_sigma, Purpose.THRESHOLD_MISMATCH),
-        shot_noise_hz=drawn(recipe.shot_noise_hz, Purpose.SHOT_NOISE),
-        leak_hz=drawn(recipe.leak_hz, Purpose.LEAK),
-        refractory_seconds=drawn(recipe.refractory_seconds, Purpose.REFRACTORY),
-        photoreceptor_hz=drawn(recipe.photoreceptor_hz, Purpose.PHOTORECEPTOR),
-        dead_pixel_count=_rounded(dead_share * recipe.crop_height_px * recipe.crop_width_px),
-    )
+def _stream_of(effect: str) -> int:
+    """The counter stream of an effect: a digest of its name, far above all other numbers; the first had numbers."""
+    digest = hashlib.blake2b(effect.encode(), digest_size=6).digest()
+    return _FIRST_EFFECTS.get(effect) or 2**32 + int.from_bytes(digest, "little")
 
 
 def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:

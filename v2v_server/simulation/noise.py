@@ -46,8 +46,7 @@ NoiseKey = tuple[int, int, int, int]
 WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
 PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
-MISMATCH_RADIUS, MISMATCH_ANGLE, SHOT_PIXEL_POS, SHOT_PIXEL_NEG, SHOT_STEP_POS, SHOT_STEP_NEG, DEAD_PLACE = range(9, 16)
-"""What a word is for. Numbers are never reused."""
+"""What a word is for. Numbers are never reused; 9 to 15 belong to effects."""
 
 GOLDEN = np.uint32(0x9E3779B9)
 SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))
@@ -157,7 +156,7 @@ def start_uniforms(key: NoiseKey, pixels: int) -> Reals:
 
 
 def hot_pixels(
-    key: NoiseKey, count: int, pixels: int, words_of: WordsOf | None = None
+    key: NoiseKey, count: int, pixels: int, words_of: WordsOf = words
 ) -> tuple[npt.NDArray[np.int64], Reals]:
     """The hot pixels: those of the smallest words, so they are distinct for any count up to all.
 
@@ -168,40 +167,17 @@ def hot_pixels(
     Returns:
         positions [count] int64, ascending, in row order; their standard normals [count] float32.
     """
-    if count == 0:
-        return np.empty(0, np.int64), np.empty(0, np.float32)
-    words_of = words_of or words
-    position = _smallest_words(key, HOT_PLACE, count, pixels, words_of)
+    position = smallest_words(key, HOT_PLACE, count, pixels, words_of)
     normal, _ = box_muller(words_of(key, HOT_RADIUS, position), words_of(key, HOT_ANGLE, position))
     return position, normal
 
 
-def dead_pixels(key: NoiseKey, count: int, pixels: int, words_of: WordsOf | None = None) -> npt.NDArray[np.int64]:
-    """The dead pixels, chosen like the hot ones: positions [count] int64, ascending, in row order."""
-    return _smallest_words(key, DEAD_PLACE, count, pixels, words_of or words) if count else np.empty(0, np.int64)
-
-
-def mismatch_normals(key: NoiseKey, pixels: int) -> tuple[Reals, Reals]:
-    """By how many deviations each pixel's positive and negative threshold lies off: two of [pixels] float32."""
-    place = np.arange(pixels)
-    return box_muller(*mix(words(key, MISMATCH_RADIUS, place), words(key, MISMATCH_ANGLE, place)))
-
-
-def shot_words(key: NoiseKey, steps: int, pixels: int) -> tuple[Words, Words]:
-    """Independent uniform words that decide the shot events: those of positive and of negative events.
-
-    ``mix`` of the words of pixel and step, as for the normals: with SHOT_PIXEL_POS and SHOT_STEP_POS in the place of
-    the two radius words, SHOT_PIXEL_NEG and SHOT_STEP_NEG in that of the two angle words.
-
-    Returns:
-        each [steps, pixels] uint32.
-    """
-    place, step = np.arange(pixels), np.arange(steps)
-    positive = words(key, SHOT_STEP_POS, step)[:, None] ^ words(key, SHOT_PIXEL_POS, place)
-    return mix(positive, words(key, SHOT_STEP_NEG, step)[:, None] ^ words(key, SHOT_PIXEL_NEG, place))
-
-
-def _smallest_words(key: NoiseKey, purpose: int, count: int, pixels: int, words_of: WordsOf) -> npt.NDArray[np.int64]:
+def smallest_words(
+    key: NoiseKey, purpose: int, count: int, pixels: int, words_of: WordsOf = words
+) -> npt.NDArray[np.int64]:
+    """The pixels that have the smallest words: [count] int64, ascending, in row order."""
+    if count == 0:
+        return np.empty(0, np.int64)
     place_words = words_of(key, purpose, np.arange(pixels))
     largest = np.partition(place_words, count - 1)[count - 1]
     return np.flatnonzero(place_words <= largest).astype(np.int64)

@@ -31,8 +31,8 @@ from v2v_server.simulation.vectors import (
 BLOCK_PX = 512
 """Pixels of a block. Fewer would touch each page of frames and voxels more often, more would not stay in the cache."""
 
-_PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
-_ROWS_AHEAD = 3  # how many steps before its use a row of frames is fetched into the cache
+PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
+ROWS_AHEAD = 3  # how many steps before its use a row of frames is fetched into the cache
 
 _GOLDEN = noise.GOLDEN
 _S0, _S1, _S2 = noise.SCRAMBLE_FACTORS
@@ -81,12 +81,12 @@ def _fold(key, constant):
 
 
 @numba.njit(nogil=True)
-def _folds(key, purpose):
+def folds_of(key, purpose):
     return _fold(key, np.uint32(2) * purpose), _fold(key, np.uint32(2) * purpose + np.uint32(1))
 
 
 @numba.njit(nogil=True)
-def _word(folds, counter):
+def word(folds, counter):
     return _scramble(np.uint32(_scramble(np.uint32(np.uint32(counter) + folds[0])) + folds[1]))
 
 
@@ -94,14 +94,14 @@ def _word(folds, counter):
 def words(key, purpose, counters):
     """``noise.words`` of [count] uint32 counters: [count] uint32."""
     found = np.empty(len(counters), np.uint32)
-    folds = _folds(key, purpose)
+    folds = folds_of(key, purpose)
     for i in range(len(counters)):
-        found[i] = _word(folds, counters[i])
+        found[i] = word(folds, counters[i])
     return found
 
 
 @numba.njit(nogil=True, inline="always")
-def _two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
+def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
     """``noise.mix`` and ``noise.box_muller`` of a block: into ``normal`` [2, block], by way of the three other rows.
 
     Several short loops: a processor overlaps the rounds of a loop only as far as its window of waiting instructions
@@ -140,13 +140,13 @@ def _two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_ro
 
 
 @numba.njit(nogil=True, inline="always")
-def _look_up(table, row, coming, levels):
+def look_up(table, row, coming, levels):
     for i in range(look_up_by_permutation(table, row, coming, levels), len(row)):  # type: ignore[call-arg]
         levels[i] = _log_intensity(table, row[i])
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _crossed(potential, threshold_pos, threshold_neg, tolerance):
+def crossed(potential, threshold_pos, threshold_neg, tolerance):
     """Signed events of a potential, and the residual they leave: the rule of ``voxel.py``. No event is +0, never -0."""
     zero = tolerance - tolerance
     rising = potential >= zero
@@ -157,7 +157,7 @@ def _crossed(potential, threshold_pos, threshold_neg, tolerance):
 
 
 @numba.njit(nogil=True, inline="always")
-def _store(counts, limit, stored):
+def store(counts, limit, stored):
     """One bin of each pixel into the voxels; returns how many had to be clipped."""
     exceeded = False
     for i in range(len(stored)):
@@ -205,18 +205,18 @@ def simulate_pixels(
     use_widest_vectors()  # type: ignore[call-arg]
     steps, pixels = len(source_index) - 1, frames.shape[1]
     noisy = len(noise_scale) > 0
-    state = aligned_rows(4, _PITCH, table.dtype)
+    state = aligned_rows(4, PITCH, table.dtype)
     residual, count, levels = state[0], state[1], state[2:]
-    words = aligned_rows(4, _PITCH, np.uint32)
-    floats = aligned_rows(3, _PITCH, np.float32)
+    words = aligned_rows(4, PITCH, np.uint32)
+    floats = aligned_rows(3, PITCH, np.float32)
     radius_words, angle_words, normal = words[0], words[1], floats[:2]
     pairs = np.empty((2, (steps + 1) // 2), np.uint32)
-    start, pixel_radius, pixel_angle = _folds(key, _START), _folds(key, _PIXEL_RADIUS), _folds(key, _PIXEL_ANGLE)
+    start, pixel_radius, pixel_angle = folds_of(key, _START), folds_of(key, _PIXEL_RADIUS), folds_of(key, _PIXEL_ANGLE)
     if noisy:
-        pair_radius, pair_angle = _folds(key, _PAIR_RADIUS), _folds(key, _PAIR_ANGLE)
+        pair_radius, pair_angle = folds_of(key, _PAIR_RADIUS), folds_of(key, _PAIR_ANGLE)
         for pair in range(pairs.shape[1]):
-            pairs[0, pair] = _word(pair_radius, pair)
-            pairs[1, pair] = _word(pair_angle, pair)
+            pairs[0, pair] = word(pair_radius, pair)
+            pairs[1, pair] = word(pair_angle, pair)
     saturated, next_hot = 0, 0
 
     for first in range(0, pixels, BLOCK_PX):
@@ -225,27 +225,27 @@ def simulate_pixels(
         while next_hot < len(hot_position) and hot_position[next_hot] < last:
             next_hot += 1
         for i in range(BLOCK_PX):
-            uniform = np.float32(np.int32(_word(start, first + i) >> np.uint32(8))) * _UNIT
+            uniform = np.float32(np.int32(word(start, first + i) >> np.uint32(8))) * _UNIT
             residual[i] = uniform * start_span + start_low
         if noisy:
             for i in range(BLOCK_PX):
-                radius_words[i] = _word(pixel_radius, first + i)
-                angle_words[i] = _word(pixel_angle, first + i)
+                radius_words[i] = word(pixel_radius, first + i)
+                angle_words[i] = word(pixel_angle, first + i)
         now, row = 0, 0
         shown = frames[source_index[0], first:last]
-        _look_up(table, shown, shown, levels[now])
+        look_up(table, shown, shown, levels[now])
 
         for step in range(steps):
             before = now
             if source_index[step + 1] != source_index[step]:
                 now = 1 - now
-                coming = frames[source_index[min(step + 1 + _ROWS_AHEAD, steps)], first:last]
-                _look_up(table, frames[source_index[step + 1], first:last], coming, levels[now])
+                coming = frames[source_index[min(step + 1 + ROWS_AHEAD, steps)], first:last]
+                look_up(table, frames[source_index[step + 1], first:last], coming, levels[now])
             for each in range(hot, next_hot):
                 residual[hot_position[each] - first] += hot_drift[each] * hot_scale[step]
             pair, odd = step >> 1, step & 1
             if noisy and not odd:
-                _two_normals(
+                two_normals(
                     radius_words, angle_words, pairs[0, pair], pairs[1, pair], words[2], words[3], floats[2], normal
                 )
             # Without noise its row is zeros, which changes no more than the sign of a zero, and that is never seen.
@@ -254,13 +254,13 @@ def simulate_pixels(
             if of_bin == 0:
                 for i in range(BLOCK_PX):
                     change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
-                    count[i], residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+                    count[i], residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
             else:
                 for i in range(BLOCK_PX):
                     change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
-                    signed, residual[i] = _crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+                    signed, residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
                     count[i] += signed
             if of_bin == steps_per_bin - 1:
-                saturated += _store(count, limit, voxels[row, first:last])
+                saturated += store(count, limit, voxels[row, first:last])
                 row += 1
     return saturated

@@ -19,7 +19,7 @@ at most, where the 8 has room for the terms of second order. Float32 is used up 
 then the error stays below half the smaller threshold in either, over the whole clip and not only over a step, and the
 count of a bin is exact, being below 2**24 or 2**53.
 
-Effects (``effects.py``) round more: 4 u (range) for the low-pass, whose own error a step can only pass on, 3 u D for
+Effects (``effects/``) round more: 4 u (range) for the low-pass, whose own error a step can only pass on, 3 u D for
 the leak, and up to 12 u D for a refractory period in place of the 2 u D of potential and product: no more than 24 u D
 in all. The most events of such a clip are counted EFFECTS_MARGIN times, which has room for that.
 
@@ -28,7 +28,6 @@ Everything here is sums, products and correctly rounded roots: every host comes 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -36,8 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS, effect_settings
-from v2v_protocol.sample import Effects
+from v2v_protocol.recipe import LARGEST_EVENTS
 
 AUTO = "auto"
 Real = type[np.floating[Any]]
@@ -83,21 +81,6 @@ def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
     for name, value in (("threshold_pos", threshold_pos), ("threshold_neg", threshold_neg)):
         if not low <= value <= high:
             raise UsageError(f"{name} = {value!r}: give a number from {low:.3g} to {high:.3g}")
-
-
-def check_effects(effects: Effects, pixels: int) -> None:
-    """Refuses effects outside the limits of a recipe.
-
-    Raises:
-        UsageError: one is; the message names it, the value and the limits.
-    """
-    for name, setting in effect_settings().items():
-        value = getattr(effects, name, 0.0)  # dead pixels are a share in a recipe, and a count here
-        one = dataclasses.replace(setting, kind="number")
-        one.check(name, float(value) if isinstance(value, np.number) else value)
-    count = effects.dead_pixel_count
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= pixels:
-        raise UsageError(f"dead_pixel_count = {count!r}: give a whole number from 0 to {pixels}")
 
 
 def error_bound(real: Real, events: float, smaller_threshold: float) -> float:

@@ -1,6 +1,6 @@
 """Cameras with effects, slowly: float64, one pixel, one step and one event at a time.
 
-Written from the docstring of ``v2v_server.simulation.effects``, not from the kernel. What is random comes in as an
+Written from the docstrings in ``v2v_server/simulation/effects``, not from the kernel. What is random comes in as an
 argument, so that both sides see the same.
 """
 
@@ -17,7 +17,7 @@ Doubles = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """Units as in ``v2v_protocol.sample.Effects``; thresholds are nominal, log units."""
+    """Units as in ``v2v_protocol.recipe``; thresholds are nominal, log units."""
 
     threshold_pos: float
     threshold_neg: float

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects import Prepared
+from v2v_server.simulation.effects import EFFECTS, mismatch, shot_noise
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance
 
 
@@ -60,7 +60,7 @@ def simulate(
 def simulate_with_effects(
     grey: npt.NDArray[np.uint8],
     table: npt.NDArray[Any],
-    prepared: Prepared,
+    prepared: tuple[Any, ...],
     key: noise.NoiseKey,
     *,
     threshold_pos: float,
@@ -75,35 +75,38 @@ def simulate_with_effects(
     Args:
         grey: [steps + 1, pixels].
         table: [256] log intensity of each grey level.
-        prepared: the effects.
+        prepared: the effects' tables.
     """
+    of = {effect.FIELD: tables for effect, tables in zip(EFFECTS, prepared, strict=True)}
+    spread, low_pass = of["threshold_mismatch_sigma"], of["photoreceptor_hz"]
+    leak, blindness, shot = of["leak_hz"].leak, of["refractory_seconds"], of["shot_noise_hz"]
     real = table.dtype.type
     steps, pixels = len(grey) - 1, grey.shape[1]
     level, tolerance = table[grey], real(tolerance)
-    mismatch = np.stack(noise.mismatch_normals(key, pixels)).astype(real) * prepared.mismatch_sigma
-    share = np.maximum(real(1) + mismatch, prepared.smallest_share)
+    normal = np.stack(mismatch.normals(key, pixels)).astype(real)
+    share = np.maximum(real(1) + normal * spread.sigma, spread.smallest_share)
     positive, negative = real(threshold_pos) * share[0], real(threshold_neg) * share[1]
     residual = noise.start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     normals = noise.standard_normals(key, steps, pixels)
     position, normal = noise.hot_pixels(key, hot_count, pixels)
-    shot_words = noise.shot_words(key, steps, pixels)
+    shot_words = shot_noise.shot_words(key, steps, pixels)
     seen, blind = level[0].copy(), np.zeros(pixels, real)
     counts = np.zeros((steps, pixels), real)
     for step in range(steps):
         change = level[step + 1] - level[step]
-        of_step = prepared.table_of_step[step]
-        if len(prepared.low_pass):
-            slow, fast = prepared.low_pass[of_step][:, grey[step + 1]]
+        of_step = low_pass.table_of_step[step]
+        if len(low_pass.low_pass):
+            slow, fast = low_pass.low_pass[of_step][:, grey[step + 1]]
             change = slow * (level[step] - seen) + fast * change
             seen += change
         if noise_sigma:
             change += normals[step].astype(real) * real(noise_sigma)
-        if len(prepared.leak):
-            change += positive * prepared.leak[step]
+        if len(leak):
+            change += positive * leak[step]
         change[position] += normal.astype(real) * real(hot_sigma)
-        if prepared.refractory_seconds > 0:
+        if blindness.refractory > 0:
             signed, residual, blind = _with_refractory(
-                residual, blind, change, prepared.seconds[step], prepared.refractory_seconds, positive, negative,
+                residual, blind, change, blindness.seconds[step], blindness.refractory, positive, negative,
                 tolerance,
             )  # fmt: skip
         else:
@@ -112,13 +115,13 @@ def simulate_with_effects(
             events = np.floor((np.abs(potential) + tolerance) / threshold)
             signed = np.where(potential >= 0, events, -events)
             residual = potential - signed * threshold
-        if len(prepared.shot):
-            chances = prepared.shot.view(np.uint32)[of_step][:, grey[step + 1]]
+        if len(shot.shot):
+            chances = shot.shot.view(np.uint32)[of_step][:, grey[step + 1]]
             rising, falling = ((words[step] < chances).sum(axis=0) for words in shot_words)
             signed = signed + (rising - falling).astype(real)
             residual = np.where(rising + falling > 0, real(0), residual)
         counts[step] = signed
-    counts[:, prepared.dead_position] = 0
+    counts[:, of["dead_pixel_share"].position] = 0
     return counts
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import Effects, SampleParams
+from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import simulate, simulate_clip, simulate_log
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.voxel import voxel_array
@@ -172,23 +172,20 @@ for dtype in ("int8", "int16", "float32"):
     simulate_clip(FRAMES, replace(PARAMS, noise_sigma=0.0, hot_pixel_count=0), RECIPE, dtype)
 seen.append(count())
 for effects in EFFECTS:
-    recipe = RECIPE.replace(leak_hz=(1.0, 1.0) if effects.need_seconds else 0.0)
-    seconds = np.linspace(0.01, 0.1, 10) if effects.need_seconds else None
+    timed = any(name.endswith(("_hz", "_seconds")) for name in effects)
+    recipe = RECIPE.replace(leak_hz=(1.0, 1.0) if timed else 0.0)
+    seconds = np.linspace(0.01, 0.1, 10) if timed else None
     for noise_sigma in (0.0, 0.1):
         simulate_clip(FRAMES, replace(PARAMS, noise_sigma=noise_sigma, effects=effects), recipe, "int8", seconds)
 seen.append(count())
 print(json.dumps(seen))
 """
 
-EFFECTS = [
-    Effects(threshold_mismatch_sigma=0.03),
-    Effects(shot_noise_hz=2.0),
-    Effects(leak_hz=0.1),
-    Effects(refractory_seconds=1e-3),
-    Effects(photoreceptor_hz=100.0),
-    Effects(dead_pixel_count=3),
-    Effects(0.03, 2.0, 0.1, 1e-3, 100.0, 3),
-]
+ALL = {
+    "threshold_mismatch_sigma": 0.03, "shot_noise_hz": 2.0, "leak_hz": 0.1, "refractory_seconds": 1e-3,
+    "photoreceptor_hz": 100.0, "dead_pixel_share": 0.1,
+}  # fmt: skip
+EFFECTS = [*({name: value} for name, value in ALL.items()), ALL]
 
 
 def test_after_warm_up_nothing_is_compiled() -> None:

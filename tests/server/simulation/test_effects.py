@@ -20,15 +20,31 @@ from tests.server.simulation.generic_processor import printed_on_a_generic_proce
 from tests.server.simulation.test_pixel import moving_frames
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_NORMAL, Recipe, preset
-from v2v_protocol.sample import NO_EFFECTS, Effects, SampleParams
-from v2v_server.simulation import effects as equations
+from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.effects import dead_pixels, mismatch, photoreceptor, prepare, shot_noise
+from v2v_server.simulation.effects.light import exponential, linear_light
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.voxel import rounding_tolerance
 
 GAMMA, LOG_EPS, FPS = 2.2, 1e-3, 25.0
-ALL = Effects(0.15, 20.0, 3.0, 0.005, 20.0, 2)
+Effects = dict[str, float]
+
+
+def effects_of(
+    mismatch: float = 0.0, shot: float = 0.0, leak: float = 0.0, blind: float = 0.0, corner: float = 0.0,
+    dead: float = 0.0,
+) -> Effects:  # fmt: skip
+    """A draw: those that are on."""
+    values = {
+        "threshold_mismatch_sigma": mismatch, "shot_noise_hz": shot, "leak_hz": leak, "refractory_seconds": blind,
+        "photoreceptor_hz": corner, "dead_pixel_share": dead,
+    }  # fmt: skip
+    return {name: value for name, value in values.items() if value > 0.0}
+
+
+ALL = effects_of(0.15, 20.0, 3.0, 0.005, 20.0, 2 / (37 * 45))
 
 
 def params_of(effects: Effects, seed: int = 0, **changes: Any) -> SampleParams:
@@ -37,22 +53,22 @@ def params_of(effects: Effects, seed: int = 0, **changes: Any) -> SampleParams:
 
 
 def arguments_of(effects: Effects) -> dict[str, Any]:
-    return dataclasses.asdict(effects) | {"frames_per_second": FPS}
+    return effects | {"frames_per_second": FPS}
 
 
 def tolerance_of(effects: Effects) -> float:
-    smallest = 0.2 * max(1 - LARGEST_NORMAL * effects.threshold_mismatch_sigma, 0.25)
+    smallest = 0.2 * max(1 - LARGEST_NORMAL * effects.get("threshold_mismatch_sigma", 0.0), 0.25)
     return rounding_tolerance(smallest, smallest)
 
 
 some_effects = st.builds(
-    Effects,
-    threshold_mismatch_sigma=st.sampled_from((0.0, 0.1, 0.9)),
-    shot_noise_hz=st.sampled_from((0.0, 3.0, 300.0)),
-    leak_hz=st.sampled_from((0.0, 0.1, 40.0)),
-    refractory_seconds=st.sampled_from((0.0, 1e-4, 0.01, 0.1)),
-    photoreceptor_hz=st.sampled_from((0.0, 1.0, 100.0)),
-    dead_pixel_count=st.integers(0, 1),
+    effects_of,
+    mismatch=st.sampled_from((0.0, 0.1, 0.9)),
+    shot=st.sampled_from((0.0, 3.0, 300.0)),
+    leak=st.sampled_from((0.0, 0.1, 40.0)),
+    blind=st.sampled_from((0.0, 1e-4, 0.01, 0.1)),
+    corner=st.sampled_from((0.0, 1.0, 100.0)),
+    dead=st.sampled_from((0.0, 0.02, 0.5)),
 )
 
 
@@ -69,7 +85,7 @@ def test_kernel_equals_its_numpy_definition(
     effects: Effects, size: Any, noise_sigma: Any, hot_count: Any, precision: Any, seed: Any
 ) -> None:
     if not effects:
-        effects = dataclasses.replace(NO_EFFECTS, leak_hz=1.0)
+        effects = effects_of(leak=1.0)
     steps, pixels = 12, size[0] * size[1]
     frames = moving_frames(steps + 1, *size, seed=seed % 256)
     got = simulate(
@@ -78,7 +94,7 @@ def test_kernel_equals_its_numpy_definition(
     ).voxels.reshape(steps, pixels)  # fmt: skip
     real: Any = np.dtype(precision).type
     params = params_of(effects, seed)
-    prepared = equations.prepare(params, (GAMMA, LOG_EPS), np.full(steps, 1 / FPS), pixels, real)
+    prepared = prepare(effects, params.noise_key, (GAMMA, LOG_EPS), np.full(steps, 1 / FPS), pixels, real)
     expected = reference.simulate_with_effects(
         frames.reshape(steps + 1, pixels),
         log_table(GAMMA, LOG_EPS) if real is np.float32 else log_table_float64(GAMMA, LOG_EPS),
@@ -106,18 +122,17 @@ def test_kernel_equals_the_oracle(effects: Effects, noise_sigma: float, seed: in
     change = noise.standard_normals(key, steps, pixels).astype(np.float64) * noise_sigma * np.sqrt(durations)[:, None]
     position, normal = noise.hot_pixels(key, 2, pixels)
     change[:, position] += 3.0 * normal.astype(np.float64) * durations[:, None]
-    shot = np.stack(noise.shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
+    shot = np.stack(shot_noise.shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
     chance = Chance(
         noise.start_uniforms(key, pixels).astype(np.float64),
         change,
-        np.stack(noise.mismatch_normals(key, pixels)).astype(np.float64),
+        np.stack(mismatch.normals(key, pixels)).astype(np.float64),
         shot,
-        noise.dead_pixels(key, effects.dead_pixel_count, pixels),
+        dead_pixels.positions(key, effects.get("dead_pixel_share", 0.0), pixels),
     )
     camera = Camera(
-        0.2, 0.25, tolerance_of(effects), effects.threshold_mismatch_sigma, effects.shot_noise_hz, effects.leak_hz,
-        effects.refractory_seconds, effects.photoreceptor_hz,
-    )  # fmt: skip
+        0.2, 0.25, tolerance_of(effects), **{name: effects[name] for name in effects if name != "dead_pixel_share"}
+    )
     expected = effect_oracle.simulate(frames.reshape(-1, pixels), durations, GAMMA, LOG_EPS, camera, chance)
     got = simulate_clip(frames, params, recipe, "float32", durations).voxels.reshape(steps, pixels)
     # float32 against float64: an event that is due at the end of a step may fall into the next.
@@ -210,7 +225,7 @@ def test_mismatch_spreads_the_thresholds_by_the_stated_sigma() -> None:
         assert abs(share.std() - 0.1) < 4 * 0.1 / math.sqrt(2 * share.size) + 1e-3
     assert abs(np.corrcoef(*shares)[0, 1]) < 4 / 100
     # The numbers themselves, to what a count resolves.
-    normals = noise.mismatch_normals(noise_key_of_seed(0), 10_000)
+    normals = mismatch.normals(noise_key_of_seed(0), 10_000)
     np.testing.assert_allclose(shares[0], 1 + 0.1 * normals[0], rtol=4e-3)
     assert abs(np.corrcoef(shares[0][1:], shares[0][:-1])[0, 1]) < 4 / 100
 
@@ -297,8 +312,8 @@ def test_the_low_pass_damps_a_sinusoid_by_its_gain(hertz: float, level: int) -> 
 def test_dead_pixels_are_dead_and_no_others() -> None:
     frames = moving_frames(21, 40, 40)
     plain = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20).voxels
-    got = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20, dead_pixel_count=100).voxels
-    position = noise.dead_pixels(noise_key_of_seed(0), 100, 1600)
+    got = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20, dead_pixel_share=100 / 1600).voxels
+    position = dead_pixels.positions(noise_key_of_seed(0), 100 / 1600, 1600)
     assert len(set(position.tolist())) == 100
     expected = plain.reshape(20, -1).copy()
     expected[:, position] = 0
@@ -320,7 +335,7 @@ def test_an_effect_that_can_do_nothing_leaves_every_bit_alone() -> None:
 
 def test_noise_per_frame_stays_per_frame_where_an_effect_needs_seconds() -> None:
     recipe = Recipe(voxels_per_clip=2, crop_height_px=16, crop_width_px=16, leak_hz=(1.0, 1.0))
-    params = params_of(dataclasses.replace(NO_EFFECTS, dead_pixel_count=1), noise_sigma=0.1)
+    params = params_of(effects_of(dead=0.01), noise_sigma=0.1)
     frames = moving_frames(recipe.frames_needed, 16, 16)
     clips = [simulate_clip(frames, params, recipe, "int8", np.full(recipe.steps, dt)).voxels for dt in (0.01, 0.5)]
     np.testing.assert_array_equal(clips[0], clips[1])
@@ -343,7 +358,7 @@ SCENES: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
     "leak_hz": (still(128, 50, 48, 48), {"leak_hz": 0.1}),
     "refractory_seconds": (pan(50, 4.0), {"refractory_seconds": 1e-3}),
     "photoreceptor_hz": (pan(50, 2.0), {"photoreceptor_hz": 30.0}),
-    "dead_pixel_count": (pan(50, 1.0), {"dead_pixel_count": 231}),
+    "dead_pixel_share": (pan(50, 1.0), {"dead_pixel_share": 231 / 48**2}),
 }
 TOLERANCE = 0.05
 
@@ -373,21 +388,21 @@ def test_leaving_an_effect_out_is_seen_on_its_scene(name: str) -> None:
 
 def test_the_exponential() -> None:
     x = np.concatenate([-np.geomspace(1e-12, 699, 500), np.linspace(0, 7, 100)])
-    np.testing.assert_allclose(equations.exponential(x), np.exp(x), rtol=2e-15)
+    np.testing.assert_allclose(exponential(x), np.exp(x), rtol=2e-15)
 
 
 def test_tables_against_their_equations() -> None:
-    light = equations.linear_light(GAMMA, LOG_EPS)
+    light = linear_light(GAMMA, LOG_EPS)
     np.testing.assert_allclose(light, (np.arange(256) / 255) ** GAMMA, atol=1e-15)
-    means = equations.shot_means(1000.0, light, np.array([0.01, 0.1]))
+    means = shot_noise.shot_means(1000.0, light, np.array([0.01, 0.1]))
     np.testing.assert_allclose(means[:, [0, 255]], [[5.0, 1.25], [50.0, 12.5]])
-    table = equations.shot_table(means) / 2.0**32
+    table = shot_noise.shot_table(means) / 2.0**32
     for d, level in ((0, 0), (1, 255), (1, 0)):
         for k in (0, 3, 12, 60):
             below = sum(math.exp(-means[d, level]) * means[d, level] ** j / math.factorial(j) for j in range(k + 1))
             expected = 1 - below if k < table.shape[1] else 0.0
             assert table[d, min(k, table.shape[1] - 1), level] == pytest.approx(expected, abs=3e-10)
-    slow, fast = equations.low_pass_table(30.0, light, 0.02)
+    slow, fast = photoreceptor.low_pass_table(30.0, light, 0.02)
     x = 2 * math.pi * 30.0 * 0.02
     assert slow[255] == pytest.approx(1 - math.exp(-x))
     assert fast[255] == pytest.approx(1 - (1 - math.exp(-x)) / x)
@@ -410,8 +425,8 @@ FRAMES = moving_frames(11, 6, 7)
         ({"leak_hz": "much"}, "leak_hz"),
         ({"refractory_seconds": math.inf}, "refractory_seconds"),
         ({"photoreceptor_hz": 1e-3}, "photoreceptor_hz = 0.001: give a number from 0.01 to 1e.06 Hz, or 0 for off"),
-        ({"dead_pixel_count": 43}, "dead_pixel_count = 43.* 42"),
-        ({"dead_pixel_count": 1.0}, "dead_pixel_count"),
+        ({"dead_pixel_share": 1.1}, "dead_pixel_share = 1.1"),
+        ({"dead_pixels": 1.0}, "unknown effect 'dead_pixels' .did you mean 'dead_pixel_share'"),
     ],
 )
 def test_bad_effects_are_refused_by_name(change: Any, message: Any) -> None:
@@ -424,12 +439,12 @@ def test_a_clip_with_a_timed_effect_needs_its_durations() -> None:
     with pytest.raises(UsageError, match="missing: noise_unit is 'frame', and there is an effect in Hz"):
         simulate_clip(FRAMES, params_of(ALL), recipe, "int8")
     with pytest.raises(UsageError, match="unwanted: noise_unit is 'frame', and there is no effect in Hz"):
-        simulate_clip(FRAMES, params_of(NO_EFFECTS), recipe.replace(leak_hz=0.0), "int8", np.ones(10))
+        simulate_clip(FRAMES, params_of({}), recipe.replace(leak_hz=0.0), "int8", np.ones(10))
 
 
 def test_a_dead_pixel_needs_no_clock() -> None:
     recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=7, dead_pixel_share=(1.0, 1.0))
-    params = params_of(dataclasses.replace(NO_EFFECTS, dead_pixel_count=42))
+    params = params_of(effects_of(dead=1.0))
     assert not simulate_clip(FRAMES, params, recipe, "int8").voxels.any()
 
 

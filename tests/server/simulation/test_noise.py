@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from v2v_server.simulation import noise
+from v2v_server.simulation.effects import dead_pixels, mismatch, shot_noise
 
 KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
 
@@ -134,17 +135,17 @@ def test_hot_pixels_fall_everywhere_alike() -> None:
 
 def test_dead_and_hot_pixels_are_chosen_apart() -> None:
     key = (1, 2, 3, 4)
-    dead = noise.dead_pixels(key, 500, 1000)
+    dead = dead_pixels.positions(key, 0.5, 1000)
     assert len(set(dead.tolist())) == 500
     assert (np.diff(dead) > 0).all()
-    assert noise.dead_pixels(key, 0, 1000).size == 0
+    assert dead_pixels.positions(key, 0.0, 1000).size == 0
     hot, _ = noise.hot_pixels(key, 500, 1000)
     # Hypergeometric: 250 in common on average, with a deviation of 7.9.
     assert abs(len(set(dead.tolist()) & set(hot.tolist())) - 250) < 4 * 7.9
 
 
 def test_mismatch_normals_are_normal_and_independent() -> None:
-    positive, negative = noise.mismatch_normals((5, 6, 7, 8), 200_000)
+    positive, negative = mismatch.normals((5, 6, 7, 8), 200_000)
     for sample in (positive, negative):
         assert abs(sample.mean()) < 4 / math.sqrt(sample.size)
         assert abs(sample.var() - 1) < 4 * math.sqrt(2 / sample.size)
@@ -159,7 +160,7 @@ def test_mismatch_normals_are_normal_and_independent() -> None:
 def test_shot_words_are_uniform_and_independent() -> None:
     """Of pixel, step and sign; the smallest ones too, which alone make events."""
     steps, pixels = 200, 2000
-    both = np.stack(noise.shot_words((9, 8, 7, 6), steps, pixels)) * 2.0**-32
+    both = np.stack(shot_noise.shot_words((9, 8, 7, 6), steps, pixels)) * 2.0**-32
     n = both[0].size
     for uniform in both:
         assert abs(uniform.mean() - 0.5) < 4 / math.sqrt(12 * n)

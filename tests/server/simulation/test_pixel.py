@@ -96,7 +96,7 @@ def test_kernel_equals_its_numpy_definition(
 
 @numba.njit
 def look_up(table: Any, row: Any, coming: Any, levels: Any) -> None:
-    pixel._look_up(table, row, coming, levels)
+    pixel.look_up(table, row, coming, levels)
 
 
 @pytest.mark.parametrize("real", [np.float32, np.float64], ids=["permuted", "portable"])

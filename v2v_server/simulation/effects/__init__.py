@@ -1,0 +1,88 @@
+"""What a camera does beyond the paper's pixel model: one file an effect, off at zero.
+
+    mismatch.py       every pixel has thresholds of its own
+    photoreceptor.py  a low-pass, slower in the dark
+    leak.py           positive events without any cause
+    refractory.py     a pixel is blind after an event
+    shot_noise.py     events of either sign, most in the dark
+    dead_pixels.py    pixels that never fire
+    light.py          linear light of a grey level, and an exponential that is the same on every host
+    kernel.py         the pixel kernel with all of them
+
+An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws) and one file
+here, named in :data:`EFFECTS`. The file states the equation, its source, and
+
+    FIELD                     the recipe's field
+    ROWS                      how many rows of a block's state it keeps for itself
+    prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
+
+and, compiled, as many of these as it needs. Each does nothing where the tables say off:
+
+    start(tables, own, block, at)     before the first step of a block of pixels; may change the block's thresholds
+    see(tables, own, block, at)       may replace ``block.change``, the change of log intensity in this step
+    change(tables, own, block, at)    may add to ``block.change``
+    cross(tables, own, block, at)     may decide ``block.signed`` and ``block.residual`` itself; then it returns True
+    after(tables, own, block, at)     may change ``block.signed``, the events of this step, and ``block.residual``
+    close(tables, own, block, at)     may change ``block.count``, the sum of a bin, before it is stored
+
+Within a step: see, noise, change, hot drift, cross, after. Effects take their turns in the order of :data:`EFFECTS`.
+The names of ``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`. ``docs/effects.md`` tells sources,
+departures from them, and values; ``docs/extending.md`` shows a new effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.simulation import noise
+from v2v_server.simulation.effects.light import linear_light
+from v2v_server.simulation.effects.state import Clip
+from v2v_server.simulation.precision import Real
+
+EFFECTS: tuple[Any, ...] = tuple(
+    import_module(f"{__name__}.{name}")
+    for name in (
+        "mismatch",
+        "photoreceptor",
+        "leak",
+        "refractory",
+        "shot_noise",
+        "dead_pixels",
+    )
+)
+"""All effects, in the order in which they take their turns."""
+
+
+def prepare(
+    values: Mapping[str, float],
+    key: noise.NoiseKey,
+    intensity: tuple[float, float],
+    step_seconds: npt.NDArray[np.float64],
+    pixels: int,
+    real: Real,
+    words_of: noise.WordsOf = noise.words,
+) -> tuple[Any, ...]:
+    """The tables of every effect for one clip, in the order of :data:`EFFECTS`.
+
+    Args:
+        values: the draw, by field; what is missing is off.
+        key: of the sample's noise.
+        intensity: gamma and log_eps.
+        step_seconds: [steps] duration of each step.
+        pixels: of the picture.
+        real: arithmetic of the pixels, float32 or float64.
+        words_of: a faster ``noise.words`` where the caller has one.
+
+    Raises:
+        UsageError: more shot events in a step than can be drawn.
+    """
+    durations, table_of_step = np.unique(step_seconds, return_inverse=True)
+    clip = Clip(
+        linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, words_of
+    )
+    return tuple(effect.prepare(values.get(effect.FIELD, 0.0), clip) for effect in EFFECTS)

@@ -1,0 +1,67 @@
+"""Photoreceptor low-pass of f_white Hz: dP/dt = 2 pi f (L - P), f = f_white (i + 20/255) / (1 + 20/255).
+
+i is the light of the new frame (v2e). L is linear between frames (ESIM: Rebecq et al. 2018), for which a step of T
+seconds is exact:
+
+    P' = P + a (L - P) + b (L' - L),    a = 1 - exp(-2 pi f T),    b = 1 - a / (2 pi f T)
+
+P takes the place of L in all that follows. It starts settled.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from v2v_server.simulation.effects.light import Doubles, exponential
+from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.pixel import BLOCK_PX, look_up
+
+FIELD, ROWS = "photoreceptor_hz", 3
+DARKEST = 20 / 255
+"""v2e's offset of the light that sets the bandwidth: no pixel is slower than 1/14 of a white one."""
+
+
+class Tables(NamedTuple):
+    """[tables, 2, 256] real, a and b by grey level, no table where there is no low-pass; which of them a step has."""
+
+    low_pass: Any
+    table_of_step: Any
+
+
+def prepare(value: float, clip: Clip) -> Tables:
+    """See ``effects/__init__.py``."""
+    tables = [low_pass_table(value, clip.light, each) for each in clip.durations] if value > 0.0 else []
+    return Tables(np.array(tables, clip.real).reshape(-1, 2, 256), clip.table_of_step)
+
+
+def low_pass_table(photoreceptor_hz: float, light: Doubles, seconds: float) -> Doubles:
+    """a and b of a step of that duration, [2, 256] float64."""
+    turns = 2.0 * np.pi * photoreceptor_hz * seconds * ((light + DARKEST) / (1.0 + DARKEST))
+    a = 1.0 - exponential(-turns)
+    return np.stack([a, 1.0 - a / turns])
+
+
+@hook
+def start(tables, own, block, at):
+    """P = L."""
+    if len(tables.low_pass) > 0:
+        for i in range(BLOCK_PX):
+            own[0, i] = block.levels[at.now, i]
+
+
+@hook
+def see(tables, own, block, at):
+    """The change of P."""
+    if len(tables.low_pass) > 0:
+        seen, slow, fast, levels = own[0], own[1], own[2], block.levels
+        of_step = tables.table_of_step[at.step]
+        if at.moved or at.step == 0 or of_step != tables.table_of_step[at.step - 1]:
+            look_up(tables.low_pass[of_step, 0], at.shown, at.shown, slow)
+            look_up(tables.low_pass[of_step, 1], at.shown, at.shown, fast)
+        for i in range(BLOCK_PX):
+            old, new = levels[at.before, i], levels[at.now, i]
+            block.change[i] = slow[i] * (old - seen[i]) + fast[i] * (new - old)
+            seen[i] += block.change[i]

@@ -1,0 +1,81 @@
+"""Refractory period t: after an event the pixel is blind for t seconds; what changes meanwhile is lost.
+
+v2e drops the events of that time. With a change that is linear within the step, k events take the time to the first
+threshold plus (k - 1) (c / slope + t), and the blind time left over goes on into the next step.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.pixel import BLOCK_PX
+
+FIELD, ROWS = "refractory_seconds", 1
+
+
+class Tables(NamedTuple):
+    """Real period; [steps] real, duration of each step."""
+
+    refractory: Any
+    seconds: Any
+
+
+def prepare(value: float, clip: Clip) -> Tables:
+    """See ``effects/__init__.py``."""
+    return Tables(clip.real(value), clip.step_seconds.astype(clip.real))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def crossed(residual, blind, change, seconds, refractory, threshold_pos, threshold_neg, tolerance):
+    """Signed events, residual and blind seconds after a step whose change is linear in time.
+
+    In log units, a period between events is the threshold plus what the change would have done while blind.
+    """
+    zero = tolerance - tolerance
+    seen = max(seconds - blind, zero) / seconds
+    potential = residual + change * seen
+    rising = potential >= zero
+    threshold = threshold_pos if rising else threshold_neg
+    size, speed = abs(potential), abs(change)
+    missed = speed * (refractory / seconds)
+    period = threshold + missed
+    more = np.floor((size - threshold + tolerance) / period)
+    left = (size - threshold) - more * period
+    fires = size + tolerance >= threshold
+    is_blind = left < missed
+    events = more + np.float32(1) if fires else zero
+    blind_left = max(blind - seconds, zero)
+    blind_after = min(refractory - left * (seconds / speed), refractory) if is_blind else zero
+    size_after = zero if is_blind else left - missed
+    signed_after = size_after if rising else -size_after
+    return (
+        events if rising else zero - events,
+        signed_after if fires else potential,
+        blind_after if fires else blind_left,
+    )
+
+
+@hook
+def start(tables, own, block, at):
+    """Nothing is blind."""
+    for i in range(BLOCK_PX):
+        own[0, i] = block.tolerance - block.tolerance
+
+
+@hook
+def cross(tables, own, block, at):
+    """Events beside each other in time."""
+    if tables.refractory > 0:
+        duration, blind = tables.seconds[at.step], own[0]
+        for i in range(BLOCK_PX):
+            block.signed[i], block.residual[i], blind[i] = crossed(
+                block.residual[i], blind[i], block.change[i], duration, tables.refractory, block.positive[i],
+                block.negative[i], block.tolerance,
+            )  # fmt: skip
+        return True
+    return False

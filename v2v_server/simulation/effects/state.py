@@ -1,0 +1,90 @@
+"""What an effect is given: the clip when its tables are made, the block of pixels and the step when it runs."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.simulation import noise
+from v2v_server.simulation.precision import Real
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+compiled: Any = numba.njit(**_OPTIONS)
+"""Decorator of a compiled function without the counting of references, which every view of an array would cost. It can
+make no array: all memory is its caller's."""
+hook: Any = numba.njit(forceinline=True, **_OPTIONS)
+"""The same for an effect's part of the kernel, which becomes a piece of the kernel itself."""
+
+
+class Clip(NamedTuple):
+    """What the tables of an effect are made for.
+
+    Attributes:
+        light: [256] float64, i(F) of every grey level, 0 (black) to 1 (white).
+        step_seconds: [steps] float64, duration of each step.
+        durations: [different] float64, the different ones, ascending.
+        table_of_step: [steps] int64, which of them each step has.
+        pixels: of the picture.
+        real: arithmetic of the pixels, float32 or float64.
+        key: of the sample's noise.
+        words_of: ``noise.words``, or a faster one.
+    """
+
+    light: npt.NDArray[np.float64]
+    step_seconds: npt.NDArray[np.float64]
+    durations: npt.NDArray[np.float64]
+    table_of_step: npt.NDArray[np.int64]
+    pixels: int
+    real: Real
+    key: noise.NoiseKey
+    words_of: noise.WordsOf
+
+
+class Block(NamedTuple):
+    """State of BLOCK_PX neighbouring pixels; [BLOCK_PX + padding] real each where nothing else is said.
+
+    Attributes:
+        residual: what is left of the change since the last event, log units.
+        count: signed events of the bin so far.
+        change: what this step adds to the residual, log units.
+        signed: signed events of this step.
+        positive, negative: the thresholds of each pixel, log units.
+        levels: two rows of log intensity, see :class:`At`.
+        words: [4] uint32 rows, and ``floats``: [4] float32 rows, free for use within one call.
+        tolerance: real, see ``voxel.py``.
+        key: [4] uint32, the noise key.
+    """
+
+    residual: Any
+    count: Any
+    change: Any
+    signed: Any
+    positive: Any
+    negative: Any
+    levels: Any
+    words: Any
+    floats: Any
+    tolerance: Any
+    key: Any
+
+
+class At(NamedTuple):
+    """Where the kernel is.
+
+    Attributes:
+        first: the block's first pixel.
+        step: number of the step.
+        moved: whether this step shows another frame than the one before (the camera does not pause).
+        before, now: rows of ``Block.levels``: log intensity before and after the step.
+        shown: [width] uint8, grey levels after the step; narrower than the block at the end of the picture.
+    """
+
+    first: Any
+    step: Any
+    moved: Any
+    before: Any
+    now: Any
+    shown: Any
