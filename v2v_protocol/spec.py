@@ -16,11 +16,7 @@ from v2v_protocol.settings import check_settings, nearest, require_known, settin
 
 VoxelDtype = Literal["int8", "int16", "float32"]
 OnBadVideo = Literal["substitute", "raise"]
-FlowMethod = Literal[
-    "auto", "zero", "dis-ultrafast", "dis-ultrafast-1", "dis-fast", "dis-fast-lean", "dis-fast-1",
-    "dis-fast-1-stride-6", "dis-medium", "dis-medium-0",
-    "farneback", "sparse-to-dense", "deepflow",
-]  # fmt: skip
+FlowMethod = Literal["auto", "zero", "dis-ultrafast", "dis-fast", "dis-fast-lean", "dis-fast-1"]
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)

@@ -56,7 +56,7 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "on_bad_video": "raise",
     "samples_per_decode": 2,
     "sibling_spacing": 24,
-    "flow_method": "dis-medium",
+    "flow_method": "dis-fast-1",
     "flow_direction": "backward",
     "flow_from": 20,
     "flow_margin_px": -1,

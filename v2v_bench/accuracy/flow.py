@@ -33,10 +33,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
-from v2v_server.flow.auto import choose
-from v2v_server.flow.estimator import Estimator, Field
-from v2v_server.flow.methods import METHODS
-from v2v_server.flow.settings import AUTO
+from v2v_server.flow.methods import AUTO, METHODS, Estimator, Field, choose, estimator
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation.clip import simulate_clip, warm_up
@@ -82,14 +79,14 @@ def textures(videos: Path | None) -> dict[str, Grey]:
 
 def estimators(names: Sequence[str], raft_small: Path | None) -> dict[str, Estimator]:
     """The methods to compare, by name."""
-    made = {name: _auto() if name == AUTO else METHODS[name].estimator() for name in names}
+    made = {name: _auto() if name == AUTO else estimator(name) for name in names}
     if raft_small is not None:
         made[_RAFT] = _raft(raft_small)
     return made
 
 
 def _auto() -> Estimator:
-    ready = {name: method.estimator() for name, method in METHODS.items()}
+    ready = {name: estimator(name) for name in METHODS}
     return lambda first, second: ready[choose(first, second)](first, second)
 
 
@@ -360,7 +357,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cv2.setNumThreads(1)
     try:
         for name in names:
-            FlowSettings(method=name)
+            StreamSpec.from_dict({"flow_method": name})
         if asked.every < 1 or asked.samples < 1:
             raise UsageError("--every and --samples: give at least 1")
         pairs = scenes(textures(asked.videos), HEIGHT_PX, WIDTH_PX, every=asked.every)
@@ -370,7 +367,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             records += accuracy(name, estimate, pairs)
         if asked.corpus is not None:
             default = FlowSettings().method
-            listed = [default, *(name for name in names if name not in (default, "deepflow"))]
+            listed = [default, *(name for name in names if name != default)]
             records += cost(asked.corpus, asked.rows, listed, asked.samples)
     except (V2VError, OSError) as error:
         print(f"v2v_bench.accuracy.flow: {error}", file=sys.stderr)

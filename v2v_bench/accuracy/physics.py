@@ -33,7 +33,7 @@ from v2v_bench.accuracy.scenes import SECONDS, START_SHARE, analytic_scenes, mov
 from v2v_bench.speed.dense import bin_events, dense_events
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
-from v2v_server.flow.methods import METHODS
+from v2v_server.flow.methods import estimator
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.noise import start_uniforms
@@ -192,7 +192,7 @@ def _liveliest(frames: Frames, side: int) -> Frames:
 
 def _motion(frames: Frames, every: int) -> Reals:
     """Length of the flow over ``every`` frames in the middle of each bin, [bins, pixels], px; dense inverse search."""
-    estimate = METHODS["dis-fast-1"].estimator()
+    estimate = estimator("dis-fast-1")
     middle = range(VIDEO_BIN_FRAMES // 2, len(frames) - 1, VIDEO_BIN_FRAMES)
     fields = [estimate(frames[i - every // 2], frames[i - every // 2 + every]) for i in middle]
     return np.stack([np.linalg.norm(field, axis=-1).ravel() for field in fields]).astype(np.float64)

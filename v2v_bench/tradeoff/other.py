@@ -38,7 +38,7 @@ from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.view import apply_view
 
 BASE, KERNEL = "exact sample", "kernel"
-FLOW_METHODS: tuple[FlowMethod, ...] = ("dis-ultrafast-1", "dis-fast-1", "auto", "dis-medium")
+FLOW_METHODS: tuple[FlowMethod, ...] = ("auto", "dis-fast-1")
 _EVERY_PAIR = 5
 
 Compressor = Callable[[bytes], bytes]

@@ -34,8 +34,7 @@ from v2v_server.catalogue.scene import (
     TILES,
     Scene,
 )
-from v2v_server.flow import dis
-from v2v_server.flow.estimator import Picture, guarded, one_thread
+from v2v_server.flow.methods import ULTRAFAST, Picture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
 CLIPPED_FROM_LEVEL = 250
@@ -65,7 +64,7 @@ class Look:
     """Watches a video go by. Memory: three pictures, and some hundred bytes a frame."""
 
     def __init__(self) -> None:
-        self._search = guarded(dis.dis(dis.ULTRAFAST, 1), dis.SMALLEST_SIDE_PX)
+        self._search = dis(ULTRAFAST, 1)
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
         self._last: Picture | None = None

@@ -2,9 +2,11 @@
 
 A field f on the grid of picture A says where what A shows has gone in picture B: B(x + f(x)) = A(x), pixels, (x, y), x
 to the right and y down. Forward flow lies on the grid of the earlier picture, backward flow on that of the later one.
+
+    methods.py   the estimators by name, and how "auto" chooses among them
+    clip.py      the flow of a sample: which pictures, on which part, and where it can be believed
 """
 
-from v2v_server.flow.clip import FlowClip, flow_for, flow_window, view_part
-from v2v_server.flow.settings import DIRECTIONS, FlowSettings
+from v2v_server.flow.clip import FlowClip, FlowSettings, flow_for, flow_window, view_part
 
-__all__ = ["DIRECTIONS", "FlowClip", "FlowSettings", "flow_for", "flow_window", "view_part"]
+__all__ = ["FlowClip", "FlowSettings", "flow_for", "flow_window", "view_part"]

@@ -16,17 +16,39 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.flow.auto import STILL, choose
-from v2v_server.flow.estimator import Estimator, Picture, one_thread
-from v2v_server.flow.methods import method
-from v2v_server.flow.settings import AUTO, FlowSettings
-from v2v_server.flow.validity import consistent
+from v2v_protocol.spec import StreamSpec
+from v2v_server.flow.methods import AUTO, STILL, Estimator, Field, Picture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window
 from v2v_server.system.opencv import cv2
 
 SKIPPED = "skipped"
 PAUSED = "paused"
+_CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class FlowSettings:
+    """How the flow of a clip is made: the flow fields of a ``StreamSpec``, which checks them.
+
+    Attributes:
+        method: a name of :data:`v2v_server.flow.methods.METHODS`, or "auto": each pair's own motion decides.
+        direction: "forward", on the grid of the earlier frame, or "backward", on that of the later one.
+        first_voxel: flow of the voxels before this one is not computed but zero (20: the half rule of the temporal
+            consistency loss).
+        margin_px: estimated on the crop and this much of the picture around it; None: on the whole picture.
+    """
+
+    method: str = AUTO
+    direction: str = "forward"
+    first_voxel: int = 0
+    margin_px: int | None = 64
+
+    @classmethod
+    def of(cls, spec: StreamSpec) -> FlowSettings:
+        """The settings that a stream's spec states."""
+        margin_px = None if spec.flow_margin_px < 0 else spec.flow_margin_px
+        return cls(spec.flow_method, spec.flow_direction, spec.flow_from, margin_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +143,9 @@ def flow_for(
             first, second = (earlier, later) if settings.direction == "forward" else (later, earlier)
             name = choose(first, second) if planned == AUTO else planned
             methods.append(name)
-            estimate = estimators.setdefault(name, method(name).estimator())
+            if name not in estimators:
+                estimators[name] = estimator(name)
+            estimate = estimators[name]
             field = estimate(first, second)
             flow[voxel] = pictures.crop(field, params.flip).transpose(2, 0, 1)
             if params.flip:
@@ -129,6 +153,33 @@ def flow_for(
             if valid is not None:
                 valid[voxel, 0] = pictures.crop(consistent(field, estimate(second, first)), params.flip)
     return FlowClip(flow, valid, tuple(methods))
+
+
+def consistent(field: Field, opposite: Field) -> npt.NDArray[np.bool_]:
+    """Where following a field and then its opposite leads back to the start:
+
+        |f(x) + g(x + f(x))|^2 < 0.01 (|f(x)|^2 + |g(x + f(x))|^2) + 0.5
+
+    (Sundaram, Brox and Keutzer, "Dense Point Trajectories by GPU-Accelerated Large Displacement Optical Flow", ECCV
+    2010, equation 5). It fails where a pixel is hidden in the other picture; one that leaves the picture is invalid
+    too.
+
+    Args:
+        field: f, [h, w, 2] float32, px.
+        opposite: g, on the grid of the other picture.
+
+    Returns:
+        [h, w] bool.
+    """
+    height, width = field.shape[:2]
+    x = field[..., 0] + np.arange(width, dtype=np.float32)
+    y = field[..., 1] + np.arange(height, dtype=np.float32)[:, None]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    back = cv2.remap(opposite, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    gap = ((field + back) ** 2).sum(axis=-1)
+    length = (field**2).sum(axis=-1) + (back**2).sum(axis=-1)
+    agree: npt.NDArray[np.bool_] = inside & (gap < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
+    return agree
 
 
 class _Pictures:

@@ -1,72 +1,151 @@
-"""The methods by name."""
+"""The methods by name, and the choice among them.
+
+All of them are zero or dense inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016)
+by OpenCV: patches are matched from coarse to fine down to a finest scale, whose field is then enlarged. Scale 2 is a
+quarter of the picture's size; scale 1 takes two to three times as long and resolves motion that scale 2 blurs.
+
+``auto`` chooses for each pair of pictures by a cheap look at how much moves:
+
+- Still: no block of 8 x 8 pixels changes its mean by more than 1.5 grey levels. A coder's noise averages out in a
+  block, a moving edge does not. The flow is zero.
+- Slow: 95 % of the picture moves less than half a pixel. Dense inverse search without refinement is then as good as
+  with it, at half the time.
+- Otherwise with refinement. Of the methods whose median error on pans and zooms is below a quarter of a pixel it is the
+  cheapest that also holds on frames of little texture (docs/flow.md).
+
+The look takes about a third of the time of the costliest choice: dense inverse search on the picture at a quarter of
+its size.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_server.flow import deepflow, dis, farneback, sparse
-from v2v_server.flow.estimator import Estimator, Field, Picture, guarded
+from v2v_server.system.opencv import cv2
+
+Picture = npt.NDArray[np.uint8]
+"""[h, w] uint8, C-contiguous."""
+Field = npt.NDArray[np.float32]
+"""[h, w, 2] float32, (x, y), px."""
+Estimator = Callable[[Picture, Picture], Field]
+"""estimate(A, B): the field on the grid of A that leads to B. The result does not depend on earlier calls. It holds
+buffers, so each thread needs its own."""
+
+ULTRAFAST, FAST, MEDIUM = range(3)
+"""OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*: naming them here would load it."""
+SMALLEST_SIDE_PX = 64
+"""OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
+
+AUTO, STILL, SLOW, MOVING = "auto", "zero", "dis-ultrafast", "dis-fast"
+_BLOCK_PX = 8
+STILL_GREY_LEVELS = 1.5
+_SHRINK = 4
+SLOW_PX = 0.5
+_MOST_OF_THE_PICTURE = 0.95
 
 
-@dataclass(frozen=True, slots=True)
-class Method:
-    """One way to estimate flow.
+def zero() -> Estimator:
+    """An estimator for which nothing ever moves."""
+    return lambda first, second: np.zeros((*first.shape, 2), np.float32)
 
-    Attributes:
-        create: makes an estimator; it holds buffers, so each thread needs its own.
-        smallest_side_px: pictures with a smaller side are enlarged first.
+
+def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estimator:
+    """Dense inverse search with a preset's number of iterations, patch stride and refinement; guarded.
+
+    Args:
+        preset: ULTRAFAST, FAST or MEDIUM.
+        finest_scale: the pyramid level that matching ends at; 0 is the full picture.
+        refinements: iterations of the variational refinement; None: the preset's, 5 (ultrafast: none).
     """
+    search = cv2.DISOpticalFlow.create(preset)
+    if refinements is not None:
+        search.setVariationalRefinementIterations(refinements)
 
-    create: Callable[[], Estimator]
-    smallest_side_px: int = 1
-
-    def estimator(self) -> Estimator:
-        """A new estimator, guarded."""
-        return guarded(self.create(), self.smallest_side_px)
-
-
-def _zero() -> Estimator:
     def estimate(first: Picture, second: Picture) -> Field:
-        return np.zeros((*first.shape, 2), np.float32)
+        # A small picture makes OpenCV lower the finest scale, and leave it so for the pictures that follow.
+        search.setFinestScale(finest_scale)
+        field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
+        return field
 
-    return estimate
+    return guarded(estimate, SMALLEST_SIDE_PX)
 
 
-def _dis(preset: int, finest_scale: int, patch_stride_px: int | None = None, refinements: int | None = None) -> Method:
-    return Method(partial(dis.dis, preset, finest_scale, patch_stride_px, refinements), dis.SMALLEST_SIDE_PX)
-
-
-METHODS: Mapping[str, Method] = MappingProxyType(
+METHODS: Mapping[str, Callable[[], Estimator]] = MappingProxyType(
     {
-        "zero": Method(_zero),
-        "dis-ultrafast": _dis(dis.ULTRAFAST, 2),
-        "dis-ultrafast-1": _dis(dis.ULTRAFAST, 1),
-        "dis-fast": _dis(dis.FAST, 2),
-        "dis-fast-lean": _dis(dis.FAST, 2, None, 3),
-        "dis-fast-1": _dis(dis.FAST, 1),
-        "dis-fast-1-stride-6": _dis(dis.FAST, 1, 6),
-        "dis-medium": _dis(dis.MEDIUM, 1),
-        "dis-medium-0": _dis(dis.MEDIUM, 0),
-        "farneback": Method(farneback.farneback, farneback.SMALLEST_SIDE_PX),
-        "sparse-to-dense": Method(sparse.sparse_to_dense, sparse.SMALLEST_SIDE_PX),
-        "deepflow": Method(deepflow.deepflow, deepflow.SMALLEST_SIDE_PX),
+        STILL: zero,
+        SLOW: partial(dis, ULTRAFAST, 2),
+        MOVING: partial(dis, FAST, 2),
+        "dis-fast-lean": partial(dis, FAST, 2, 3),
+        "dis-fast-1": partial(dis, FAST, 1),
     }
 )
-"""Every method. The number behind a preset of dense inverse search is its finest scale where that is not OpenCV's."""
+"""What makes an estimator of each method. "lean" refines three times, not five; "1" is the finest scale."""
 
 
-def method(name: str) -> Method:
-    """The method of that name.
+def estimator(name: str) -> Estimator:
+    """A new estimator of that method.
 
     Raises:
         UsageError: no such method; the message lists them.
     """
     if name not in METHODS:
         raise UsageError(f"flow method {name!r}: choose one of {', '.join(METHODS)}")
-    return METHODS[name]
+    return METHODS[name]()
+
+
+def choose(first: Picture, second: Picture) -> str:
+    """The name of the method that "auto" takes for a pair of [h, w] uint8 pictures."""
+    change = cv2.subtract(first, second, dtype=cv2.CV_32F)
+    if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= STILL_GREY_LEVELS:
+        return STILL
+    field = dis(ULTRAFAST, 1)(_shrunk(first, _SHRINK), _shrunk(second, _SHRINK))
+    pace = np.quantile(np.hypot(field[..., 0], field[..., 1]), _MOST_OF_THE_PICTURE) * _SHRINK
+    return SLOW if pace < SLOW_PX else MOVING
+
+
+def _shrunk(picture: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
+    height, width = picture.shape
+    size = (max(1, width // factor), max(1, height // factor))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def guarded(estimate: Estimator, smallest_side_px: int) -> Estimator:
+    """The same estimator, made safe.
+
+    Equal pictures have exactly zero flow, whatever the method makes of them. A picture with a side below
+    ``smallest_side_px`` is enlarged by repeating its border: methods fail on such, some by a segmentation fault.
+    """
+
+    def safe(first: Picture, second: Picture) -> Field:
+        height, width = first.shape
+        if np.array_equal(first, second):
+            return np.zeros((height, width, 2), np.float32)
+        below, right = max(0, smallest_side_px - height), max(0, smallest_side_px - width)
+        if below or right:
+            first, second = (
+                cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
+                for picture in (first, second)
+            )
+        return estimate(first, second)[:height, :width]
+
+    return safe
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV with one thread: a server worker is one core's worth of work, and how a picture is divided among threads
+    cannot change a result."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -10,8 +10,8 @@ crop touches and in the segments between the voxel's two frames:
               at the pair itself
     moving    else: dis-fast-lean
 
-The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.auto`), spared its look. Where
-it would take dis-fast, dis-fast-lean refines three times instead of five, within the tolerance (docs/scene.md).
+The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.methods`), spared its look.
+Where it would take dis-fast, dis-fast-lean refines three times instead of five, within the tolerance (docs/scene.md).
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import CHANGE, CLIPPED, DARK, FLICKER, LAG_FRAMES, MOTION, NOISE, TILES, Scene
-from v2v_server.flow.auto import SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
-from v2v_server.flow.settings import AUTO
+from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
 
 MOVING = "dis-fast-lean"
 TOLERANCE_PX = 0.05

@@ -5,21 +5,19 @@ from __future__ import annotations
 import pytest
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.spec import FLOW_DIRECTIONS, FLOW_METHODS, StreamSpec
-from v2v_server.flow import DIRECTIONS, FlowSettings
-from v2v_server.flow.methods import METHODS
-from v2v_server.flow.settings import AUTO
+from v2v_protocol.spec import FLOW_METHODS, StreamSpec
+from v2v_server.flow import FlowSettings
+from v2v_server.flow.methods import AUTO, METHODS
 
 
 def test_both_sides_know_the_same_names() -> None:
     assert (AUTO, *METHODS) == FLOW_METHODS
-    assert FLOW_DIRECTIONS == DIRECTIONS
     assert FlowSettings.of(StreamSpec()) == FlowSettings()
 
 
 def test_settings_of_a_spec() -> None:
-    spec = StreamSpec(flow_method="deepflow", flow_direction="backward", flow_from=20, flow_margin_px=-1)
-    assert FlowSettings.of(spec) == FlowSettings("deepflow", "backward", 20, None)
+    spec = StreamSpec(flow_method="dis-fast-1", flow_direction="backward", flow_from=20, flow_margin_px=-1)
+    assert FlowSettings.of(spec) == FlowSettings("dis-fast-1", "backward", 20, None)
 
 
 def test_what_cannot_be_is_refused_before_anything_is_sent() -> None:

@@ -9,7 +9,7 @@ import sys
 import cv2 as real
 import pytest
 
-from v2v_server.flow import dis
+from v2v_server.flow import methods
 from v2v_server.system.opencv import cv2
 
 
@@ -21,16 +21,19 @@ def test_it_is_opencv() -> None:
 
 
 def test_presets_have_opencvs_numbers() -> None:
-    assert dis.ULTRAFAST == real.DISOPTICAL_FLOW_PRESET_ULTRAFAST
-    assert dis.FAST == real.DISOPTICAL_FLOW_PRESET_FAST
-    assert dis.MEDIUM == real.DISOPTICAL_FLOW_PRESET_MEDIUM
+    assert methods.ULTRAFAST == real.DISOPTICAL_FLOW_PRESET_ULTRAFAST
+    assert methods.FAST == real.DISOPTICAL_FLOW_PRESET_FAST
+    assert methods.MEDIUM == real.DISOPTICAL_FLOW_PRESET_MEDIUM
 
 
 @pytest.mark.parametrize(
     ("code", "is_loaded"),
     [
         ("import v2v_server.worker.conversation", False),
-        ("import numpy as np; from v2v_server.flow.auto import choose; choose(*np.zeros((2, 32, 32), np.uint8))", True),
+        (
+            "import numpy as np; from v2v_server.flow.methods import choose; choose(*np.zeros((2, 32, 32), np.uint8))",
+            True,
+        ),
     ],
 )
 def test_a_worker_loads_it_with_its_first_use(code: str, is_loaded: bool) -> None:

@@ -130,11 +130,11 @@ def test_reasons_state_the_figures() -> None:
 
 
 def test_a_method_that_was_asked_for_is_obeyed() -> None:
-    asked = StreamSpec(recipe=RECIPE, scene="auto", flow_method="dis-medium")
+    asked = StreamSpec(recipe=RECIPE, scene="auto", flow_method="dis-fast-1")
     plan = plan_flow(scene(0.0, 0.0), 0, params(), asked, SIZE_PX, SIZE_PX)
     assert plan.methods == ()
     assert not plan.still
-    assert plan.reason.startswith("still; flow dis-medium as asked; ")
+    assert plan.reason.startswith("still; flow dis-fast-1 as asked; ")
 
 
 # --- sequences --------------------------------------------------------------------------------------------------------
