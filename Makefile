@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OLD_NUMPY := .venv-old-numpy
+DOCS := .venv-docs
 CLIPS := .demo/videos
 
-.PHONY: help demo test test-slow test-old-numpy check format clean
+.PHONY: help demo test test-slow test-old-numpy check docs format clean
 
 help:
 	@echo "make demo            stream real clips through a server into a dataset, train on them; leaves out/*.png"
@@ -14,6 +15,7 @@ help:
 	@echo "make test-slow       the tests that take longer"
 	@echo "make test-old-numpy  golden bytes of samples under an older numpy"
 	@echo "make check           formatting, lint, types"
+	@echo "make docs            the documentation as a site, in out/site"
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -54,9 +56,18 @@ check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+$(DOCS)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(DOCS)
+	$(DOCS)/bin/python -m pip install --quiet --constraint constraints.txt 'mkdocs-material>=9.5' 'mkdocstrings[python]>=0.26'
+	touch $@
+
+# The pages' own tools, apart: they need no package of ours, and ours need none of them.
+docs: $(DOCS)/.ready
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(OLD_NUMPY) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -70,6 +70,8 @@ def test_the_protocol_needs_next_to_nothing(path: Path) -> None:
 def test_packages_keep_apart(package: str) -> None:
     for path in modules(package):
         crossed = imported(path.read_text(encoding="utf-8")) & FORBIDDEN[package]
+        if path.name == "in_process.py":
+            crossed -= {"v2v_server"}  # the one door, opened when it is used
         assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
 
 

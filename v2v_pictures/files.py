@@ -63,7 +63,7 @@ def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second
         f'<!doctype html><meta charset="utf-8"><title>{html.escape(title)}</title>'
         "<style>body{font-family:sans-serif;margin:2rem auto;max-width:1600px;padding:0 1rem;background:#fff}"
         "img,video{max-width:100%;height:auto;display:block;margin:1rem 0}</style>"
-        f"<h1>{html.escape(title)}</h1>{video}"
+        f"{video}"
         f'<img alt="frames, event bins and flow of each virtual camera" src="data:image/png;base64,{picture}">\n'
     )
 

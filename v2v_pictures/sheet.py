@@ -19,6 +19,8 @@ from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow
 MARGIN_PX, GAP_PX = 28, 8
 _TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 62, 46, 26, 46, 96
 _STRIP_LABEL_PX = 116
+_LEAST_SOURCE_PX = 120
+_HATCH_PX = 7
 _MOST_BINS = 8
 
 
@@ -108,7 +110,8 @@ def _camera_line(page: Canvas, camera: Camera, number: int, top: int) -> None:
         x = page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
     x = page.text(x + 18, top + 3, camera.describe(), colour=canvas.SOFT)
     right = page.width_px - MARGIN_PX
-    page.text(right, top + 3, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
+    if right - x > _LEAST_SOURCE_PX:
+        page.text(right, top + 3, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
 
 
 def draw_strip(
@@ -134,7 +137,7 @@ def draw_strip(
     highest = max(float(np.quantile(rates, 0.99)), 1e-9)
     label = _STRIP_LABEL_PX
     page.text(left, top + height / 2 - 16, "events a pixel")
-    page.text(left, top + height / 2, f"up to {highest:.2g} a bin", colour=canvas.SOFT)
+    page.text(left, top + height / 2, f"up to {highest:.1g} a bin", colour=canvas.SOFT)
     left, width = left + label, width - label
     count = rates.shape[1]
     at = [left + width * number / count for number in range(count + 1)]
@@ -145,6 +148,9 @@ def draw_strip(
         up, down = np.minimum(rates[:, number] / highest, 1.0) * (height / 2)
         page.box(at[number], middle - up, at[number + 1], middle, BRIGHTER)
         page.box(at[number], middle, at[number + 1], middle + down, DARKER)
+    for start, end in zip(edges[::2], edges[1::2], strict=True):  # seen behind full bars too
+        page.hatch(at[start], top, at[end], top + _HATCH_PX)
+        page.hatch(at[start], top + height - _HATCH_PX, at[end], top + height)
     page.line(left, middle, left + width, middle, canvas.LINE)
     page.frame(left, top, left + width, top + height)
     for start, end in zip(edges[::2], edges[1::2], strict=True):

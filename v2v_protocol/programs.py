@@ -58,6 +58,7 @@ def environment() -> dict[str, str]:
 serve = _program("v2v-serve", "v2v_server.commands.cli", "serve", "server")
 worker = _program("v2v-worker", "v2v_server.commands.cli", "worker", "server")
 simulate = _program("v2v-simulate", "v2v_server.commands.cli", "simulate", "server")
+preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server")
 prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
 loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")

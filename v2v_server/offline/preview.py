@@ -77,7 +77,8 @@ def preview(
     """
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {', '.join(KINDS)}")
-    write(out, b"")  # before any work: whether it can be written
+    if not out.parent.is_dir():  # before any work
+        raise UsageError(f"--out {out}: there is no folder {out.parent}")
     catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), cache_dir=cache_dir)
     try:
         cameras = [_camera(catalogue, look, spec, with_flow, say) for look in looks]

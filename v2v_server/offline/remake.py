@@ -14,7 +14,7 @@ from v2v_pictures.camera import Camera, check_drawable
 from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
-from v2v_protocol.sample import Sample, SampleId, array_layout
+from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
@@ -30,6 +30,92 @@ _MOMENTS = 4
 """Voxel grids that a picture shows."""
 
 
+class Remaker:
+    """Makes samples of one stream, each by its name: the same bytes a server streams.
+
+    Args:
+        catalogue: the corpus.
+        spec: the stream's spec.
+        arrays: which arrays to make.
+        quarantine, snapshot: the quarantine and the snapshot to make them under; the empty one by default.
+
+    Attributes:
+        count: samples of an epoch.
+
+    Raises:
+        UsageError: arrays nobody makes.
+        CorpusError: no video gives a sequence.
+    """
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        spec: StreamSpec,
+        arrays: tuple[str, ...] = DEFAULT_ARRAYS,
+        quarantine: Quarantine | None = None,
+        snapshot: int = 0,
+    ) -> None:
+        array_layout(spec.recipe, spec.voxel_dtype, arrays)
+        self._catalogue, self._spec, self._arrays = catalogue, spec, arrays
+        self._quarantine, self._snapshot = quarantine or Quarantine(), snapshot
+        table = SequenceTable(catalogue.videos, catalogue.rows, spec)
+        if not table.count:
+            story = "; ".join(
+                f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
+            )
+            raise CorpusError(f"no video gives a sequence: {story}")
+        self._schedule = Schedule.of(table, spec)
+        self.count = self._schedule.count
+
+    def sample(self, seed: int, epoch: int, index: int) -> Sample:
+        """The sample of this name, candidates and refusals included.
+
+        Raises:
+            UsageError: an index outside the epoch.
+            SampleUnavailable: no candidate could give the sample.
+            VideoUnreadable: this host cannot read a candidate's file, whatever a server made of it.
+        """
+        catalogue, spec = self._catalogue, self._spec
+        SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
+        if index >= self.count:
+            raise UsageError(f"index {index}: the epoch has {self.count} samples, 0 .. {self.count - 1}")
+        request = Request(b"", epoch, index, snapshot=self._snapshot)
+        most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
+        while request.candidate < most:
+            sequence = self._schedule.candidate(seed, epoch, index, request.candidate)
+            video = sequence.video
+            condemned = self._quarantine.refusal(self._snapshot, video.id, video.fingerprint, sequence.start_frame)
+            if condemned is not None:
+                request = next_candidate(request, video.id, None, condemned)
+                continue
+            lease = lease_for(
+                request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
+            )
+            try:
+                return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+            except VideoError as error:
+                if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
+                    raise
+                request = next_candidate(request, lease.video, error.frame, error.reason)
+        refusals = "; ".join(dict.fromkeys(map(str, request.refusals)))
+        raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: {refusals}")
+
+
+def open_remaker(
+    source: str,
+    *,
+    rows: str,
+    list_file: str | None,
+    cache_dir: str | None,
+    spec: StreamSpec,
+    arrays: tuple[str, ...],
+) -> Remaker:
+    """From what a user names; errors as of :func:`open_catalogue` and :class:`Remaker`."""
+    scene = spec.scene != "off"
+    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
+    return Remaker(catalogue, spec, arrays)
+
+
 def remake(
     catalogue: Catalogue,
     spec: StreamSpec,
@@ -37,60 +123,12 @@ def remake(
     seed: int,
     epoch: int,
     index: int,
-    arrays: tuple[str, ...] = ("voxels", "frames"),
+    arrays: tuple[str, ...] = DEFAULT_ARRAYS,
     quarantine: Quarantine | None = None,
     snapshot: int = 0,
 ) -> Sample:
-    """The sample of an identity: the same bytes a server streams, candidates and refusals included.
-
-    Args:
-        catalogue: the corpus.
-        spec: the stream's spec.
-        seed, epoch, index: the rest of the identity.
-        arrays: which arrays to make.
-        quarantine, snapshot: the quarantine and the number of the snapshot to make it under; the empty one by default.
-
-    Raises:
-        UsageError: an index outside the epoch, or arrays nobody makes.
-        CorpusError: no video gives a sequence.
-        SampleUnavailable: no candidate could give the sample.
-        VideoUnreadable: this host cannot read a candidate's file, whatever a server made of it.
-    """
-    array_layout(spec.recipe, spec.voxel_dtype, arrays)
-    SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
-    table = SequenceTable(catalogue.videos, catalogue.rows, spec)
-    if not table.count:
-        story = "; ".join(
-            f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
-        )
-        raise CorpusError(f"no video gives a sequence: {story}")
-    schedule = Schedule.of(table, spec)
-    if index >= schedule.count:
-        raise UsageError(f"index {index}: the epoch has {schedule.count} samples, 0 .. {schedule.count - 1}")
-    held = quarantine or Quarantine()
-    request = Request(b"", epoch, index, snapshot=snapshot)
-    most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
-    while request.candidate < most:
-        sequence = schedule.candidate(seed, epoch, index, request.candidate)
-        quarantined = held.refusal(snapshot, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
-        if quarantined is not None:
-            request = next_candidate(request, sequence.video.id, None, quarantined)
-            continue
-        lease = lease_for(
-            request,
-            sequence=sequence,
-            catalogue=catalogue,
-            spec=spec,
-            seed=seed,
-            arrays=arrays,
-        )
-        try:
-            return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
-        except VideoError as error:
-            if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
-                raise
-            request = next_candidate(request, lease.video, error.frame, error.reason)
-    raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: " + "; ".join(map(str, request.refusals)))
+    """One sample of an identity. Arguments and errors: see :class:`Remaker`."""
+    return Remaker(catalogue, spec, arrays, quarantine, snapshot).sample(seed, epoch, index)
 
 
 def _is_left_out(catalogue: Catalogue, video: str) -> bool:

@@ -220,7 +220,7 @@ def test_the_command(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
 
 def test_the_entry_knows_every_benchmark_that_the_documents_name() -> None:
     root = Path(cli.__file__).parent.parent
-    texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "benchmarks").glob("*.py")]
+    texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "v2v_bench").rglob("*.py")]
     named = {name for path in texts for name in re.findall(r"v2v-bench ([a-z][a-z_]*)", path.read_text("utf-8"))}
     assert {"training_trade", "gpu_feed", "throughput"} <= set(cli.names())
     assert len(named) > 5

@@ -1,0 +1,121 @@
+"""`v2v-preview`: every kind of file, recipes side by side, videos too short or too small, and what is refused."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image as Pictures
+
+from tests.clips import panned_luma, write_clip
+from v2v_protocol.errors import CorpusError, UsageError
+from v2v_server.commands import preview as command
+from v2v_server.offline.preview import Look, preview
+
+TINY = {"voxels_per_clip": 3, "crop_height_px": 48, "crop_width_px": 64}
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("clips") / "gliding.mp4", panned_luma(40, 96, 128))
+
+
+def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> None:
+    for kind in ("png", "mp4", "gif", "html"):
+        out = tmp_path / f"preview.{kind}"
+        preview(
+            str(clip), out, [Look("a", TINY, 0), Look("b", TINY, 1)], {}, title="t", cache_dir=str(tmp_path),
+            with_flow=kind == "png", say=lambda line: None,
+        )  # fmt: skip
+    with Pictures.open(tmp_path / "preview.png") as picture:
+        assert picture.format == "PNG"
+    with Pictures.open(tmp_path / "preview.gif") as picture:
+        assert picture.n_frames == -(-3 * 5 // 2)
+    with av.open(io.BytesIO((tmp_path / "preview.mp4").read_bytes())) as film:
+        assert len(list(film.decode(video=0))) == 3 * 5
+    assert "data:image/png;base64," in (tmp_path / "preview.html").read_text()
+
+
+def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    looks = [Look("paper", "paper", 0)]
+    preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
+    assert "paper: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
+    assert said[1] == f"{tmp_path / 'p.png'}: 1 cameras"
+
+
+def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
+    still = write_clip(tmp_path / "still.mp4", panned_luma(1, 64, 64))
+    with pytest.raises(CorpusError, match=r"still\.mp4"):
+        preview(str(still), tmp_path / "p.png", [Look("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
+    assert not (tmp_path / "p.png").exists()
+
+
+def test_the_command_compares_recipes_on_one_clip(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[tuple[str, int]] = []
+    drawn = command.preview
+
+    def spy(source: str, out: Path, looks: list[Look], *rest: object, **named: object) -> None:
+        seen.extend((look.title, look.seed) for look in looks)
+        drawn(source, out, looks, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(command, "preview", spy)
+    sets = [f"--set={name}={value}" for name, value in TINY.items()]
+    own = tmp_path / "own.yaml"
+    own.write_text("preset: paper\nthreshold: [0.3, 0.3]\n")
+    out = tmp_path / "c.png"
+    command.main(
+        [
+            str(clip),
+            "--out",
+            str(out),
+            "--compare",
+            "paper",
+            "noise-free",
+            str(own),
+            *sets,
+            "--cache-dir",
+            str(tmp_path),
+        ]
+    )
+    assert seen == [("paper", 0), ("noise-free", 0), ("own", 0)]
+    assert np.asarray(Pictures.open(out)).ndim == 3
+    assert capsys.readouterr().out == f"{out}: 3 cameras\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--out", "p.bmp"], "--out p.bmp: give a name that ends in .png, .mp4, .gif, .html"),
+        (["--out", "p.png", "--seeds", "0"], "--seeds 0: give 1 to 32"),
+        (["--out", "p.png", "--moments", "99"], "--moments 99: give 1 to 32"),
+        (["--out", "nowhere/p.png"], "--out nowhere/p.png: there is no folder nowhere"),
+        (["--out", "p.png", "--recipe", "paper", "--compare", "paper"], "leave --recipe out"),
+        (["--out", "p.png", "--recipe", "papr"], "paper"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_leaves_no_file(
+    flags: list[str],
+    said: str,
+    clip: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        command.main([str(clip), *flags])
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="ends in"):
+        preview(str(clip), tmp_path / "p.tiff", [Look("", "paper", 0)], {}, title="t")

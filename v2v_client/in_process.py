@@ -1,0 +1,136 @@
+"""The stream's samples without a server: any of them by its index, made in the process that asks.
+
+This is the one door from the client to the server's code. It opens when a dataset is made, and needs the extra
+``server``; nothing else of the client does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch.utils.data import Dataset
+from torch.utils.data._utils.collate import default_collate_fn_map
+
+from v2v_client.batch import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
+from v2v_protocol.spec import StreamSpec
+
+
+class V2VDataset(Dataset[Sample]):
+    """One epoch of a stream, indexable: ``dataset[i]`` is the very sample that a server streams under index i.
+
+        dataset = V2VDataset("my-videos/", recipe="paper")
+        dataset[0].arrays["voxels"]  # int8 [T, bins, H, W]
+        for batch in DataLoader(dataset, batch_size=12, num_workers=4):
+            batch.voxels  # a Batch, as from V2VStreamDataset, but for its resume_state, which is empty
+
+    For looking, testing and small experiments. It decodes in the process that asks, so it is as slow as decoding is;
+    for training use :class:`v2v_client.V2VStreamDataset`.
+
+    Args:
+        videos: folder tree of videos, a single video, or a list file.
+        recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe.
+        arrays: which of "voxels", "frames", "flow" and "flow_valid" to make.
+        seed, epoch: of the stream.
+        rows: rows of each picture to use, as for ``v2v-serve --rows``.
+        list_file: list file that restricts a folder.
+        cache_dir: folder of the catalogue's index; None: the user's cache.
+        **spec: other fields of :class:`v2v_protocol.spec.StreamSpec`.
+
+    Raises:
+        UsageError: an argument outside its range, or the extra ``server`` is not installed.
+        CorpusError: no video can be used, or none gives a sequence.
+    """
+
+    def __init__(
+        self,
+        videos: str | os.PathLike[str],
+        recipe: str | Mapping[str, Any] | Recipe | None = None,
+        arrays: Sequence[str] = DEFAULT_ARRAYS,
+        seed: int = 0,
+        epoch: int = 0,
+        rows: str = "full",
+        list_file: str | None = None,
+        cache_dir: str | None = None,
+        **spec: Any,
+    ) -> None:
+        if not 0 <= seed <= LARGEST_SEED or not 0 <= epoch <= LARGEST_EPOCH:
+            raise UsageError(f"seed = {seed}, epoch = {epoch}: give 0 to {LARGEST_SEED} and 0 to {LARGEST_EPOCH}")
+        self.seed, self.epoch = seed, epoch
+        self.spec = StreamSpec.from_dict({**spec, "recipe": recipe})
+        self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
+        self._source = (os.fspath(videos), rows, list_file, cache_dir)
+        self._maker: Any = None
+        self._process = 0
+        self._length = int(self._opened().count)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: int) -> Sample:
+        """The sample of this index.
+
+        Raises:
+            IndexError: outside 0 .. len - 1.
+            SampleUnavailable: no candidate could give it.
+        """
+        place = index + self._length if index < 0 else index
+        if not 0 <= place < self._length:
+            raise IndexError(f"index {index}: the epoch has {self._length} samples")
+        sample: Sample = self._opened().sample(self.seed, self.epoch, place)
+        return sample
+
+    def set_epoch(self, epoch: int) -> None:
+        """Chooses the epoch: other cameras and another order. Before a DataLoader starts its workers."""
+        self.epoch = epoch
+
+    def __repr__(self) -> str:
+        return f"V2VDataset({self._source[0]!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_maker": None}
+
+    def _opened(self) -> Any:
+        """The maker of samples, of this process's own: an index file that was open before a fork must not be read."""
+        if self._maker is None or self._process != os.getpid():
+            self._maker, self._process = _maker(*self._source, self.spec, self._arrays), os.getpid()
+        return self._maker
+
+
+def _maker(
+    videos: str, rows: str, list_file: str | None, cache_dir: str | None, spec: StreamSpec, arrays: tuple[str, ...]
+) -> Any:
+    try:
+        remake = importlib.import_module("v2v_server.offline.remake")
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"V2VDataset makes samples itself and needs the package {error.name}: pip install '.[server]' in a checkout"
+        ) from error
+    return remake.open_remaker(videos, rows=rows, list_file=list_file, cache_dir=cache_dir, spec=spec, arrays=arrays)
+
+
+def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
+    tensors = {
+        name: torch.stack([torch.from_numpy(sample.arrays[name]) for sample in samples]) for name in samples[0].arrays
+    }
+    named: dict[str, Any] = {name: tensors.get(name) for name in ARRAYS}
+    return Batch(
+        **named,
+        indices=tuple(sample.provenance.id.index for sample in samples),
+        epoch=samples[0].provenance.id.epoch,
+        provenance=tuple(sample.provenance for sample in samples),
+        resume_state={},
+        wait_seconds=0.0,
+        cpu_seconds=0.0,
+        decodes=len(samples),
+    )
+
+
+# PyTorch's place for what its default collate function shall do with a type it does not know.
+default_collate_fn_map[Sample] = _collate

@@ -1,0 +1,68 @@
+"""The command line of `v2v-preview`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from v2v_protocol.errors import UsageError
+from v2v_server.commands.cli import new_parser, run_command
+from v2v_server.config import recipe_setting
+from v2v_server.offline.preview import KINDS, Look, preview
+
+_MOST_CAMERAS = 32
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """`v2v-preview`."""
+    parser = new_parser("v2v-preview", "Show what a recipe makes of your videos: frames, events, flow, activity.")
+    parser.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
+    parser.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
+    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the first camera (default 0)")
+    parser.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
+    parser.add_argument(
+        "--compare", nargs="+", metavar="NAME", help="the same clip under these recipes instead, one camera each"
+    )
+    parser.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
+    parser.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    parser.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    parser.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
+    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    run_command(parser, _run, argv)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    for flag, value in (("--seeds", arguments.seeds), ("--moments", arguments.moments)):
+        if not 1 <= value <= _MOST_CAMERAS:
+            raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
+    if arguments.compare:
+        if arguments.recipe is not None:
+            raise UsageError("--compare names the recipes: leave --recipe out")
+        looks = [
+            Look(Path(name).stem, recipe_setting(name, arguments.set), arguments.seed) for name in arguments.compare
+        ]
+        what = "the same clip under " + ", ".join(look.title for look in looks)
+    else:
+        recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
+        looks = [Look(f"seed {seed}", recipe, seed) for seed in range(arguments.seed, arguments.seed + arguments.seeds)]
+        what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
+    preview(
+        arguments.source,
+        Path(arguments.out),
+        looks,
+        # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
+        {"shuffle": False} if arguments.compare else {},
+        title=f"{Path(arguments.source).name}: {what}",
+        list_file=arguments.list,
+        rows=arguments.rows,
+        with_flow=not arguments.no_flow,
+        moments=arguments.moments,
+        cache_dir=arguments.cache_dir,
+    )
+
+
+if __name__ == "__main__":
+    main()
