@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import difflib
 import typing
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Literal
 
 from trainer.models import NETWORKS
 from trainer.tasks import TASKS
+from trainer.tasks.task import chosen, limited
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
+from v2v_protocol.settings import Setting, nearest, of_type, settings_of, shown
 from v2v_protocol.spec import StreamSpec
 
 
@@ -35,7 +35,7 @@ class NetworkConfig:
         weights: checkpoint to take the first weights from; empty: random.
     """
 
-    name: str = "e2vid"
+    name: str = chosen("e2vid", NETWORKS)
     options: Mapping[str, Any] = field(default_factory=dict)
     weights: str = ""
 
@@ -59,13 +59,13 @@ class StreamConfig:
     videos: str = ""
     list: str = ""
     rows: str = "full"
-    workers: int = 2
-    batch_size: int = 12
+    workers: int = limited(2, 1, 4096)
+    batch_size: int = limited(12, 1, 65_536)
     recipe: Any = "paper"
-    seed: int = 0
+    seed: int = limited(0, 0, LARGEST_SEED)
     spec: Mapping[str, Any] = field(default_factory=dict)
-    loader_workers: int = 0
-    timeout_seconds: float = 60.0
+    loader_workers: int = limited(0, 0, 64)
+    timeout_seconds: float = limited(60.0, 0.1, 1e6)
 
     @property
     def resolved_recipe(self) -> Recipe:
@@ -93,14 +93,14 @@ class OptimizerConfig:
     """
 
     name: Literal["adam", "adamw"] = "adam"
-    learning_rate: float = 1e-4
-    weight_decay: float = 0.0
+    learning_rate: float = limited(1e-4, 1e-12, 1e3)
+    weight_decay: float = limited(0.0, 0, 1e3)
     amsgrad: bool = True
-    learning_rate_decay: float = 1.0
-    warmup_steps: int = 0
+    learning_rate_decay: float = limited(1.0, 1e-6, 1)
+    warmup_steps: int = limited(0, 0, 10**9)
     schedule: Literal["constant", "cosine"] = "constant"
-    clip_gradient_norm: float = 0.0
-    ema_decay: float = 0.0
+    clip_gradient_norm: float = limited(0.0, 0, 1e9)
+    ema_decay: float = limited(0.0, 0, 0.999999)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,11 +120,11 @@ class ComputeConfig:
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
-    pieces: int = 1
+    pieces: int = limited(1, 1, 65_536)
     channels_last: bool = False
     compile: bool = False
-    threads: int = 0
-    seed: int = 0
+    threads: int = limited(0, 0, 1024)
+    seed: int = limited(0, 0, 2**63 - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,61 +145,23 @@ class RunConfig:
     """
 
     out: str = ""
-    epochs: int = 1
-    steps: int = 0
-    seconds: float = 0.0
-    log_every: int = 20
-    save_every: int = 500
-    keep_epochs: int = 0
-    judge_every: int = 500
-    judge_samples: int = 4
-    preview_every: int = 500
-    preview_samples: int = 2
+    epochs: int = limited(1, 1, 1_000_000)
+    steps: int = limited(0, 0, 10**12)
+    seconds: float = limited(0.0, 0, 1e9)
+    log_every: int = limited(20, 1, 10**9)
+    save_every: int = limited(500, 1, 10**9)
+    keep_epochs: int = limited(0, 0, 1_000_000)
+    judge_every: int = limited(500, 0, 10**9)
+    judge_samples: int = limited(4, 1, 64)
+    preview_every: int = limited(500, 0, 10**9)
+    preview_samples: int = limited(2, 1, 64)
 
-
-_LIMITS: dict[str, tuple[float, float]] = {
-    "stream.workers": (1, 4096),
-    "stream.batch_size": (1, 65_536),
-    "stream.seed": (0, LARGEST_SEED),
-    "stream.loader_workers": (0, 64),
-    "stream.timeout_seconds": (0.1, 1e6),
-    "optimizer.learning_rate": (1e-12, 1e3),
-    "optimizer.weight_decay": (0, 1e3),
-    "optimizer.learning_rate_decay": (1e-6, 1),
-    "optimizer.warmup_steps": (0, 10**9),
-    "optimizer.clip_gradient_norm": (0, 1e9),
-    "optimizer.ema_decay": (0, 0.999999),
-    "compute.pieces": (1, 65_536),
-    "compute.threads": (0, 1024),
-    "compute.seed": (0, 2**63 - 1),
-    "run.epochs": (1, 1_000_000),
-    "run.steps": (0, 10**12),
-    "run.seconds": (0, 1e9),
-    "run.log_every": (1, 10**9),
-    "run.save_every": (1, 10**9),
-    "run.keep_epochs": (0, 1_000_000),
-    "run.judge_every": (0, 10**9),
-    "run.judge_samples": (1, 64),
-    "run.preview_every": (0, 10**9),
-    "run.preview_samples": (1, 64),
-}
 
 _SET_ELSEWHERE = {
     "recipe": "set stream.recipe instead",
     **dict.fromkeys(("flow_direction", "flow_from"), "section loss decides"),
 }
 """Fields of the spec that follow from other keys."""
-
-_KINDS: dict[Any, tuple[type[Any], str]] = {
-    float: (float, "a number"),
-    int: (int, "a whole number"),
-    bool: (bool, "true or false"),
-    str: (str, "text"),
-    Mapping[str, Any]: (Mapping, "keys and values"),
-    Any: (object, "a value"),
-}
-
-_CHOICES: dict[str, Collection[str]] = {"network.name": NETWORKS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,7 +213,7 @@ class TrainConfig:
         built = {}
         for name, content in values.items():
             if name not in sections:
-                raise UsageError(f"unknown key {name!r}{_nearest(name, sections)}; sections: {', '.join(sections)}")
+                raise UsageError(f"unknown key {name!r}{nearest(name, sections)}; sections: {', '.join(sections)}")
             built[name] = _section(sections[name], name, content)
         return cls(**built)
 
@@ -281,52 +243,27 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     return {f"{section}.{key}": value for section, content in values.items() for key, value in content.items()}
 
 
-def _section(kind: type[Any], name: str, content: Any) -> Any:
+def _section(kind: Any, name: str, content: Any) -> Any:
     if not isinstance(content, Mapping):
-        raise UsageError(f"{name} = {content!r}: it is a section, give keys and values")
-    hints = typing.get_type_hints(kind)
-    stated = {item.name: item.metadata for item in dataclasses.fields(kind)}
+        raise UsageError(f"{name} = {shown(content)}: it is a section, give keys and values")
+    hints, stated = typing.get_type_hints(kind), settings_of(kind)
     for key in content:
         if key not in hints:
-            raise UsageError(f"unknown key {name}.{key}{_nearest(str(key), hints)}; known: {', '.join(hints)}")
-    return kind(**{key: setting_of(f"{name}.{key}", hints[key], value, stated[key]) for key, value in content.items()})
+            raise UsageError(f"unknown key {name}.{key}{nearest(key, hints)}; known: {', '.join(hints)}")
+    return kind(**{
+        key: setting_of(f"{name}.{key}", hints[key], value, stated.get(key)) for key, value in content.items()
+    })  # fmt: skip
 
 
-def setting_of(key: str, hint: Any, value: Any, stated: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """``value`` in the kind that ``hint`` says, within the limits, and of the words, that are stated for its key.
+def setting_of(key: str, hint: Any, value: Any, stated: Setting | None = None) -> Any:
+    """``value`` in the kind, within the limits, and of the words, that are stated for its key or follow from its type.
 
     Raises:
         UsageError: it is of another kind, or outside; the message names the key.
     """
-    words = stated.get("words") or _CHOICES.get(key)
-    if typing.get_origin(hint) is Literal or words:
-        words = words or typing.get_args(hint)
-        if value not in words:
-            raise UsageError(f"{key} = {value!r}: choose one of {', '.join(words)}")
-        return value
-    if hint is float:
-        value = _number(key, value)
-    kind, word = _KINDS[hint]
-    if not isinstance(value, kind) or (hint is int and isinstance(value, bool)):
-        raise UsageError(f"{key} = {value!r}: give {word}")
-    limits = stated.get("limits") or _LIMITS.get(key)
-    if limits:
-        low, high = limits
-        if not low <= value <= high:
-            raise UsageError(f"{key} = {value!r}: give {word} from {low:g} to {high:g}")
+    setting = stated or of_type(hint)
+    if setting is not None:
+        return setting.check(key, value)
+    if hint == Mapping[str, Any] and not isinstance(value, Mapping):
+        raise UsageError(f"{key} = {shown(value)}: give keys and values")
     return copy.deepcopy(value)
-
-
-def _number(key: str, value: Any) -> float:
-    # YAML 1.1 reads 1e-4, without a point, as text.
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise UsageError(f"{key} = {value!r}: give a number")
-    try:
-        return float(value)
-    except ValueError as error:
-        raise UsageError(f"{key} = {value!r}: give a number") from error
-
-
-def _nearest(word: str, known: Any) -> str:
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,12 +1,4 @@
-"""``v2v-train``: train a network on the stream.
-
-    v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid
-    v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4
-    torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555
-
-Without an address it starts a server of its own. Ctrl-C and SIGTERM end the run after the present step and save it; the
-third one ends it at once.
-"""
+"""``v2v-train``: train a network on the stream."""
 
 from __future__ import annotations
 
@@ -26,38 +18,43 @@ from trainer.loop import Diverged, train
 from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from v2v_client.command import run_command
 from v2v_client.local_server import LocalServer
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
 
 SIGNAL_STATUS = 128
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="v2v-train",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Exit status: 0 trained to the end, 1 diverged, 2 wrong usage, input or no server, 128 + N ended and "
-        f"saved after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
-    )
-    parser.add_argument("config", metavar="CONFIG.yaml", help="a file, or the name of a shipped configuration")
-    source = parser.add_mutually_exclusive_group()
+def _parser() -> Parser:
+    parser = Parser(
+        "v2v-train", "CONFIG.yaml [flags]",
+        "Train a network on the stream. Without an address it starts a server of its own. Ctrl-C and SIGTERM end the "
+        "run after the present step and save it; the third one ends it at once.",
+        [
+            "v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid",
+            "v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4",
+            "torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555",
+        ],
+        "Exit status: 0 trained to the end, 1 diverged, 2 wrong usage, input or no server, 128 + N ended and saved "
+        f"after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
+    )  # fmt: skip
+    stream = parser.group("Stream")
+    source = stream.add_mutually_exclusive_group()
     source.add_argument("--connect", metavar="ADDRESS", help="of a running server (stream.address)")
     source.add_argument("--videos", metavar="DIR", help="start a server on these videos (stream.videos)")
-    parser.add_argument("--workers", type=int, metavar="N", help="of the started server (stream.workers)")
-    parser.add_argument(
+    stream.add_argument("--workers", type=int, metavar="N", help="of the started server (stream.workers)")
+    run = parser.group("Run")
+    run.add_argument("config", metavar="CONFIG.yaml", help="a file, or the name of a shipped configuration")
+    run.add_argument(
         "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="change one key, repeatable"
     )
-    parser.add_argument("--resume", metavar="FILE", help="checkpoint to go on from")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
+    run.add_argument("--resume", metavar="FILE", help="checkpoint to go on from")
+    run.add_argument(
+        "--out", metavar="DIR",
         help="folder of the run (run.out; default runs/NAME of the config, with --resume that of the checkpoint)",
-    )
-    parser.add_argument("--show-config", action="store_true", help="print all keys with their values, and end")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    )  # fmt: skip
+    run.add_argument("--show-config", action="store_true", help="print all keys with their values, and end")
     return parser
 
 

@@ -16,9 +16,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from v2v_protocol.command import INTERRUPTED, WRONG_USAGE, version_of
 from v2v_protocol.errors import V2VError
+from v2v_protocol.settings import nearest
 
-INTERRUPTED = 128 + signal.SIGINT
 _LINE_WIDTH = 104
 _HERE = Path(__file__).parent
 
@@ -45,6 +46,8 @@ BENCHMARKS = {
 }
 """Module of each benchmark, below this package."""
 
+_EXAMPLES = ("examples:", "  v2v-bench throughput --videos clips/", "  v2v-bench kernel --json kernel.json")
+
 
 def names() -> dict[str, str]:
     """What can be run: name and beginning of its docstring, read from the source without importing anything."""
@@ -59,7 +62,7 @@ def names() -> dict[str, str]:
 def usage() -> str:
     """The list of benchmarks."""
     lines = [f"  {name:14s} {line}" for name, line in names().items()]
-    return "\n".join(["usage: v2v-bench NAME [flags]     v2v-bench NAME --help", "", *lines])
+    return "\n".join(["usage: v2v-bench NAME [flags]     v2v-bench NAME --help", "", *lines, "", *_EXAMPLES])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,9 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("-h", "--help"):
         print(usage())
         return 0
+    if name == "--version":
+        print(version_of("v2v-bench"))
+        return 0
     if name not in BENCHMARKS:
-        print(f"v2v-bench: no benchmark {name!r}; known: {', '.join(BENCHMARKS)}", file=sys.stderr)
-        return 2
+        near, known = nearest(name, BENCHMARKS), ", ".join(BENCHMARKS)
+        print(f"v2v-bench: no benchmark {name!r}{near}; known: {known}", file=sys.stderr)
+        return WRONG_USAGE
     # Each main reads the command line itself, the way it does as a module of its own.
     before, sys.argv = sys.argv, [f"v2v-bench {name}", *rest]
     try:

@@ -46,7 +46,7 @@ def peak_rss_bytes(pid: int) -> int:
 def roles_of(server: LocalServer) -> dict[str, list[int]]:
     """The broker (the server's main process), its workers, and this process as the client."""
     children = psutil.Process(server.pid).children()
-    workers = [child.pid for child in children if "worker" in child.cmdline()]
+    workers = [child.pid for child in children if "v2v_server.commands.worker" in child.cmdline()]
     return {"workers": workers, "broker": [server.pid], "client": [os.getpid()]}
 
 

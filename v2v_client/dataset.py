@@ -7,7 +7,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from typing import Any
+from typing import Any, Unpack
 
 import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
@@ -26,6 +26,8 @@ from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
+from v2v_protocol.settings import require_whole
+from v2v_protocol.spec import SpecOptions
 
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
@@ -60,14 +62,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
         seed: of all random draws and of the order.
         epoch: the first one.
         rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
-        preset: speed against accuracy: "exact", "balanced" or "fast" (:data:`v2v_protocol.spec.SPEED_PRESETS`); the
-            options below may change what it sets.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, samples_per_decode, sibling_spacing,
-            flow_*, scene: see :class:`v2v_protocol.spec.StreamSpec`; None takes the server's.
         shared_memory: whether server workers on this host may put samples into memory of this process, which saves
             most of what moving them costs; where they cannot, samples come in messages by themselves.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
+        options: ``preset`` ("exact", "balanced" or "fast": speed, see :data:`v2v_protocol.spec.SPEED_PRESETS`) and
+            fields of :class:`v2v_protocol.spec.StreamSpec`, which may change what it sets; None takes the server's.
 
     A sample is made once for the position it is asked for; what a crash or a cut swallows is asked for again. So each
     sample comes once relative to the state that was saved, whichever process died in between.
@@ -100,54 +100,29 @@ class V2VStreamDataset(IterableDataset[Batch]):
         batch_size: int = 12,
         arrays: Sequence[str] = ("voxels", "frames"),
         recipe: str | Mapping[str, Any] | Recipe | None = None,
+        *,
         seed: int = 0,
         epoch: int = 0,
         rank: int | None = None,
         world_size: int | None = None,
-        preset: str | None = None,
-        voxel_dtype: str | None = None,
-        shuffle: bool | None = None,
-        max_sequences_per_video: int | None = None,
-        on_bad_video: str | None = None,
-        samples_per_decode: int | None = None,
-        sibling_spacing: int | None = None,
-        flow_method: str | None = None,
-        flow_direction: str | None = None,
-        flow_from: int | None = None,
-        flow_margin_px: int | None = None,
-        scene: str | None = None,
         shared_memory: bool = True,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
+        **options: Unpack[SpecOptions],
     ) -> None:
         super().__init__()
         if (rank is None) != (world_size is None):
             raise UsageError(f"rank = {rank}, world_size = {world_size}: give both or none")
         self._address = address
-        self._batch_size = _whole("batch_size", batch_size, 1, 65_536)
+        self._batch_size = require_whole("batch_size", batch_size, 1, 65_536)
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._seed = _whole("seed", seed, 0, LARGEST_SEED)
-        self._options = Options(
-            self._arrays,
-            preset=preset,
-            recipe=recipe,
-            voxel_dtype=voxel_dtype,
-            shuffle=shuffle,
-            max_sequences_per_video=max_sequences_per_video,
-            on_bad_video=on_bad_video,
-            samples_per_decode=samples_per_decode,
-            sibling_spacing=sibling_spacing,
-            flow_method=flow_method,
-            flow_direction=flow_direction,
-            flow_from=flow_from,
-            flow_margin_px=flow_margin_px,
-            scene=scene,
-        )
+        self._seed = require_whole("seed", seed, 0, LARGEST_SEED)
+        self._options = Options(self._arrays, recipe=recipe, **options)
         self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
         self._shared_memory = shared_memory
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
-        self._position = Position(_whole("epoch", epoch, 0, LARGEST_EPOCH))
+        self._position = Position(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
         self._offered: Stream | None = None  # what the server said when it was only asked
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
@@ -229,7 +204,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             UsageError: no such epoch; or it is accelerate that sets it.
         """
         require_epoch_of_ours()
-        self._position.set_epoch(_whole("epoch", epoch, 0, LARGEST_EPOCH))
+        self._position.set_epoch(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
         """The position after the last batch that this process took.
@@ -331,9 +306,3 @@ def _distributed() -> tuple[int, int] | None:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return None
-
-
-def _whole(name: str, value: Any, low: int, high: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise UsageError(f"{name} = {value!r}: give a whole number from {low} to {high}")
-    return value

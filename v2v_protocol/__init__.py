@@ -3,7 +3,9 @@
 Pure data: the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
 """
 
-PROTOCOL_VERSION = 3
+__version__ = "0.1.0"
+
+PROTOCOL_VERSION = 4
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""
 
 NUMERICS_VERSION = 3

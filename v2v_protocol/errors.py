@@ -67,7 +67,7 @@ class VideoError(V2VError):
 
 
 class VideoChanged(VideoError):
-    """The file differs from the one that was catalogued."""
+    """The file differs from the one that was catalogued (size, or hash of its head and tail)."""
 
 
 class VideoUnreadable(VideoError):

@@ -6,8 +6,8 @@
     worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), LeaseFailed, Ping, Goodbye
     server -> worker       Lease, Stop, Denied, Pong
 
-Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int
-or str, and Mapping (plain values, checked by whoever knows its form).
+Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
+float or str, and Mapping (plain values, checked by whoever knows its form).
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ class Lease:
         rows: rows of the picture that may be used, ``Rows`` syntax.
         width_px, height_px: of the upright picture, before rows.
         frames_per_second: average rate, for noise stated per second; 0 where unknown.
-        thresholds: (positive, negative) as float.hex() when the corpus states them for this video, else empty.
+        thresholds: (positive, negative) when the corpus states them for this video, else empty.
         start_frame: first frame of the sequence.
         frame_index: ``FrameIndex.to_bytes()`` of at least the part of the file that is needed.
         candidate: which candidate of the index this is.
@@ -256,7 +256,7 @@ class Lease:
     width_px: int
     height_px: int
     frames_per_second: float
-    thresholds: tuple[str, ...]
+    thresholds: tuple[float, ...]
     start_frame: int
     frame_index: bytes
     candidate: int

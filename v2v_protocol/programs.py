@@ -55,9 +55,9 @@ def environment() -> dict[str, str]:
     return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 
 
-serve = _program("v2v-serve", "v2v_server.commands.cli", "serve", "server")
-worker = _program("v2v-worker", "v2v_server.commands.cli", "worker", "server")
-simulate = _program("v2v-simulate", "v2v_server.commands.cli", "simulate", "server")
+serve = _program("v2v-serve", "v2v_server.commands.serve", "main", "server")
+worker = _program("v2v-worker", "v2v_server.commands.worker", "main", "server")
+simulate = _program("v2v-simulate", "v2v_server.commands.simulate", "main", "server")
 preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server")
 prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")

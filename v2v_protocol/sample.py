@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe, effect_settings
+from v2v_protocol.settings import require_whole
 
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
@@ -45,13 +46,9 @@ class SampleId:
     index: int
 
     def __post_init__(self) -> None:
-        for name, value, limit in (
-            ("seed", self.seed, LARGEST_SEED),
-            ("epoch", self.epoch, LARGEST_EPOCH),
-            ("index", self.index, LARGEST_INDEX),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
-                raise UsageError(f"{name} = {value!r}: give a whole number from 0 to {limit}")
+        require_whole("seed", self.seed, 0, LARGEST_SEED)
+        require_whole("epoch", self.epoch, 0, LARGEST_EPOCH)
+        require_whole("index", self.index, 0, LARGEST_INDEX)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,7 @@ class Setting:
         words: the choices of a word.
         unit: of a number, as in "px" or "Hz".
         group: heading under which help and the reference page show it.
+        metavar: what stands for the value in help.
         is_hidden: a program's own business: no line in help or on the reference page.
     """
 
@@ -49,6 +50,7 @@ class Setting:
     words: tuple[str, ...] = ()
     unit: str = ""
     group: str = ""
+    metavar: str = ""
     is_hidden: bool = False
 
     @property
@@ -107,12 +109,12 @@ class Setting:
         return low, high
 
     def _number(self, value: object) -> float | None:
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
             return None
         try:
-            # Minus zero equals zero, but would not give the same digest.
+            # Text, because YAML 1.1 takes 1e-3 for text. Minus zero equals zero, but would not give the same digest.
             number = float(value) + 0.0
-        except OverflowError:
+        except (OverflowError, ValueError):
             return None
         return number if self._allows(number) else None
 
@@ -120,10 +122,6 @@ class Setting:
         return (self.low <= number <= self.high and math.isfinite(number)) or (self.off and number == 0)
 
     def _hint(self, value: object) -> str:
-        if self.kind in ("number", "range") and any(
-            isinstance(item, str) and _is_number(item) for item in (value if isinstance(value, list) else [value])
-        ):
-            return " (1e-3 is text in YAML: write 1.0e-3)"
         # scene: off, say, of which the message would show nothing that was written.
         if self.kind in ("word", "text") and isinstance(value, bool):
             return " (YAML reads off, on, no and yes as truth values: put it in quotes)"
@@ -160,16 +158,24 @@ def text(default: str, help: str, **more: Any) -> Any:
     return _field(Setting("text", default, help, **more))
 
 
+def of_type(hint: Any) -> Setting | None:
+    """What a type alone says of a field: a Literal, bool, int, float or str; None for any other."""
+    if typing.get_origin(hint) is Literal:
+        return Setting("word", None, "", words=typing.get_args(hint))
+    kinds: dict[Any, Any] = {bool: "switch", int: "whole", float: "number", str: "text"}
+    return Setting(kinds[hint], None, "") if hint in kinds else None
+
+
 def _field(setting: Setting) -> Any:
     return dataclasses.field(default=setting.default, metadata={_SETTING: setting})
 
 
 @cache
-def settings_of(cls: type[object]) -> Mapping[str, Setting]:
+def settings_of(cls: Any) -> Mapping[str, Setting]:
     """The settings of a dataclass, by name, in their order. A group goes on until a field names the next."""
     found: dict[str, Setting] = {}
     group = ""
-    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for item in dataclasses.fields(cls):
         if _SETTING in item.metadata:
             setting: Setting = item.metadata[_SETTING]
             group = setting.group or group
@@ -204,6 +210,17 @@ def require_known(
             raise error(f"unknown {what} {shown(key)}{nearest(key, names)}; known: {', '.join(names)}")
 
 
+def require_whole(name: str, value: object, low: int, high: int) -> int:
+    """``value``, which must be a whole number.
+
+    Raises:
+        UsageError: it is none, or outside the limits; the message calls it ``name``.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise UsageError(f"{name} = {shown(value)}: give a whole number from {low} to {high}")
+    return value
+
+
 def nearest(key: object, known: Iterable[str]) -> str:
     """ " (did you mean 'bins'?)", or nothing where no known key is like it."""
     close = difflib.get_close_matches(str(key), list(known), n=1)
@@ -218,11 +235,3 @@ def shown(value: object) -> str:
 
 def _limit(value: float) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _is_number(value: str) -> bool:
-    try:
-        float(value)
-    except ValueError:
-        return False
-    return True

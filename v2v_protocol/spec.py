@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
@@ -19,6 +19,7 @@ OnBadVideo = Literal["substitute", "raise"]
 FlowMethod = Literal["auto", "zero", "dis-ultrafast", "dis-fast", "dis-fast-lean", "dis-fast-1"]
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
+SpeedPreset = Literal["exact", "balanced", "fast"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
 FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
 ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
@@ -149,6 +150,24 @@ class StreamSpec:
     def digest(self) -> str:
         """32 hexadecimal digits that name this spec."""
         return _digest(self)
+
+
+class SpecOptions(TypedDict, total=False):
+    """What a consumer may ask for besides its recipe, as keyword arguments, for editors and type checkers; None takes
+    the server's value. A test holds it to the fields of :class:`StreamSpec`, which say what each is."""
+
+    preset: SpeedPreset | None
+    voxel_dtype: VoxelDtype | None
+    shuffle: bool | None
+    max_sequences_per_video: int | None
+    on_bad_video: OnBadVideo | None
+    samples_per_decode: int | None
+    sibling_spacing: int | None
+    flow_method: FlowMethod | None
+    flow_direction: FlowDirection | None
+    flow_from: int | None
+    flow_margin_px: int | None
+    scene: SceneChoice | None
 
 
 SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))

@@ -289,9 +289,7 @@ def _tuple_of(check: Check) -> Check:
             raise ProtocolError(f"expected a list, got {type(value).__name__}")
         if len(value) > LARGEST_TUPLE:
             raise LimitExceeded(f"{len(value)} entries; the limit is {LARGEST_TUPLE}")
-        for item in value:
-            check(item)
-        return tuple(value)
+        return tuple(map(check, value))
 
     return check_all
 
@@ -318,6 +316,7 @@ _BY_ANNOTATION: dict[str, Check] = {
     "bytes": _exactly(bytes),
     "int | None": _int_or_none,
     "tuple[int, ...]": _tuple_of(_int),
+    "tuple[float, ...]": _tuple_of(_float),
     "tuple[str, ...]": _tuple_of(_exactly(str)),
     "Mapping[str, Any]": _mapping,
 }

@@ -3,8 +3,6 @@ wins). Every message names the flag."""
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 import ipaddress
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,12 +11,15 @@ from typing import Any
 
 import yaml
 
+from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.settings import check_settings, number, require_known, settings_of, switch, text, whole
+from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_server.video.rows import Rows
 
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
+MOST_WORKERS = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,76 +27,50 @@ class ServeConfig:
     """Settings of one server. Flags are these names with dashes; keys of a YAML file are these names with either.
 
     Attributes:
-        videos: folder tree, single video, or list file.
-        workers: local worker processes.
-        expect_workers: workers that are expected to serve in all, this host's and others': a consumer's credit is
-            settled for as many when it connects. 0, or fewer than there are: for the local ones, or those there are.
-        list: list file that restricts a folder.
-        rows: rows of each picture that may be used.
-        bind: address for consumers.
-        worker_bind: address for workers; empty: a private one on this host.
-        insecure: allow addresses other than loopback although nothing is encrypted or authenticated.
-        port_file: file that receives the bound address once the server is ready.
-        cache_dir: folder of the catalogue index; empty: the user's cache.
-        list_refused: name every video that cannot be used at the start, not only the first five.
-        preset: speed preset ("exact", "balanced", "fast"), see :data:`v2v_protocol.spec.SPEED_PRESETS`.
-        recipe: recipe preset name, or a mapping of recipe fields: the default for consumers that ask for none.
-        voxel_dtype, shuffle, max_sequences_per_video, on_bad_video, samples_per_decode, sibling_spacing,
-            flow_method, flow_direction, flow_from, flow_margin_px, scene: defaults of the other spec fields, see
-            :class:`v2v_protocol.spec.StreamSpec`.
-        lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
-        session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
-        max_credit_bytes: bound on the bytes in flight to one consumer.
-        parent_pid: stop when this process is no longer the parent; 0: never mind.
+        spec: the default for consumers that ask for nothing else. Its fields are flags and keys beside the others.
 
     Raises:
         UsageError: an unknown key, a value of the wrong kind or outside its limits.
     """
 
-    videos: str = ""
-    workers: int = 2
-    expect_workers: int = 0
-    list: str = ""
-    rows: str = "full"
-    bind: str = DEFAULT_BIND
-    worker_bind: str = ""
-    insecure: bool = False
-    port_file: str = ""
-    cache_dir: str = ""
-    list_refused: bool = False
-    preset: str = "exact"
-    recipe: Any = None
-    voxel_dtype: str = "int8"
-    shuffle: bool = True
-    max_sequences_per_video: int = 10
-    on_bad_video: str = "substitute"
-    samples_per_decode: int | None = None
-    sibling_spacing: int | None = None
-    flow_method: str = "auto"
-    flow_direction: str = "forward"
-    flow_from: int = 0
-    flow_margin_px: int = 64
-    scene: str = "off"
-    lease_deadline_seconds: float = 60.0
-    session_idle_seconds: float = 600.0
-    max_credit_bytes: int = 2 << 30
-    parent_pid: int = 0
-    spec: StreamSpec = field(init=False, compare=False)
+    videos: str = text(
+        "", "folder of videos (searched recursively), a video, or a list file", metavar="DIR", group="Videos"
+    )
+    list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
+    rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
+    cache_dir: str = text("", "folder of the catalogue index; without it the user's cache", metavar="DIR")
+    list_refused: bool = switch(False, "name every video that cannot be used at the start, not only the first five")
+    workers: int = whole(2, 0, MOST_WORKERS, "local worker processes", group="Workers")
+    expect_workers: int = whole(
+        0, 0, MOST_WORKERS,
+        "workers that will serve in all, other hosts' too; a consumer's credit is settled for them when it connects, "
+        "up to 400 samples and --max-credit-bytes. 0: the local ones, or those there are",
+    )  # fmt: skip
+    lease_deadline_seconds: float = number(
+        60.0, 0.001, 1e6, "a worker silent for longer over one sample is taken for hung", unit="s", metavar="S"
+    )
+    bind: str = text(
+        DEFAULT_BIND, "address for consumers; port * is a free one", metavar="ADDRESS", group="Addresses and consumers"
+    )
+    worker_bind: str = text("", "address for workers; without it one that is private to this host", metavar="ADDRESS")
+    insecure: bool = switch(
+        False, "allow addresses that other machines can reach, although nothing is encrypted or authenticated"
+    )
+    port_file: str = text("", "receives the bound address once the server is ready", metavar="FILE")
+    session_idle_seconds: float = number(
+        600.0, 0.001, 1e6, "a consumer silent for longer is forgotten; it can come back", unit="s", metavar="S"
+    )
+    max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "bound on the bytes in flight to one consumer")
+    parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
+    spec: StreamSpec = field(default_factory=StreamSpec)
 
     def __post_init__(self) -> None:
+        check_settings(self, flag_of)
         if not self.videos:
             raise UsageError("--videos is missing: give a folder of videos, one video, or a list file")
-        _whole("--workers", self.workers, 0, 4096)
-        _whole("--expect-workers", self.expect_workers, 0, 4096)
-        _positive("--lease-deadline-seconds", self.lease_deadline_seconds)
-        _positive("--session-idle-seconds", self.session_idle_seconds)
-        _whole("--max-credit-bytes", self.max_credit_bytes, 1, 1 << 40)
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, self.insecure)
-        names = ["preset", *(item.name for item in dataclasses.fields(StreamSpec))]
-        spec = StreamSpec.from_dict({name: getattr(self, name) for name in names})
-        object.__setattr__(self, "spec", spec)
 
     @classmethod
     def load(cls, file: str | None, flags: Mapping[str, Any], settings: Sequence[str] = ()) -> ServeConfig:
@@ -103,7 +78,7 @@ class ServeConfig:
 
         Args:
             file: the YAML file.
-            flags: by the names of the attributes.
+            flags: by the names of the attributes, and of the fields of the spec.
             settings: of `--set`, to change single fields of the recipe.
 
         Raises:
@@ -116,24 +91,16 @@ class ServeConfig:
             if name in values:
                 raise UsageError(f"--config {file}: {name} is there twice, with dashes and with underscores; keep one")
             values[name] = value
+        require_known(values, SERVE_KEYS, f"key in --config {file}:")
         values |= {name: value for name, value in flags.items() if value is not None}
-        known = {item.name: item for item in dataclasses.fields(cls) if item.init}
-        for key, value in values.items():
-            if key not in known:
-                close = difflib.get_close_matches(key, known, n=1)
-                hint = f" (did you mean {close[0]!r}?)" if close else ""
-                raise UsageError(f"--config {file}: unknown key {key!r}{hint}; known: {', '.join(known)}")
-            kind = {"str": str, "int": int, "bool": bool}.get(str(known[key].type))
-            if kind is not None and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
-                said = f"--{key.replace('_', '-')} = {value!r}: expected a value of kind {kind.__name__}"
-                # scene: off, say, of which the message would show nothing that was written.
-                bare = kind is str and isinstance(value, bool)
-                raise UsageError(
-                    f"{said} (YAML reads off, on, no and yes as truth values: put it in quotes)" if bare else said
-                )
         if settings:
             values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
-        return cls(**values)
+        asked = {name: values.pop(name) for name in SPEC_KEYS if name in values}
+        return cls(**values, spec=StreamSpec.from_dict(asked))
+
+
+SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)
+"""What a YAML file for ``v2v-serve --config`` may hold."""
 
 
 def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Any:
@@ -226,13 +193,3 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def _whole(flag: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise UsageError(f"{flag} {value}: give a whole number from {low} to {high}")
-
-
-def _positive(flag: str, value: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
-        raise UsageError(f"{flag} {value}: give a positive number of seconds")

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
@@ -231,9 +231,6 @@ class Server:
         once in a while: all workers of a host fail alike."""
         try:
             check_fingerprint(self._catalogue.path(missing.video), missing.fingerprint)
-        except VideoChanged:
-            self._catalogue.doubt(missing.video)
-            return False
         except (VideoError, CorpusError):
             return False
         now = time.monotonic()

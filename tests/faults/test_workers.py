@@ -62,8 +62,7 @@ def test_a_worker_whose_host_lacks_the_videos_changes_nothing(
     command = [
         sys.executable,
         "-m",
-        "v2v_server.commands.cli",
-        "worker",
+        "v2v_server.commands.worker",
         "--connect",
         address,
         "--videos",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -25,12 +26,28 @@ def test_every_program_is_there_and_says_what_it_does(
     module, function = SCRIPTS[name].split(":")
     assert module == programs.__name__
     monkeypatch.setattr(sys, "argv", [name, "--help"])
-    try:
-        status = getattr(programs, function)()
-    except SystemExit as end:
-        status = end.code
+    status = getattr(programs, function)()
     assert not status
-    assert name in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"usage: {name} ")
+    assert f"examples:\n  {name} " in shown
+    assert "`" not in shown
+    assert "options:" not in shown  # every flag has a group with a title
+
+
+@pytest.mark.parametrize("name", sorted(SCRIPTS))
+def test_every_program_says_its_version_and_takes_no_flag_that_it_does_not_know(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = getattr(programs, SCRIPTS[name].split(":")[1])
+    monkeypatch.setattr(sys, "argv", [name, "--version"])
+    assert not program()
+    assert re.fullmatch(rf"{name} [0-9.]+ \(protocol \d+, numerics \d+\)\n", capsys.readouterr().out)
+    monkeypatch.setattr(sys, "argv", [name, "--vresion"])
+    assert program() == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert name == "v2v-bench" or "unknown flag --vresion (did you mean '--version'?)" in said
 
 
 @pytest.mark.parametrize(("package", "said"), [("h5py", "h5py"), ("torch.utils.tensorboard", "torch")])

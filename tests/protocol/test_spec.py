@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import msgpack
 import pytest
@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from tests.protocol.recipes import specs
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import PRESETS, Recipe, preset
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.settings import settings_of
+from v2v_protocol.spec import SPEC_KEYS, SPEED_PRESETS, SpecOptions, SpeedPreset, StreamSpec
 
 OTHER_RECIPE_VALUES: dict[str, Any] = {
     "voxels_per_clip": 41,
@@ -78,6 +79,17 @@ def test_canonical_form_of_the_default() -> None:
 def test_every_field_is_covered() -> None:
     assert OTHER_RECIPE_VALUES.keys() == {field.name for field in dataclasses.fields(Recipe)}
     assert OTHER_SPEC_VALUES.keys() == {field.name for field in dataclasses.fields(StreamSpec)}
+
+
+def test_the_options_of_a_dataset_are_the_fields_of_a_spec() -> None:
+    """The one copy that type checkers need: same names in the same order, same choices, and None."""
+    options = get_type_hints(SpecOptions)
+    assert tuple(options) == tuple(key for key in SPEC_KEYS if key != "recipe")
+    fields = get_type_hints(StreamSpec) | {"preset": SpeedPreset}
+    assert options == {name: fields[name] | None for name in options}
+    assert get_args(SpeedPreset) == tuple(SPEED_PRESETS)
+    for name, setting in settings_of(StreamSpec).items():
+        assert setting.words == get_args(fields[name])
 
 
 def test_every_field_changes_the_digest() -> None:

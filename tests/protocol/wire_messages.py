@@ -28,6 +28,7 @@ BY_ANNOTATION: dict[str, st.SearchStrategy[Any]] = {
     "bytes": st.binary(max_size=20),
     "int | None": st.none() | _words,
     "tuple[int, ...]": st.lists(_words, max_size=5).map(tuple),
+    "tuple[float, ...]": st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=5).map(tuple),
     "tuple[str, ...]": st.lists(_text, max_size=5).map(tuple),
     "Mapping[str, Any]": st.dictionaries(_text, _plain, max_size=4),
 }
@@ -40,6 +41,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "bytes": (None, 1, "text", [], {}),
     "int | None": (-1, True, 1.0, "1", [], {}),
     "tuple[int, ...]": (None, 1, "12", b"12", {}, [-1], [True], [1.0], [None], [[1]], ["1"]),
+    "tuple[float, ...]": (None, 1.0, "12", {}, [math.nan], [True], ["1.0"], [None], [[1.0]]),
     "tuple[str, ...]": (None, 1, "ab", {}, [1], [None], [b"a"], [["a"]]),
     "Mapping[str, Any]": (None, 1, "ab", [], [["a", 1]]),
 }
@@ -53,6 +55,7 @@ EXAMPLE: dict[str, Any] = {
     "bytes": b"bytes",
     "int | None": None,
     "tuple[int, ...]": (1, 2),
+    "tuple[float, ...]": (0.5, 1.0),
     "tuple[str, ...]": ("a", "b"),
     "Mapping[str, Any]": {"key": [1, 2.5, "three", None]},
 }

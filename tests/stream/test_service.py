@@ -22,7 +22,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome
 from v2v_protocol.wire import decode, encode
-from v2v_server.commands.cli import serve
+from v2v_server.commands.serve import main as serve
 
 
 @pytest.fixture
@@ -142,10 +142,9 @@ def _filled_in(arguments: list[str], **names: object) -> list[str]:
 def test_bad_settings_are_one_clear_line_and_status_2(
     clips: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        serve(_filled_in(arguments, clips=clips))
+    status = serve(_filled_in(arguments, clips=clips))
     said = capsys.readouterr().err
-    assert ended.value.code == 2, said
+    assert status == 2, said
     assert message in said
     assert said.count("\n") == 1
 
@@ -171,9 +170,7 @@ def test_a_port_file_that_cannot_be_written_is_one_line_and_leaves_nothing(
     folder = tmp_path / "port"
     folder.mkdir()
     flags = ["--videos", "{clips}", "--workers", "0", "--bind", "tcp://127.0.0.1:*", "--port-file", "{folder}"]
-    with pytest.raises(SystemExit) as ended:
-        serve(_filled_in(flags, clips=clips, folder=folder))
-    assert ended.value.code == 2
+    assert serve(_filled_in(flags, clips=clips, folder=folder)) == 2
     assert capsys.readouterr().err.endswith(f"v2v-serve: --port-file {folder}: Is a directory\n")
     assert list(tmp_path.iterdir()) == [folder]
 

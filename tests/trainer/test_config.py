@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
@@ -23,17 +22,6 @@ def test_the_defaults_are_valid_and_survive_plain_values():
     config = TrainConfig()
     assert TrainConfig.from_dict(config.to_dict()) == config
     assert TrainConfig.from_dict(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
-
-
-def test_every_limit_and_choice_is_of_a_key_that_exists():
-    from trainer import config as module
-
-    known = {
-        f"{section.name}.{item.name}"
-        for section in dataclasses.fields(TrainConfig)
-        for item in dataclasses.fields(getattr(TrainConfig(), section.name))
-    }
-    assert known >= module._LIMITS.keys() | module._CHOICES.keys()
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -98,7 +86,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("optimizer.learning_rate=fast", r"optimizer\.learning_rate = 'fast': give a number"),
         ("optimizer.learning_rate=true", r"optimizer\.learning_rate = True: give a number"),
         ("optimizer.learning_rate=.nan", r"optimizer\.learning_rate = nan: give a number from 1e-12"),
-        ("optimizer.ema_decay=1", r"optimizer\.ema_decay = 1\.0: give a number from 0 to 0\.999999"),
+        ("optimizer.ema_decay=1", r"optimizer\.ema_decay = 1: give a number from 0 to 0\.999999"),
         ("optimizer.amsgrad=1", r"optimizer\.amsgrad = 1: give true or false"),
         ("optimizer.name=sgd", r"optimizer\.name = 'sgd': choose one of adam, adamw"),
         ("network.name=unet", r"network\.name = 'unet': choose one of e2vid, firenet"),
@@ -112,7 +100,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("stream.spec.flow_from=3", r"stream\.spec\.flow_from: section loss decides"),
         ("stream.spec.voxel_dtype=int4", r"voxel_dtype = 'int4'"),
         ("loss.l1_weight=0", r"l1_weight, lpips_weight and temporal_weight are all 0"),
-        ("loss.l1_weight=-1", r"loss\.l1_weight = -1\.0: give a number from 0"),
+        ("loss.l1_weight=-1", r"loss\.l1_weight = -1: give a number from 0"),
         ("loss.flow=guess", r"loss\.flow = 'guess': choose one of raft, stream"),
         ("loss=3", r"--set loss=3: write SECTION\.KEY=VALUE"),
         ("run.steps", r"--set run\.steps: write SECTION\.KEY=VALUE"),

@@ -18,37 +18,37 @@ from trainer.convert import items
 from trainer.convert.conversion import FORMS, Converted, convert, default_name
 from trainer.convert.text_events import NS_PER_UNIT
 from trainer.evaluation import layout
-from v2v_client.command import run_command
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """`v2v-convert`."""
-    parser = argparse.ArgumentParser(
-        prog="v2v-convert",
-        description="Convert recordings of event cameras into the h5 layout that v2v-eval reads.",
-        epilog="Forms: " + "; ".join(f"{name} = {form.title}" for name, form in FORMS.items()),
-    )
-    parser.add_argument("sources", nargs="+", metavar="SRC", help="recording: a file or a folder; never written to")
-    parser.add_argument(
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-convert", "SRC [SRC ...] --out PATH [flags]",
+        "Convert recordings of event cameras into the h5 layout that v2v-eval reads.",
+        ["v2v-convert boxes_6dof/ --out recordings/", "v2v-convert a.bag --events-topic /dvs/events --out a.h5"],
+        "Forms:\n" + "\n".join(f"  {name:14s} {form.title}" for name, form in FORMS.items()),
+    )  # fmt: skip
+    recordings, out = parser.group("Recordings"), parser.group("Output")
+    recordings.add_argument("sources", nargs="+", metavar="SRC", help="recording: a file or a folder; never written to")
+    out.add_argument(
         "--out", required=True, metavar="PATH", help="folder for the new files, or (one SRC) a file ending in .h5"
     )
-    parser.add_argument("--form", choices=tuple(FORMS), help="what the recordings are (default: look)")
-    parser.add_argument("--size", metavar="WxH", help="size of the sensor, where a recording does not state it")
-    parser.add_argument(
+    recordings.add_argument("--form", choices=tuple(FORMS), help="what the recordings are (default: look)")
+    recordings.add_argument("--size", metavar="WxH", help="size of the sensor, where a recording does not state it")
+    recordings.add_argument(
         "--time-unit", choices=tuple(NS_PER_UNIT),
         help="of times in text files (default: seconds if there is a point in them, else us)",
     )  # fmt: skip
-    parser.add_argument("--camera", choices=("left", "right"), default="left", help="of a stereo recording (MVSEC)")
-    parser.add_argument("--events-topic", metavar="TOPIC", help="of a bag with several")
-    parser.add_argument("--images-topic", metavar="TOPIC", help="of a bag with several")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
-    parser.add_argument("--json", metavar="FILE", help="also write a record of each recording")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    recordings.add_argument("--camera", choices=("left", "right"), default="left", help="of a stereo recording (MVSEC)")
+    recordings.add_argument("--events-topic", metavar="TOPIC", help="of a bag with several")
+    recordings.add_argument("--images-topic", metavar="TOPIC", help="of a bag with several")
+    out.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    out.add_argument("--json", metavar="FILE", help="also write a record of each recording")
     interrupted = "interrupted; no incomplete file is left"
-    if status := run_command(parser, _run, argv, interrupted=interrupted):
-        sys.exit(status)
+    return run_command(parser, _run, argv, interrupted=interrupted)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -136,4 +136,4 @@ def _progress(name: str) -> Iterator[items.Progress]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

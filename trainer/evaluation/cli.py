@@ -25,7 +25,7 @@ from trainer.evaluation.tables import records, table
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
 from trainer.weights import load_network
-from v2v_client.command import run_command
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 
@@ -33,53 +33,56 @@ LEAST_WIDTH = 110
 """Of tables that do not go to a terminal."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """`v2v-eval`."""
-    if status := run_command(_parser(), _run, argv):
-        sys.exit(status)
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    return run_command(_parser(), _run, argv)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="v2v-eval",
-        description="Reconstruct recordings of event cameras, and score that against the cameras' pictures.",
-    )
-    parser.add_argument(
+def _parser() -> Parser:
+    parser = Parser(
+        "v2v-eval", "[CONFIG] --weights FILE --data DIR [flags]",
+        "Reconstruct recordings of event cameras, and score that against the cameras' pictures.",
+        [
+            "v2v-eval paper-discrete --weights runs/e2vid/last.pt --data recordings/",
+            "v2v-eval --weights runs/e2vid/last.pt --data own.h5 --out pictures/ --video",
+        ],
+    )  # fmt: skip
+    what, how, out = parser.group("What"), parser.group("How"), parser.group("Output")
+    what.add_argument(
         "config", nargs="?", metavar="CONFIG",
         help=f"YAML file, or one of {', '.join(sorted(shipped()))}; without it, all recordings of --data",
     )  # fmt: skip
-    parser.add_argument("--weights", required=True, metavar="FILE", help="of the network; nothing in it is executed")
-    parser.add_argument(
+    what.add_argument("--weights", required=True, metavar="FILE", help="of the network; nothing in it is executed")
+    what.add_argument(
         "--data", required=True, metavar="DIR",
         help="with CONFIG: the folder with one folder a data set; without: a folder of .h5 files, or one of them",
     )  # fmt: skip
-    parser.add_argument("--ema", action="store_true", help="the averaged weights of an own checkpoint")
-    parser.add_argument("--model", choices=tuple(NETWORKS), help="what the weights are (default: look)")
-    parser.add_argument(
+    what.add_argument("--ema", action="store_true", help="the averaged weights of an own checkpoint")
+    what.add_argument("--model", choices=tuple(NETWORKS), help="what the weights are (default: look)")
+    how.add_argument(
         "--normalize-voxels", action="store_true", help="normalise every voxel grid, as published FireNet wants"
     )
-    parser.add_argument("--voxels", choices=get_args(Kind), help="default: CONFIG's, or discrete")
-    parser.add_argument(
+    how.add_argument("--voxels", choices=get_args(Kind), help="default: CONFIG's, or discrete")
+    how.add_argument(
         "--span", choices=get_args(Span),
         help="what the bins divide: first to last event of a window (published, default), or the time of the window",
     )  # fmt: skip
-    parser.add_argument("--metrics", metavar="A,B", help=f"of {', '.join(METRICS)}; default: CONFIG's")
-    parser.add_argument(
+    what.add_argument("--metrics", metavar="A,B", help=f"of {', '.join(METRICS)}; default: CONFIG's")
+    what.add_argument(
         "--lpips", nargs=3, action="append", default=[], metavar=("NET", "BACKBONE", "HEADS"),
         help="weights of LPIPS for alex, squeeze or vgg; may be given several times",
     )  # fmt: skip
-    parser.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
-    parser.add_argument(
+    what.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
+    how.add_argument(
         "--as-published", action="store_true",
         help="event_idx as stored, times cut to us: as the released code does, faults included",
     )  # fmt: skip
-    parser.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
-    parser.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
-    parser.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
-    parser.add_argument("--rows", type=int, default=6, metavar="N", help="rows of a picture (default 6)")
-    parser.add_argument("--video", action="store_true", help="also a video of each sequence, side by side")
-    parser.add_argument("--json", metavar="FILE", help="also write flat records")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    how.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
+    how.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
+    out.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
+    out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of a picture (default 6)")
+    out.add_argument("--video", action="store_true", help="also a video of each sequence, side by side")
+    out.add_argument("--json", metavar="FILE", help="also write flat records")
     return parser
 
 
@@ -194,4 +197,4 @@ def _progress() -> Iterator[Advance]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from trainer.pictures import Image
 from v2v_client import Batch
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.settings import number, whole, word
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,10 +156,10 @@ def required_file(settings: Any, key: str, why: str, origin: str) -> str | Path:
 
 
 def limited(default: float, low: float, high: float) -> Any:
-    """A field of settings that is a number from ``low`` to ``high``."""
-    return dataclasses.field(default=default, metadata={"limits": (low, high)})
+    """A field of settings that is a number from ``low`` to ``high``, a whole one where ``default`` is."""
+    return whole(default, int(low), int(high), "") if isinstance(default, int) else number(default, low, high, "")
 
 
 def chosen(default: str, words: Mapping[str, Any]) -> Any:
     """A field of settings that is one of ``words``."""
-    return dataclasses.field(default=default, metadata={"words": tuple(words)})
+    return word(default, words, "")

@@ -215,7 +215,7 @@ class Fleet:
         self._added += 1
         folder = self.folder / name
         folder.mkdir()
-        command = [sys.executable, "-m", "v2v_server.commands.cli", "worker", "--connect", self._worker_address]
+        command = [sys.executable, "-m", "v2v_server.commands.worker", "--connect", self._worker_address]
         place = Process(f"worker {name}", [*command, "--videos", str(self.videos), "--name", name], folder)
         self._spawn(place)
         self.further_workers.append(place)
@@ -226,7 +226,7 @@ class Fleet:
             return []
         try:
             children = psutil.Process(self.server.pid).children()
-            return [child.pid for child in children if "worker" in child.cmdline()]
+            return [child.pid for child in children if "v2v_server.commands.worker" in child.cmdline()]
         except (psutil.NoSuchProcess, psutil.ZombieProcess):
             return []
 

@@ -97,7 +97,9 @@ def soak(dataset: V2VStreamDataset, server: LocalServer, *, seconds: float, samp
 
 
 def _note(seen: Soak, server: LocalServer, now: float) -> None:
-    workers = [child for child in psutil.Process(server.pid).children() if "worker" in child.cmdline()]
+    workers = [
+        child for child in psutil.Process(server.pid).children() if "v2v_server.commands.worker" in child.cmdline()
+    ]
     pids = {"broker": server.pid, **{f"worker {number}": child.pid for number, child in enumerate(workers)}}
     for name, pid in {**pids, "client": os.getpid()}.items():
         resident = rss_mib(pid)

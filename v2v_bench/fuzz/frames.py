@@ -147,7 +147,7 @@ class FrameFuzzer:
             case "int":
                 return self._int()
             case "float":
-                return self._random.choice((0.0, -1.5, 1e300, self._random.random()))
+                return self._float()
             case "bool":
                 return self._random.random() < 0.5
             case "str":
@@ -158,11 +158,16 @@ class FrameFuzzer:
                 return self._random.choice((None, self._int()))
             case "tuple[int, ...]":
                 return tuple(self._int() for _ in range(self._random.randrange(6)))
+            case "tuple[float, ...]":
+                return tuple(self._float() for _ in range(self._random.randrange(4)))
             case "tuple[str, ...]":
                 return tuple(self._text() for _ in range(self._random.randrange(4)))
             case "Mapping[str, Any]":
                 return {self._text(): self._value(3) for _ in range(self._random.randrange(4))}
         raise TypeError(f"a message has a field of type {annotation}, which this fuzzer does not know")
+
+    def _float(self) -> float:
+        return self._random.choice((0.0, -1.5, 1e300, self._random.random()))
 
     def _int(self) -> int:
         return self._random.choice((self._random.choice(_EDGES), self._random.randrange(1000)))

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import ctypes
 import signal
+import sys
 
-from v2v_server.commands.cli import serve
+from v2v_server.commands.serve import main
 
 
 def _trim(number: int, frame: object) -> None:
@@ -22,4 +23,4 @@ def _trim(number: int, frame: object) -> None:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGUSR2, _trim)
-    serve()
+    sys.exit(main())

@@ -115,11 +115,12 @@ def _released(corpus: Corpus, setting: Setting) -> Measured:
 
 
 def _preset(name: str, corpus: Corpus, setting: Setting) -> Measured:
+    options: dict[str, Any] = {"recipe": "paper", "preset": name}
     with LocalServer(corpus.videos, workers=setting.workers, flags=["--rows", corpus.rows]) as server:
         made = {"samples": 0, "decodes": 0}
 
         def batches() -> Iterator[Batch]:
-            dataset = V2VStreamDataset(server.address, setting.batch_size, recipe="paper", preset=name)
+            dataset = V2VStreamDataset(server.address, setting.batch_size, **options)
             for batch in itertools.chain.from_iterable(itertools.repeat(dataset)):
                 made["samples"] += len(batch)
                 made["decodes"] += batch.decodes

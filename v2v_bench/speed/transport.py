@@ -34,7 +34,7 @@ from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import SpeedPreset, StreamSpec
 from v2v_server.simulation.clip import warm_up
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
@@ -80,7 +80,7 @@ def some_samples(videos: Path, rows: str, recipe: Recipe, count: int) -> list[Sa
 
 
 def at_work(
-    preset: str, videos: Path, rows: str, flags: Sequence[str], batch_size: int, seconds: float
+    preset: SpeedPreset, videos: Path, rows: str, flags: Sequence[str], batch_size: int, seconds: float
 ) -> dict[str, Any]:
     """The record of the product: whole epochs, after one that warms it up, until that much time is over."""
     with LocalServer(videos, workers=WORKERS, flags=["--rows", rows, *flags]) as server:
@@ -160,7 +160,7 @@ def work(asked: argparse.Namespace) -> int:
         V2VError: wrong usage, or a process that died.
     """
     recipe, size, flags = recipe_of(asked.changes), asked.batch_size, server_flags(asked.changes)
-    runs = [("exact", asked.videos, asked.rows)]
+    runs: list[tuple[SpeedPreset, Path, str]] = [("exact", asked.videos, asked.rows)]
     if asked.fast_videos is not None:
         runs.append(("fast", asked.fast_videos, asked.fast_rows))
     records = [at_work(*of, flags, size, asked.seconds) for of in runs]

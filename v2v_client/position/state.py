@@ -14,6 +14,7 @@ from typing import Any
 from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.messages import Welcome
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
+from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
@@ -205,7 +206,4 @@ def _share(values: Any) -> LoaderShare:
 
 
 def _whole(values: Mapping[str, Any], name: str, low: int, high: int) -> int:
-    value = values[name]
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise UsageError(f"state: {name} = {value!r}, expected a whole number from {low} to {high}")
-    return value
+    return require_whole(f"state: {name}", values[name], low, high)

@@ -20,10 +20,10 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_client.batch import Batch
-from v2v_client.command import run_command
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.tools.schedule_check import ScheduleCheck
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.sample import DEFAULT_ARRAYS
@@ -184,38 +184,41 @@ def table(records: Sequence[dict[str, Any]]) -> Table:
     return shown
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="v2v-loadtest",
-        description=(__doc__ or "").split("\n\n")[0],
-        epilog="Exit status: 0 each sample came once and in order, 1 not so, 2 wrong usage or no server.",
-    )
-    source = parser.add_mutually_exclusive_group(required=True)
+def _parser() -> Parser:
+    parser = Parser(
+        "v2v-loadtest", "(--videos DIR | --connect ADDRESS) [flags]",
+        "Measure how fast a server feeds one trainer, and whether anything is lost or comes twice.",
+        ["v2v-loadtest --videos clips/ --workers 1,2,4", "v2v-loadtest --connect tcp://127.0.0.1:5555 --seconds 60"],
+        "Exit status: 0 each sample came once and in order, 1 not so, 2 wrong usage or no server.",
+    )  # fmt: skip
+    server, stream, measuring = parser.group("Server"), parser.group("Stream"), parser.group("Measuring")
+    source = server.add_mutually_exclusive_group(required=True)
     source.add_argument("--videos", metavar="DIR", help="start servers of our own on these videos")
     source.add_argument("--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port")
-    parser.add_argument(
+    server.add_argument(
         "--workers", type=_counts, metavar="N,N", help="with --videos: server workers, one run each (default 1,2)"
     )
-    parser.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
-    parser.add_argument("--batch-size", type=int, default=12, metavar="N")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="to measure, after warm-up, per run")
-    parser.add_argument("--warmup-batches", type=int, default=4, metavar="N", help="received first, not timed")
-    parser.add_argument(
+    server.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
+    stream.add_argument("--batch-size", type=int, default=12, metavar="N", help="samples of a batch (default 12)")
+    measuring.add_argument(
+        "--seconds", type=float, default=20.0, metavar="S", help="to measure, after warm-up (default 20)"
+    )
+    measuring.add_argument("--warmup-batches", type=int, default=4, metavar="N", help="received first, not timed")
+    measuring.add_argument(
         "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulates a training step of this length"
     )
-    parser.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
-    parser.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
-    parser.add_argument("--samples-per-decode", type=int, metavar="K", help="default: the preset's")
-    parser.add_argument("--recipe", metavar="PRESET", help="default: the server's")
-    parser.add_argument(
+    stream.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
+    stream.add_argument("--samples-per-decode", type=int, metavar="K", help="default: the preset's")
+    stream.add_argument("--recipe", metavar="PRESET", help="default: the server's")
+    stream.add_argument(
         "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="changes a recipe field"
     )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
+    stream.add_argument("--seed", type=int, default=0, metavar="N", help="of the stream (default 0)")
+    measuring.add_argument(
         "--timeout-seconds", type=float, default=60.0, metavar="S", help="silence that means a lost server"
     )
-    parser.add_argument("--json", metavar="FILE", help="write the records there")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    measuring.add_argument("--json", metavar="FILE", help="write the records there")
     return parser
 
 

@@ -51,9 +51,9 @@ def lease_for(
         CorpusError: the catalogue's index can no longer be read.
     """
     video = sequence.video
-    thresholds: tuple[str, ...] = ()
+    thresholds: tuple[float, ...] = ()
     if video.threshold_pos is not None and video.threshold_neg is not None:
-        thresholds = (video.threshold_pos.hex(), video.threshold_neg.hex())
+        thresholds = (video.threshold_pos, video.threshold_neg)
     scene = b""
     if spec.scene != "off":
         scene = catalogue.scene(video.id).slice(sequence.start_frame, spec.recipe.frames_needed).to_bytes()

@@ -6,7 +6,6 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -41,7 +40,7 @@ class VideoEntry:
 
     Attributes:
         id: relative POSIX path; its name for ever.
-        fingerprint: see :mod:`v2v_server.video.fingerprint`.
+        fingerprint: size and hash of head and tail.
         frames: how many frames there are to decode.
         width_px, height_px: size of the upright picture, before ``rows``.
         frames_per_second: average rate; NaN where unknown.
@@ -98,7 +97,6 @@ class Catalogue:
     scene_digest: str | None
     _store: Store = field(repr=False, compare=False)
     _fingerprints: dict[str, str] = field(repr=False, compare=False)
-    _files: dict[str, str] = field(repr=False, compare=False)  # by id, the fingerprint of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
     _looking: Looking | None = field(repr=False, compare=False)
     _unseen: frozenset[str] = field(repr=False, compare=False)
@@ -143,12 +141,12 @@ class Catalogue:
         return self._slices[key]
 
     def _stored_index(self, id: str) -> bytes:
-        self._fingerprint(id)
+        fingerprint = self._fingerprint(id)
         if id in self._absent:
             video = self._absent[id]
             return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
         try:
-            data = self._store.frame_index(id, self._files[id])
+            data = self._store.frame_index(id, fingerprint)
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -163,13 +161,13 @@ class Catalogue:
                 longer be read.
             VideoChanged: another process has catalogued a changed file under this id since.
         """
-        self._fingerprint(id)
+        fingerprint = self._fingerprint(id)
         if self._looking is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
         if id in self._unseen:
             return Scene.unknown()
         try:
-            data = self._store.scene(id, self._files[id], self._looking.key)
+            data = self._store.scene(id, fingerprint, self._looking.key)
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -193,12 +191,6 @@ class Catalogue:
                 "server with --scene auto"
             )
         return self.scene_digest
-
-    def doubt(self, id: str) -> None:
-        """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
-        say. Does nothing where the index cannot be written now."""
-        with suppress(sqlite3.Error):
-            self._store.doubt(id)
 
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""
@@ -301,13 +293,12 @@ def _snapshot(
 ) -> Catalogue:
     by_id = {entry.id: entry for entry in listed}
     problems = dict(refused)
-    used, files = [], {}
+    used = []
     videos = []
     shorter = []
     absent: dict[str, PreparedVideo] = {}
     for id in sorted(records):
         record, entry = records[id], by_id.get(id, ListEntry(id))
-        files[id] = record.fingerprint
         if manifest is not None:
             if not manifest.describes(record):
                 absent[id] = manifest.videos[id]
@@ -315,7 +306,7 @@ def _snapshot(
         if record.problem is not None:
             problems[id] = record.problem
             continue
-        used.append(replace(record, fingerprint=files[id]))
+        used.append(record)
         videos.append(_entry(record, entry))
         if entry.frames is not None and entry.frames > record.frames:
             shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
@@ -359,7 +350,6 @@ def _snapshot(
         scene_digest=scene_digest,
         _store=store,
         _fingerprints={video.id: video.fingerprint for video in videos},
-        _files=files,
         _absent=absent,
         _looking=looking,
         _unseen=frozenset(unseen),

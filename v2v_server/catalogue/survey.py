@@ -28,24 +28,27 @@ def examine(root: str, id: str) -> Record:
     """
     path = Path(root, id)
     try:
-        before = _state(path)
+        status = path.stat()
         mark = fingerprint(path)
-        facts = _facts(path)
-        if _state(path) != before:
-            return Record(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
-        return Record(id, -1, problem=f"cannot be read: {error.strerror or error}")
+        return Record(id, -1, 0, problem=f"cannot be read: {error.strerror or error}")
+    except VideoError as error:
+        return Record(id, -1, 0, problem=error.reason)
+    size, mtime = status.st_size, status.st_mtime_ns
+    try:
+        facts = _facts(path)
     except VideoUnreadable as error:
-        return Record(id, -1, problem=error.reason)
+        return Record(id, -1, 0, problem=error.reason)
     except VideoError as error:
         where = "" if error.frame is None else f"frame {error.frame}: "
-        return Record(id, *before, problem=where + error.reason)
+        return Record(id, size, mtime, problem=where + error.reason)
     except Exception as error:  # noqa: BLE001 - one strange file must not end the survey of all others
-        return Record(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
+        return Record(id, size, mtime, problem=f"probing failed: {type(error).__name__}: {error}")
     return Record(
-        id,
-        *before,
-        fingerprint=f"{mark}-{facts.content}" if facts.content else mark,
+        id=id,
+        size_bytes=size,
+        mtime_ns=mtime,
+        fingerprint=mark,
         frames=facts.frames,
         width_px=facts.width_px,
         height_px=facts.height_px,
@@ -54,12 +57,6 @@ def examine(root: str, id: str) -> Record:
         interlaced=facts.interlaced,
         frame_index=facts.index.to_bytes(),
     )
-
-
-def _state(path: Path) -> tuple[int, int, int]:
-    """Size in bytes, and the times of the last modification and change of status."""
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _facts(path: Path) -> VideoFacts:
@@ -106,7 +103,7 @@ def survey(
     suspects: list[str] = []
     for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds):
         if isinstance(found, Died) and found.overdue_seconds:
-            yield Record(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
+            yield Record(id, -1, 0, problem=f"cannot be probed: {found.how}; the next start tries again")
         elif isinstance(found, Died):
             suspects.append(id)
         else:
@@ -118,9 +115,10 @@ def survey(
 def _culprit(root: Path, id: str, death: Died) -> Record:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
-        return Record(id, -1, problem=f"{why}; the next start tries again")
+        return Record(id, -1, 0, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return Record(id, *_state(Path(root, id)), problem=why)
+        status = Path(root, id).stat()
     except OSError:
-        return Record(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again
+        return Record(id, -1, 0, problem=why)  # gone meanwhile; should it come back, it is looked at again
+    return Record(id, status.st_size, status.st_mtime_ns, problem=why)

@@ -18,12 +18,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.command import FAILED, Parser, run_command
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
 from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.catalogue.listfile import LIST_SUFFIXES
-from v2v_server.commands.cli import new_parser, run_command
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.prepare import prepare
 from v2v_server.prepare.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
@@ -34,61 +34,63 @@ from v2v_server.video.rows import Rows
 _SHOWN = 20
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """`v2v-prepare`."""
-    parser = new_parser(
-        "v2v-prepare", "Transcode a corpus once to what training needs: chosen rows, grey, fast decode."
-    )
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-prepare", "SRC DST [flags]",
+        "Transcode a corpus once to what training needs: chosen rows, grey, fast decode.",
+        [
+            "v2v-prepare webvid10k/ prepared/ --rows top:0.54",
+            "v2v-prepare clips/ prepared/ --tile-width 284 --tile-overlap 128 --scene auto",
+        ],
+        "Exit status: 1 where some videos were not prepared, fall below a floor or lack the statistics asked for.",
+    )  # fmt: skip
     defaults = ", ".join(f"{name} {codec.default}" for name, codec in CODECS.items())
-    parser.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
-    parser.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
-    parser.add_argument(
+    videos = parser.group("Videos")
+    videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
+    videos.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
+    videos.add_argument(
         "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
     )
-    parser.add_argument("--codec", choices=tuple(CODECS), default=DEFAULT_CODEC, help=f"default {DEFAULT_CODEC}")
-    parser.add_argument("--quality", type=int, metavar="Q", help=f"lower is better and larger; default {defaults}")
-    parser.add_argument(
+    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts SRC")
+    videos.add_argument(
+        "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
+    )
+    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    encoding = parser.group("Encoding")
+    encoding.add_argument("--codec", choices=tuple(CODECS), default=DEFAULT_CODEC, help=f"default {DEFAULT_CODEC}")
+    encoding.add_argument("--quality", type=int, metavar="Q", help=f"lower is better and larger; default {defaults}")
+    encoding.add_argument(
         "--gop", type=int, default=DEFAULT_GOP, metavar="N", help=f"distance of keyframes (default {DEFAULT_GOP})"
     )
-    parser.add_argument(
+    encoding.add_argument(
         "--tile-width", type=int, default=0, metavar="PX", dest="tile_px",
         help="store pictures as tiles about PX wide; a crop decodes those that it touches (default 0: no tiles)",
     )  # fmt: skip
-    parser.add_argument(
+    encoding.add_argument(
         "--tile-overlap", type=int, default=0, metavar="PX", dest="tile_overlap_px",
         help="let each tile share PX columns with the next, so that a crop no wider touches one (default 0)",
     )  # fmt: skip
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=usable_cores(),
-        metavar="N",
+    run = parser.group("Run")
+    run.add_argument(
+        "--workers", type=int, default=usable_cores(), metavar="N",
         help="processes (default: one a core that it may use)",
-    )
-    parser.add_argument("--list", metavar="FILE", help="list file (`path frames c+ c-`) that restricts SRC")
-    parser.add_argument(
+    )  # fmt: skip
+    run.add_argument(
         "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
         help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
     )  # fmt: skip
-    parser.add_argument(
+    run.add_argument(
         "--frame-floor", type=float, metavar="DB",
         help="the same for the worst frame of a clip, which the clip's PSNR hides "
         f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
     )  # fmt: skip
-    parser.add_argument(
-        "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
-    )
-    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    parser.add_argument("--json", metavar="FILE", help="also write a record of each video")
-
-    def run(arguments: argparse.Namespace) -> None:
-        if not _run(arguments):
-            sys.exit(1)
-
-    run_command(parser, run, argv, interrupted="interrupted; the same command goes on from here")
+    run.add_argument("--json", metavar="FILE", help="also write a record of each video")
+    interrupted = "interrupted; the same command goes on from here"
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 
 
-def _run(arguments: argparse.Namespace) -> bool:
+def _run(arguments: argparse.Namespace) -> int:
     quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
     encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px, arguments.tile_overlap_px)
     if arguments.workers < 1:
@@ -122,7 +124,7 @@ def _run(arguments: argparse.Namespace) -> bool:
         problems = (*report.not_looked_at, *report.unusable)
         records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in problems]
         write_json(arguments.json, records)
-    return report.complete
+    return 0 if report.complete else FAILED
 
 
 def _is_video(source: Path) -> bool:
@@ -201,4 +203,4 @@ def _progress() -> Iterator[prepare.Progress]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,35 +3,46 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2v_protocol.errors import UsageError
-from v2v_server.commands.cli import new_parser, run_command
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.config import recipe_setting
 from v2v_server.offline.preview import KINDS, Look, preview
 
 _MOST_CAMERAS = 32
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """`v2v-preview`."""
-    parser = new_parser("v2v-preview", "Show what a recipe makes of your videos: frames, events, flow, activity.")
-    parser.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
-    parser.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
-    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the first camera (default 0)")
-    parser.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
-    parser.add_argument(
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-preview", "VIDEO|DIR --out FILE [flags]",
+        "Show what a recipe makes of your videos: frames, events, flow, activity.",
+        [
+            "v2v-preview clips/ --out sheet.png --recipe davis346",
+            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
+        ],
+    )  # fmt: skip
+    cameras = parser.group("Virtual cameras")
+    cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
+    cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
+    cameras.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
+    cameras.add_argument("--seed", type=int, default=0, metavar="S", help="of the first camera (default 0)")
+    cameras.add_argument(
         "--compare", nargs="+", metavar="NAME", help="the same clip under these recipes instead, one camera each"
     )
-    parser.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
-    parser.add_argument("--no-flow", action="store_true", help="leave optical flow out")
-    parser.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    parser.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
-    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    run_command(parser, _run, argv)
+    videos = parser.group("Videos")
+    videos.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
+    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
+    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    out = parser.group("Output")
+    out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
+    out.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
+    out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -65,4 +76,4 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -7,42 +7,46 @@ has read, and takes up a clearing with its next verdict or its next start.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
 from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
 from v2v_server.catalogue.files import corpus_root
-from v2v_server.commands.cli import new_parser, run_command
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """`v2v-quarantine`. Exit status as in :mod:`v2v_server.commands.cli`."""
-    parser = new_parser(
-        "v2v-quarantine", "List the sequences and videos that crashed or hung workers, or clear the list."
-    )
-    parser.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
-    parser.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    parser.add_argument("--clear", action="store_true", help="begin a new, empty snapshot; old ones can still be asked")
-    parser.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it holds")
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-quarantine", "--videos DIR [flags]",
+        "List the sequences and videos that crashed or hung workers, or clear the list.",
+        ["v2v-quarantine --videos webvid10k/", "v2v-quarantine --videos webvid10k/ --clear"],
+    )  # fmt: skip
+    what = parser.group("Quarantine")
+    what.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
+    what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    what.add_argument("--clear", action="store_true", help="begin a new, empty snapshot; old ones can still be asked")
+    what.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it holds")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
-    def run(arguments: argparse.Namespace) -> None:
-        file = quarantine_path(corpus_root(Path(arguments.videos)), arguments.cache_dir)
-        quarantine = read_quarantine(file)
-        if arguments.clear and quarantine.verdicts(quarantine.latest):
-            _clear(file, quarantine)
-        in_force = quarantine.verdicts(quarantine.latest)
-        for line in quarantine.lines:
-            print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
-        print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
-        if arguments.json is not None:
-            records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
-            write_json(arguments.json, records)
 
-    run_command(parser, run, argv)
+def _run(arguments: argparse.Namespace) -> None:
+    file = quarantine_path(corpus_root(Path(arguments.videos)), arguments.cache_dir)
+    quarantine = read_quarantine(file)
+    if arguments.clear and quarantine.verdicts(quarantine.latest):
+        _clear(file, quarantine)
+    in_force = quarantine.verdicts(quarantine.latest)
+    for line in quarantine.lines:
+        print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
+    print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
+    if arguments.json is not None:
+        records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
+        write_json(arguments.json, records)
 
 
 def _clear(file: Path, quarantine: Quarantine) -> None:
@@ -54,4 +58,4 @@ def _clear(file: Path, quarantine: Quarantine) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

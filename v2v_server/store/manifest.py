@@ -24,7 +24,6 @@ from v2v_server.catalogue.files import answers
 from v2v_server.catalogue.index_file import Record
 from v2v_server.catalogue.scene import Scene
 from v2v_server.prepare.encode import Encoding
-from v2v_server.video.fingerprint import is_same_file
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -155,7 +154,7 @@ class Manifest:
     def describes(self, record: Record) -> bool:
         """Whether the file that was probed is the one that was prepared."""
         video = self.videos[record.id]
-        return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
+        return (record.fingerprint, record.frames) == (video.fingerprint, video.frames)
 
     def as_source(self, record: Record) -> Record:
         """The record of a prepared file, with what has to agree with its source even where there is no sound file:

@@ -226,7 +226,7 @@ class Pool:
 def _command(address: str, root: Path, name: str) -> list[str]:
     """The program of one worker."""
     return [
-        *(sys.executable, "-m", "v2v_server.commands.cli", "worker"),
+        *(sys.executable, "-m", "v2v_server.commands.worker"),
         *("--connect", address, "--videos", str(root), "--name", name),
         *("--parent-pid", str(os.getpid())),
     ]

@@ -80,7 +80,7 @@ def draft_of(lease: Lease, index: int) -> Draft:
         picture_height_px=bottom - top,
         picture_width_px=lease.width_px,
         video_id=lease.video,
-        video_thresholds=_thresholds(lease.thresholds),
+        video_thresholds=_pair(lease.thresholds),
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
@@ -207,10 +207,10 @@ def kernels_of(lease: Lease) -> frozenset[Variant]:
 
 
 @lru_cache(maxsize=64)
-def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[str, ...]) -> frozenset[Variant]:
+def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...]) -> frozenset[Variant]:
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _thresholds(thresholds))
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds))
 
 
 @lru_cache(maxsize=16)
@@ -231,11 +231,8 @@ def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) 
     return plan_flow(scene, lease.start_frame, params, spec, height_px, lease.width_px)
 
 
-def _thresholds(texts: tuple[str, ...]) -> tuple[float, float] | None:
-    if not texts:
-        return None
-    positive, negative = (float.fromhex(text) for text in texts)
-    return positive, negative
+def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
+    return (thresholds[0], thresholds[1]) if thresholds else None
 
 
 def _frame_index(lease: Lease, frames: int) -> FrameIndex:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 def _is_worker() -> bool:
     arguments = Path("/proc/self/cmdline").read_bytes().split(b"\0")
-    return b"v2v_server.commands.cli" in arguments and b"worker" in arguments
+    return b"v2v_server.commands.worker" in arguments
 
 
 def _act(fault: dict, video: str) -> None:

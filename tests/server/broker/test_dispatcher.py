@@ -122,7 +122,7 @@ def test_thresholds_travel_exactly_and_unknown_rates_as_zero() -> None:
     at.hello()
     at.want(0)
     lease = at.begin()
-    assert [float.fromhex(text) for text in lease.thresholds] == [0.1, 1 / 3]
+    assert lease.thresholds == (0.1, 1 / 3)
     assert lease.frames_per_second == 0.0
 
 

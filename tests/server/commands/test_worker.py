@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from v2v_server.commands.cli import worker
+from v2v_server.commands.worker import main as worker
 
 
 def test_it_takes_as_videos_what_the_server_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     roots: list[Any] = []
-    monkeypatch.setattr("v2v_server.worker.conversation.run_worker", lambda address, root, *more: roots.append(root))
+    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda address, root, *more: roots.append(root))
     (tmp_path / "clip.mp4").touch()
     (tmp_path / "list.txt").touch()
     for source in (tmp_path, tmp_path / "clip.mp4", tmp_path / "list.txt"):
@@ -21,7 +21,5 @@ def test_it_takes_as_videos_what_the_server_takes(tmp_path: Path, monkeypatch: p
 
 
 def test_a_corpus_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(tmp_path / "missing")])
-    assert left.value.code == 2
+    assert worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(tmp_path / "missing")]) == 2
     assert "there is no such folder, video or list file on this host" in capsys.readouterr().err

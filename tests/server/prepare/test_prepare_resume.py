@@ -233,21 +233,28 @@ def test_ctrl_c_says_that_the_same_command_goes_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("v2v_server.prepare.prepare.prepare", interrupted)
-    with pytest.raises(SystemExit) as ended:
-        main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"])
-    assert ended.value.code == 130
+    assert main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"]) == 130
     assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
 
 
 def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([
-            str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1",
-            "--json", str(tmp_path),
-        ])  # fmt: skip
-    assert ended.value.code == 2
+    assert (
+        main(
+            [
+                str(source),
+                str(tmp_path / "out"),
+                "--cache-dir",
+                str(tmp_path / "cache"),
+                "--workers",
+                "1",
+                "--json",
+                str(tmp_path),
+            ]
+        )
+        == 2
+    )
     said = capsys.readouterr()
     assert "videos prepared" in said.out
     assert "cannot be written: Is a directory" in said.err
@@ -375,16 +382,12 @@ def test_command_line(
         ([str(source), str(out), "--workers", "0"], 2, "--workers 0"),
         ([str(tmp_path / "none"), str(out)], 2, "no such folder"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == status
+        assert main(arguments) == status
         shown = capsys.readouterr()
         assert message in shown.out + shown.err
     shutil.copy(source / "0.mp4", source / "5.mp4")
     (source / "6.mp4").write_bytes(b"no video")
-    with pytest.raises(SystemExit) as ended:
-        main([str(source), str(out), *settings])
-    assert ended.value.code == 1
+    assert main([str(source), str(out), *settings]) == 1
     shown = capsys.readouterr().out
     assert "6 of 6 videos prepared" in shown
     assert "1 cannot be used at all:\n  6.mp4: " in shown

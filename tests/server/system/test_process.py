@@ -53,8 +53,7 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
         load_catalogue(ServeConfig(videos="videos", workers=16))
     with pytest.raises(CorpusError):
         load_catalogue(ServeConfig(videos="videos", workers=0))
-    with pytest.raises(SystemExit):
-        prepare_cli.main(["videos", "prepared"])
+    assert prepare_cli.main(["videos", "prepared"]) == 2
     assert processes == [3, 3, 3]
     monkeypatch.delattr(os, "sched_getaffinity")
     assert process.usable_cores() == 64

@@ -35,7 +35,7 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
-from v2v_server.commands.cli import worker as worker_command
+from v2v_server.commands.worker import main as worker_command
 from v2v_server.simulation.variants import Variant
 from v2v_server.worker import conversation as worker_module
 from v2v_server.worker.conversation import Worker, run_worker
@@ -293,7 +293,7 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
 def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A batch system starts all of them with the same command."""
     names: list[str] = []
-    monkeypatch.setattr(worker_module, "run_worker", lambda address, root, name, *more: names.append(name))
+    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda address, root, name, *more: names.append(name))
     command = ["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "node7"]
     for more in ([], [], ["--logbook-fd", "3"]):
         worker_command([*command, *more])
@@ -302,9 +302,7 @@ def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.Mon
 
 
 def test_a_name_that_no_connection_can_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        worker_command(["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "n" * 300])
-    assert ended.value.code == 2
+    assert worker_command(["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "n" * 300]) == 2
     assert "--name has 300 bytes: give at most 200" in capsys.readouterr().err
 
 

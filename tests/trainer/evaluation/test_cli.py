@@ -179,9 +179,7 @@ def test_mistakes_end_with_status_2(
     tmp_path: Path, weights: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     random_recording(tmp_path / "own" / "a.h5", images=3)
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["--weights", str(weights), *(a.replace("{data}", str(tmp_path / "own")) for a in arguments)])
-    assert stop.value.code == 2
+    assert cli.main(["--weights", str(weights), *(a.replace("{data}", str(tmp_path / "own")) for a in arguments)]) == 2
     assert message in capsys.readouterr().err
 
 
@@ -210,9 +208,7 @@ def test_what_is_refused_is_so_before_anything_is_evaluated(
 
     monkeypatch.setattr(evaluate_module, "reconstruct", reconstruct)
     fixed = ["paper-discrete", "--weights", str(weights), "--data", str(tmp_path), "--metrics", "mse"]
-    with pytest.raises(SystemExit) as stop:
-        cli.main([*fixed, *(argument.replace("{data}", str(tmp_path)) for argument in arguments)])
-    assert stop.value.code == 2
+    assert cli.main([*fixed, *(argument.replace("{data}", str(tmp_path)) for argument in arguments)]) == 2
     assert message in capsys.readouterr().err
     assert not evaluated
 

@@ -1,0 +1,184 @@
+"""A command line: its flags, its help, and from what it did to its exit status.
+
+Exit status: 0 success, 1 the command could not do its work, 2 wrong usage or input, 130 interrupted. An error of ours
+is one line on stderr; ``--debug`` shows its trace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import textwrap
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, Never
+
+from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.settings import Setting, nearest, settings_of
+
+FAILED = 1
+WRONG_USAGE = 2
+INTERRUPTED = 128 + signal.SIGINT
+_LONGEST_CHOICE = 30
+_HELP_WIDTH = 100
+_GENERAL = "General"
+
+
+class Parser(argparse.ArgumentParser):
+    """The flags of a command, in groups, with ``--help``, ``--version`` and ``--debug``.
+
+    Args:
+        name: of the command.
+        usage: what follows the name in the first line of its help.
+        description: what it does, in plain text.
+        examples: command lines.
+        status: what its exit status means, in plain text, where that is more than every command's.
+    """
+
+    def __init__(self, name: str, usage: str, description: str, examples: Sequence[str], status: str = "") -> None:
+        lines = ["examples:", *(f"  {example}" for example in examples), *(["", _wrapped(status)] if status else [])]
+        super().__init__(
+            prog=name,
+            usage=f"{name} {usage}",
+            description=_wrapped(description),
+            epilog="\n".join(lines),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            add_help=False,
+        )
+        self._given: list[str] = []
+        self._groups: dict[str, argparse._ArgumentGroup] = {}
+        general = self.group(_GENERAL)
+        general.add_argument("-h", "--help", action="help", help="show this help and exit")
+        general.add_argument("--version", action="version", version=version_of(name), help="show the version and exit")
+        general.add_argument("--debug", action="store_true", help="show the trace of an error")
+
+    def group(self, title: str) -> argparse._ArgumentGroup:
+        """The group of that title, made when it is first asked for."""
+        if title not in self._groups:
+            self._groups[title] = self.add_argument_group(title)
+        return self._groups[title]
+
+    def add_settings(self, cls: Any) -> None:
+        """A flag for each setting of a dataclass; one that is not given is None."""
+        for name, setting in settings_of(cls).items():
+            flag = flag_of(name)
+            if setting.is_hidden:
+                self.add_argument(flag, type=_reader(setting), help=argparse.SUPPRESS)
+            elif setting.kind == "switch":
+                self.group(setting.group).add_argument(
+                    flag, action=argparse.BooleanOptionalAction, default=None, help=_help(setting)
+                )
+            else:
+                self.group(setting.group).add_argument(
+                    flag, type=_reader(setting), metavar=_metavar(setting), help=_help(setting)
+                )
+
+    def format_help(self) -> str:
+        """The help; what every command has comes last."""
+        self._action_groups.sort(key=lambda group: group.title == _GENERAL)
+        return super().format_help()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """argparse's own; keeps what was given for :meth:`error`."""
+        self._given = list(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> Never:
+        """Ends with status 2 and one line. A flag that nobody knows comes before anything else that is wrong."""
+        known = self._option_string_actions
+        for given in self._given:
+            flag = given.partition("=")[0]
+            if flag == "--":
+                break
+            if flag.startswith("--") and flag not in known:
+                message = f"unknown flag {flag}{nearest(flag, known)}"
+                break
+        self.exit(WRONG_USAGE, f"{self.prog}: {message}; {self.prog} --help shows all flags\n")
+
+
+def run_command(
+    parser: argparse.ArgumentParser,
+    run: Callable[[argparse.Namespace], int | None],
+    argv: Sequence[str] | None,
+    *,
+    failures: tuple[type[V2VError], ...] = (),
+    interrupted: str = "interrupted",
+) -> int:
+    """Parses and runs.
+
+    Args:
+        parser: of a command with a flag ``--debug``.
+        run: returns the exit status; None is 0.
+        argv: the command line; None takes that of the process.
+        failures: errors that say that the work failed (status 1), unless they are a UsageError; all others say that it
+            could not be done (status 2).
+        interrupted: what to say of a Ctrl-C; nothing if empty.
+
+    Returns:
+        what ``run`` returned, else 1 or 2 after an error, 130 after a Ctrl-C.
+    """
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as ended:  # argparse's own: help was shown, or a flag not understood
+        return int(ended.code or 0)
+    try:
+        return run(arguments) or 0
+    except V2VError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
+        failed = isinstance(error, failures) and not isinstance(error, UsageError)
+        return FAILED if failed else WRONG_USAGE
+    except KeyboardInterrupt:
+        if interrupted:
+            print(f"{parser.prog}: {interrupted}", file=sys.stderr)
+        return INTERRUPTED
+
+
+def version_of(name: str) -> str:
+    """What a command says of itself: the version of the program, and of what it speaks and computes."""
+    return f"{name} {__version__} (protocol {PROTOCOL_VERSION}, numerics {NUMERICS_VERSION})"
+
+
+def flag_of(name: str) -> str:
+    """How a setting is written on a command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def _wrapped(text: str) -> str:
+    """Each line broken by itself."""
+    return "\n".join(textwrap.fill(line, _HELP_WIDTH) for line in text.split("\n"))
+
+
+def _reader(setting: Setting) -> Callable[[str], Any]:
+    """From the text of a flag to its value."""
+
+    def read(text: str) -> Any:
+        try:
+            return setting.check("", {"whole": int, "number": float}.get(setting.kind, str)(text))
+        except (ValueError, UsageError) as error:
+            hint = nearest(text, setting.words)
+            raise argparse.ArgumentTypeError(f"{text!r}: {setting.expected}{hint}") from error
+
+    return read
+
+
+def _metavar(setting: Setting) -> str:
+    if setting.metavar:
+        return setting.metavar
+    if setting.kind == "word":
+        choices = ",".join(setting.words)
+        return f"{{{choices}}}" if len(choices) <= _LONGEST_CHOICE else "NAME"
+    return {"whole": "N", "number": "X", "range": "X", "switch": "", "text": "TEXT"}[setting.kind]
+
+
+def _help(setting: Setting) -> str:
+    words = f": {', '.join(setting.words)}" if _metavar(setting) == "NAME" else ""
+    default = ("off", "on")[setting.default] if setting.kind == "switch" else setting.default
+    default = f"{default:g}" if isinstance(default, float) else default
+    unit = f" {setting.unit}" if setting.unit else ""
+    shown = "" if default == "" else f" (default {default}{unit})"
+    return f"{setting.help}{words}{shown}".replace("%", "%%")

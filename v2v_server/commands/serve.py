@@ -1,0 +1,43 @@
+"""`v2v-serve`: arguments -> configuration -> call."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import V2VError
+from v2v_server.commands.spec_flags import add_spec
+from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
+from v2v_server.serve import serve
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-serve", "--videos DIR [flags]", "Decode videos, simulate event voxels, stream samples to trainers.",
+        [
+            "v2v-serve --videos clips/ --workers 8",
+            "v2v-serve --videos webvid10k/ --rows top:0.54 --preset fast --scene auto",
+            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set threshold=[0.2,0.4]",
+            "v2v-serve --config serve.yaml",
+        ],
+    )  # fmt: skip
+    parser.add_settings(ServeConfig)
+    add_spec(parser)
+    parser.group("Videos").add_argument("--config", metavar="FILE", help="YAML file of these flags; a flag wins")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
+    # Without --recipe the fields of --set are changed in what the file says.
+    settings = arguments.set if arguments.recipe is None else []
+    if arguments.recipe is not None:
+        flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
+    serve(ServeConfig.load(arguments.config, flags, settings))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
