@@ -19,7 +19,7 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.catalogue.index_file import Record, Store
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
-from v2v_server.catalogue.survey import LONGEST_SECONDS
+from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.store.manifest import Manifest
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
@@ -115,7 +115,7 @@ class Looking:
 
         look = partial(_look_at, os.fspath(root))
         suspects = []
-        for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS):
+        for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS, 2 * LARGEST_MEMORY_BYTES):
             if isinstance(scene, Died) and scene.overdue_seconds:
                 continue  # the next start tries again
             if isinstance(scene, Died) or not scene:
@@ -124,7 +124,7 @@ class Looking:
                 yield by_id[job.id], Scene.from_bytes(scene)
         # Once more, alone: it may have been killed from outside, or for want of memory, or its storage failed for a
         # moment. A second failure is not kept: of such a video nothing is known, and the next start tries again.
-        for job, scene in run_isolated(look, suspects, 1, lambda job: LONGEST_SECONDS):
+        for job, scene in run_isolated(look, suspects, 1, lambda job: LONGEST_SECONDS, 2 * LARGEST_MEMORY_BYTES):
             if not isinstance(scene, Died) and scene:
                 yield by_id[job.id], Scene.from_bytes(scene)
 

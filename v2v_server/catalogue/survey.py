@@ -17,6 +17,10 @@ from v2v_server.video.probe import VideoFacts, probe
 LONGEST_SECONDS = 3600.0
 """For reading a file from end to end, on slow storage: who needs longer waits for a file that never comes."""
 
+LARGEST_MEMORY_BYTES = 2 << 30
+"""What a process may allocate to examine a file: enough for 16 pictures of the largest size, or a list of 2**24 frames.
+A file of some kB can claim a thousand million frames, for which a demuxer would make room."""
+
 Examine = Callable[[str, str], Record]
 """(root, id) -> what is known of that file; see :func:`examine`."""
 
@@ -101,14 +105,14 @@ def survey(
     """
     look = partial(examine, os.fspath(root))
     suspects: list[str] = []
-    for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds):
+    for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
         if isinstance(found, Died) and found.overdue_seconds:
             yield Record(id, -1, 0, problem=f"cannot be probed: {found.how}; the next start tries again")
         elif isinstance(found, Died):
             suspects.append(id)
         else:
             yield found
-    for id, found in run_isolated(look, suspects, 1, lambda id: longest_seconds):
+    for id, found in run_isolated(look, suspects, 1, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
         yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 

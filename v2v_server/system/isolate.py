@@ -10,6 +10,7 @@ import contextlib
 import math
 import multiprocessing
 import os
+import resource
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -72,6 +73,7 @@ def run_isolated(
     jobs: Iterable[J],
     processes: int,
     deadline_seconds: Callable[[J], float] | None = None,
+    memory_bytes: int = 0,
 ) -> Iterator[tuple[J, R | Died]]:
     """(job, result) for every job, in order of completion.
 
@@ -84,6 +86,7 @@ def run_isolated(
         processes: how many, spawned; 0 runs the jobs in this process, unprotected.
         deadline_seconds: how long a job may take, its process's start included, before that is killed; None: any time.
             Only time that is spent waiting here counts, so that nothing is overdue after the whole program was stopped.
+        memory_bytes: how much a process may allocate: more is refused to whatever asks for it; 0 sets no limit.
 
     Raises:
         OSError: no process can be started.
@@ -96,7 +99,7 @@ def run_isolated(
     lanes: dict[Connection, _Lane[J, R]] = {}
     try:
         for job in left:
-            lane = _Lane(function, deadline_seconds)
+            lane = _Lane(function, deadline_seconds, memory_bytes)
             lanes[lane.connection] = lane
             lane.begin(job)
             if len(lanes) == processes:
@@ -110,7 +113,7 @@ def run_isolated(
                     continue
                 for following in left:
                     if isinstance(finished[1], Died):
-                        lane = _Lane(function, deadline_seconds)
+                        lane = _Lane(function, deadline_seconds, memory_bytes)
                         lanes.pop(ready).end()
                         lanes[lane.connection] = lane
                     lane.begin(following)
@@ -140,13 +143,15 @@ class _Lane(Generic[J, R]):
         patience: for how many seconds more its job is waited for.
     """
 
-    def __init__(self, function: Callable[[J], R], deadline_seconds: Callable[[J], float] | None) -> None:
+    def __init__(
+        self, function: Callable[[J], R], deadline_seconds: Callable[[J], float] | None, memory_bytes: int
+    ) -> None:
         self._deadline_seconds = deadline_seconds
         self.patience = math.inf
         self._begun = False
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, function, os.getpid()), daemon=True)
+        self._process = context.Process(target=_serve, args=(other, function, os.getpid(), memory_bytes), daemon=True)
         # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
         resource_tracker.ensure_running()
         try:
@@ -207,8 +212,12 @@ def _interrupt_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int) -> None:
+def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int, memory_bytes: int) -> None:
     die_with_parent(parent_pid)
+    if memory_bytes:
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        at_most = memory_bytes if hard == resource.RLIM_INFINITY else min(memory_bytes, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (at_most, hard))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
     connection.send(None)  # begun: what ends this process from here on is no fault of its start
     while True:

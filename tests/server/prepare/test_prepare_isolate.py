@@ -70,6 +70,18 @@ def test_a_job_that_waits_for_ever_costs_itself(tmp_path: Path) -> None:
     assert results == {1: 1, 3: 9, 4: 16}
 
 
+def room_for(size_bytes: int) -> bool:
+    try:
+        return len(bytearray(size_bytes)) == size_bytes
+    except MemoryError:
+        return False
+
+
+def test_a_process_gets_no_more_memory_than_it_may_have() -> None:
+    results = dict(run_isolated(room_for, [1 << 20, 1 << 29], 1, memory_bytes=256 << 20))
+    assert results == {1 << 20: True, 1 << 29: False}
+
+
 def test_leaving_early_ends_the_processes() -> None:
     results = run_isolated(square_or_die, range(3), processes=2)
     next(results)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 
 import av
@@ -11,6 +12,8 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import VideoError
+from v2v_server.catalogue.survey import survey
+from v2v_server.video import probe as probing
 from v2v_server.video import source
 from v2v_server.video.probe import probe
 from v2v_server.video.source import CODECS, FORMATS
@@ -90,6 +93,32 @@ def test_no_more_streams_are_made_than_the_limit(tmp_path: Path) -> None:
     with source.opened(path) as (container, _):
         assert len(container.streams) == source.MOST_STREAMS
     assert probe(path).frames == 1
+
+
+def test_a_file_that_claims_a_thousand_million_frames_is_given_no_room_for_them(tmp_path: Path) -> None:
+    """Their list would take 40 GB. Its neighbours are served."""
+    write_clip(tmp_path / "good.mov", panned_luma(5))
+    whole = write_clip(tmp_path / "claim.mov", panned_luma(3), codec="mjpeg", pixel_format="yuvj420p")
+    content, count = bytearray(whole.read_bytes()), 10**9
+    for atom, at, fields in (("stsz", 8, (1, count)), ("stsc", 8, (1, 1, count, 1)), ("stts", 12, (count,))):
+        start = content.index(atom.encode()) + at
+        content[start : start + 4 * len(fields)] = struct.pack(f">{len(fields)}I", *fields)
+    whole.write_bytes(content)
+    records = {record.id: record for record in survey(tmp_path, ["claim.mov", "good.mov"], 1)}
+    assert records["good.mov"].frames == 5
+    assert records["claim.mov"].problem is not None
+    assert records["claim.mov"].size_bytes > 0  # it is not read again at each start
+
+
+def test_a_list_of_frames_that_never_ends_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = write_clip(tmp_path / "clip.mp4", panned_luma(30))
+    monkeypatch.setattr(probing, "LARGEST_FRAMES", 20)
+    with pytest.raises(VideoError, match="holds more than 20 frames"):
+        probe(clip)
+    monkeypatch.undo()
+    monkeypatch.setattr(probing, "LONGEST_CPU_SECONDS", -1.0)
+    with pytest.raises(VideoError, match="of processor time to list its frames"):
+        probe(clip)
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
