@@ -32,7 +32,6 @@ BENCHMARKS = {
     "released": "speed.released",
     "tradeoff": "tradeoff.tradeoff",
     "training_trade": "tradeoff.training_trade",
-    "prepare": "tradeoff.prepare",
     "flow": "accuracy.flow",
     "physics": "accuracy.physics",
     "extremes": "accuracy.extremes",

@@ -27,10 +27,10 @@ from v2v_server.config import ServeConfig
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.clips import check_file
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Supervisor
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
-from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.rows import Rows
 
 _TURN_SECONDS = 0.1
@@ -230,7 +230,7 @@ class Server:
         """Whether this host has the video as it was catalogued. If so, the operator is told of the host that has not,
         once in a while: all workers of a host fail alike."""
         try:
-            check_fingerprint(self._catalogue.path(missing.video), missing.fingerprint)
+            check_file(self._catalogue.path(missing.video), missing.fingerprint)
         except (VideoError, CorpusError):
             return False
         now = time.monotonic()

@@ -43,10 +43,10 @@ from v2v_server.catalogue.look import look
 from v2v_server.flow import FlowSettings, flow_for, view_part
 from v2v_server.flow.methods import one_thread
 from v2v_server.prepare.encode import Encoding, encode_luma
-from v2v_server.prepare.transcode import luma_frames
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation.clip import simulate_clip, warm_up
 from v2v_server.simulation.view import apply_view
+from v2v_server.video.decode import stream_luma
 from v2v_server.worker.produce import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX
 
@@ -116,7 +116,7 @@ def rendered(folder: Path, frames: int) -> None:
     }
     for name, luma in clips.items():
         encode_luma(
-            folder / f"{name}.mp4", luma, Encoding("h264", 8, 250), height=_HEIGHT_PX, width=_WIDTH_PX,
+            folder / f"{name}.mp4", luma, Encoding("h264", quality=8, gop=250), height=_HEIGHT_PX, width=_WIDTH_PX,
             pts=range(len(luma)), time_base=Fraction(1, 25),
         )  # fmt: skip
 
@@ -202,7 +202,7 @@ def looking(catalogue: Catalogue) -> Record:
     for video in catalogue.videos:
         top, bottom = catalogue.rows.bounds(video.height_px)
         window = (top, 0, bottom - top, video.width_px)
-        source = luma_frames(catalogue.path(video.id), catalogue.frame_index(video.id), window)
+        source = stream_luma(catalogue.path(video.id), catalogue.frame_index(video.id), 0, video.frames, window)
         started = time.process_time()
         try:
             pictures = list(islice(source, _LOOKED_FRAMES))

@@ -26,12 +26,10 @@ from v2v_server.video.rows import Rows
 
 SOURCE = "source"
 ENCODINGS = {
-    f"{codec} {quality}": Encoding(codec, quality, 25)
-    for codec, quality in (
-        ("h264", 12), ("h264", 18), ("h264", 23), ("mpeg4", 2), ("mpeg4", 4), ("mpeg2", 2), ("mjpeg", 3),
-    )
-}  # fmt: skip
-DEFAULT_FORMS = ("h264 12", "h264 18", "mpeg4 2", "mpeg4 4", "mjpeg 3")
+    "lossless dense": Encoding("lossless", "dense"),
+    "lossless fast": Encoding("lossless", "fast"),
+} | {f"h264 {quality}": Encoding("h264", quality=quality, gop=25) for quality in (12, 18, 23)}
+DEFAULT_FORMS = ("lossless dense", "lossless fast", "h264 12", "h264 18")
 STILL_FRAMES = 250
 _STILL_GOP = 250
 
@@ -126,6 +124,12 @@ def _make_stills(source: Catalogue, pictures: Path, scenes: Path, most: int = 2)
         paths.append(pictures / f"{len(paths)}.mp4")
         height, width = luma.shape[1:]
         encode_luma(
-            paths[-1], luma, Encoding("h264", 1, 1), height=height, width=width, pts=[0], time_base=Fraction(1, 25)
+            paths[-1],
+            luma,
+            Encoding("h264", quality=1, gop=1),
+            height=height,
+            width=width,
+            pts=[0],
+            time_base=Fraction(1, 25),
         )
     webvid_like(paths, scenes, gop=_STILL_GOP, frames=STILL_FRAMES, clips=len(paths))

@@ -40,7 +40,8 @@ class Setting:
         lines = [f"# {self.name}: {why}"]
         if self.form != SOURCE:
             how = ENCODINGS[self.form]
-            flags = f"--rows {rows} --codec {how.codec} --quality {how.quality} --gop {how.gop}"
+            kind = f"--size {how.size}" if how.is_lossless else f"--quality {how.quality} --gop {how.gop}"
+            flags = f"--rows {rows} --codec {how.codec} {kind}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
         chosen = {"rows": rows, "samples_per_decode": self.samples_per_decode}
         return "\n".join([*lines, yaml.safe_dump(chosen, sort_keys=False)])

@@ -24,6 +24,7 @@ from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
+from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
@@ -97,6 +98,7 @@ class Catalogue:
     scene_digest: str | None
     _store: Store = field(repr=False, compare=False)
     _fingerprints: dict[str, str] = field(repr=False, compare=False)
+    _files: dict[str, str] = field(repr=False, compare=False)  # by id, the fingerprint of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
     _looking: Looking | None = field(repr=False, compare=False)
     _unseen: frozenset[str] = field(repr=False, compare=False)
@@ -141,12 +143,12 @@ class Catalogue:
         return self._slices[key]
 
     def _stored_index(self, id: str) -> bytes:
-        fingerprint = self._fingerprint(id)
+        self._fingerprint(id)
         if id in self._absent:
             video = self._absent[id]
             return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
         try:
-            data = self._store.frame_index(id, fingerprint)
+            data = self._store.frame_index(id, self._files[id])
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -161,13 +163,13 @@ class Catalogue:
                 longer be read.
             VideoChanged: another process has catalogued a changed file under this id since.
         """
-        fingerprint = self._fingerprint(id)
+        self._fingerprint(id)
         if self._looking is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
         if id in self._unseen:
             return Scene.unknown()
         try:
-            data = self._store.scene(id, fingerprint, self._looking.key)
+            data = self._store.scene(id, self._files[id], self._looking.key)
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -238,8 +240,7 @@ def open_catalogue(
         raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
     refused: dict[str, str] = {}
     if manifest is not None:
-        manifest.check_served(rows)
-        rows = None
+        rows = manifest.served_rows(rows)
         ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
     else:
         named = None if listed is None else [entry.id for entry in listed]
@@ -293,20 +294,23 @@ def _snapshot(
 ) -> Catalogue:
     by_id = {entry.id: entry for entry in listed}
     problems = dict(refused)
-    used = []
+    used, files = [], {}
     videos = []
     shorter = []
     absent: dict[str, PreparedVideo] = {}
     for id in sorted(records):
         record, entry = records[id], by_id.get(id, ListEntry(id))
+        files[id] = record.fingerprint
         if manifest is not None:
             if not manifest.describes(record):
                 absent[id] = manifest.videos[id]
             record = manifest.as_source(record)
+        elif record.codec == STORE_FORMAT:
+            record = replace(record, problem="is a file of a lossless corpus by itself: serve the whole folder")
         if record.problem is not None:
             problems[id] = record.problem
             continue
-        used.append(record)
+        used.append(replace(record, fingerprint=files[id]))
         videos.append(_entry(record, entry))
         if entry.frames is not None and entry.frames > record.frames:
             shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
@@ -350,6 +354,7 @@ def _snapshot(
         scene_digest=scene_digest,
         _store=store,
         _fingerprints={video.id: video.fingerprint for video in videos},
+        _files=files,
         _absent=absent,
         _looking=looking,
         _unseen=frozenset(unseen),

@@ -20,6 +20,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.catalogue.index_file import Record, Store
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
+from v2v_server.store.clips import pictures_of
 from v2v_server.store.manifest import Manifest
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
@@ -44,7 +45,8 @@ class Looking:
     @property
     def key(self) -> str:
         """Tells looks of one file apart."""
-        made = "" if self.manifest is None else f"prepared {self.manifest.header.rows}, "
+        is_source = self.manifest is None or self.manifest.lossless
+        made = "" if self.manifest is None or is_source else f"prepared {self.manifest.header.rows}, "
         return f"{made}{self.rows}, look {LOOK_VERSION}"
 
     def take_in(
@@ -154,13 +156,12 @@ def _look_at(root: str, job: _Job) -> bytes:
     decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.
     from v2v_server.catalogue.look import Look
-    from v2v_server.prepare.transcode import luma_frames
 
     seen = Look()
     if job.index and job.window is not None:
         try:
             for picture in islice(
-                luma_frames(Path(root, job.id), FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES
+                pictures_of(Path(root, job.id), FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES
             ):
                 seen.add(picture)
         except VideoError as error:

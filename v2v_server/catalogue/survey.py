@@ -10,9 +10,10 @@ from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.catalogue.index_file import Record
+from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
-from v2v_server.video.probe import VideoFacts, probe
+from v2v_server.video.probe import VideoFacts
 
 LONGEST_SECONDS = 3600.0
 """For reading a file from end to end, on slow storage: who needs longer waits for a file that never comes."""
@@ -71,12 +72,12 @@ def _facts(path: Path) -> VideoFacts:
         VideoError: the file is no video that this program serves.
     """
     try:
-        return probe(path)
+        return facts_of(path)
     except VideoError as error:
         if not isinstance(error.__cause__, OSError):
             raise
     try:
-        return probe(path)
+        return facts_of(path)
     except VideoError as error:
         if isinstance(error.__cause__, OSError):
             raise VideoUnreadable(error.video, error.frame, error.reason) from error

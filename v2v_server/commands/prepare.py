@@ -26,8 +26,9 @@ from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.catalogue.listfile import LIST_SUFFIXES
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.prepare import prepare
-from v2v_server.prepare.encode import CODECS, DEFAULT_CODEC, DEFAULT_GOP, Encoding
+from v2v_server.prepare.encode import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
 from v2v_server.prepare.report import Report
+from v2v_server.store.packing import SIZES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -38,14 +39,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = Parser(
         "v2v-prepare", "SRC DST [flags]",
-        "Transcode a corpus once to what training needs: chosen rows, grey, fast decode.",
+        "Decode a corpus once: its luma, bit for bit, in blocks that are read at once; or as small H.264.",
         [
-            "v2v-prepare webvid10k/ prepared/ --rows top:0.54",
-            "v2v-prepare clips/ prepared/ --tile-width 284 --tile-overlap 128 --scene auto",
+            "v2v-prepare webvid10k/ store/ --rows top:0.54",
+            "v2v-prepare clips/ store/ --size fast --scene auto",
         ],
         "Exit status: 1 where some videos were not prepared, fall below a floor or lack the statistics asked for.",
     )  # fmt: skip
-    defaults = ", ".join(f"{name} {codec.default}" for name, codec in CODECS.items())
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
     videos.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
@@ -58,19 +58,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     encoding = parser.group("Encoding")
-    encoding.add_argument("--codec", choices=tuple(CODECS), default=DEFAULT_CODEC, help=f"default {DEFAULT_CODEC}")
-    encoding.add_argument("--quality", type=int, metavar="Q", help=f"lower is better and larger; default {defaults}")
     encoding.add_argument(
-        "--gop", type=int, default=DEFAULT_GOP, metavar="N", help=f"distance of keyframes (default {DEFAULT_GOP})"
+        "--codec", choices=(LOSSLESS, H264), default=LOSSLESS,
+        help="lossless (default): the samples of SRC, at some 9 times its size; h264: smaller than SRC, and not exact",
+    )  # fmt: skip
+    encoding.add_argument(
+        "--size", choices=tuple(SIZES), help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, read sooner"
     )
     encoding.add_argument(
-        "--tile-width", type=int, default=0, metavar="PX", dest="tile_px",
-        help="store pictures as tiles about PX wide; a crop decodes those that it touches (default 0: no tiles)",
-    )  # fmt: skip
-    encoding.add_argument(
-        "--tile-overlap", type=int, default=0, metavar="PX", dest="tile_overlap_px",
-        help="let each tile share PX columns with the next, so that a crop no wider touches one (default 0)",
-    )  # fmt: skip
+        "--quality", type=int, metavar="Q", help=f"h264: rate factor, lower is better and larger ({DEFAULT_QUALITY})"
+    )
+    encoding.add_argument("--gop", type=int, metavar="N", help=f"h264: distance of keyframes ({DEFAULT_GOP})")
     run = parser.group("Run")
     run.add_argument(
         "--workers", type=int, default=usable_cores(), metavar="N",
@@ -152,6 +150,9 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
             f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "
             f"{change} {abs(before - after) / 1e6:.1f} MB"
         )
+        if encoding.is_lossless:
+            lines.append("every frame was read back and is the source's, bit for bit")
+    if prepared and not encoding.is_lossless:
         quality = {video.id: video.psnr_db or 0.0 for video in prepared}
         worst = min(quality, key=lambda id: quality[id])
         lines.append(
@@ -193,13 +194,18 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
 @contextlib.contextmanager
 def _progress() -> Iterator[prepare.Progress]:
     columns = (
-        TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[size]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("prepare", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task("prepare", total=None, size="")
+
+        def tell(done: int, total: int, made: int, expected: int) -> None:
+            size = f"{made / 1e9:.1f} of about {expected / 1e9:.1f} GB" if expected else ""
+            bar.update(task, completed=done, total=total, size=size)
+
+        yield tell
 
 
 if __name__ == "__main__":

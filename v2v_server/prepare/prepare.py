@@ -1,7 +1,8 @@
-"""`v2v-prepare`: a corpus transcoded once to what training needs.
+"""`v2v-prepare`: a corpus decoded once, and kept as what training needs.
 
 The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation, and
-a manifest that says what the files are. Its files are MP4 whatever their names end in; FFmpeg goes by content.
+a manifest that says what the files are: of the store (:mod:`v2v_server.store.format`), which give the very frames of
+their sources, or MP4; whatever their names end in.
 
 Whatever happens, the folder stays sound: a file gets its name only when whole and verified, and its line in the
 manifest after that. A second run keeps what the manifest lists, if file and source are still those, and does the rest.
@@ -12,8 +13,9 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,8 +38,16 @@ DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
 """How far below the clip's floor a frame may lie. The worst frame of a sound clip is some 5 dB worse than the clip at
 most; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
 
-Progress = Callable[[int, int], None]
-"""(source frames dealt with, source frames in all)."""
+LEAST_FREE_BYTES = 1 << 30
+"""So much of the disk is left to others: who fills a disk to the last byte stops what else runs there."""
+
+_STORED_BITS_PER_PIXEL = 2.2
+"""Of a lossless file, in the middle of the clips that were measured (docs/prepare.md): 0.7 to 3.4."""
+
+_TELLING_SHARE = 0.02
+
+Progress = Callable[[int, int, int, int], None]
+"""(source frames dealt with, source frames in all, bytes made so far, bytes to expect in all)."""
 
 
 def prepare(
@@ -69,7 +79,7 @@ def prepare(
     Raises:
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process is at work there, or the
-            source is prepared itself.
+            source is prepared itself; or the disk has not the room, or no longer.
         UsageError: a number outside its limits.
     """
     if frame_floor_db is None:
@@ -79,14 +89,14 @@ def prepare(
             f"{processes} processes, floor {floor_db:g} dB, frame floor {frame_floor_db:g} dB: give 0 or more, and "
             "finite numbers"
         )
-    tell = progress or (lambda done, total: None)
+    tell = progress or (lambda done, total, made, expected: None)
     total = sum(video.frames for video in catalogue.videos)
-    tell(0, total)
+    tell(0, total, 0, 0)
     target = Path(destination).resolve()
     refuse_overlap(catalogue, target, single)
     header = Header(
-        str(catalogue.rows), encoding.codec, encoding.quality, encoding.gop, len(catalogue.videos),
-        catalogue.root.name, catalogue.digest, tile_px=encoding.tile_px, tile_overlap_px=encoding.tile_overlap_px,
+        str(catalogue.rows), encoding.codec, encoding.size, encoding.quality, encoding.gop, len(catalogue.videos),
+        catalogue.root.name, catalogue.digest,
     )  # fmt: skip
     made: dict[str, PreparedVideo] = {}
     not_looked_at = []
@@ -94,10 +104,11 @@ def prepare(
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
             known = known_records(target, header, catalogue.videos)
-            earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total))
+            earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total, 0, 0))
             standing, finished = earlier.standing, earlier.finished
             left = [video for video in catalogue.videos if video.id not in finished]
             done = total - sum(video.frames for video in left)
+            room = _Room(target, catalogue, encoding, left)
             wanted = {video.id for video in catalogue.videos}
             aside = [record for id, record in known.items() if id not in wanted]
             with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
@@ -108,7 +119,9 @@ def prepare(
                         manifest.add(outcome)
                         made[outcome.id] = outcome
                     done += video.frames
-                    tell(done, total)
+                    room.done(video, 0 if isinstance(outcome, Problem) else outcome.bytes)
+                    tell(done, total, room.made, room.expected)
+                    room.check()
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     records = standing | made
@@ -122,6 +135,58 @@ def prepare(
         aside=len(aside),
         not_looked_at=tuple(not_looked_at),
     )
+
+
+class _Room:
+    """Whether the disk has the room for what is to come.
+
+    Raises:
+        CorpusError: it has not, by a first estimate.
+        OSError: it cannot be asked.
+    """
+
+    def __init__(self, target: Path, catalogue: Catalogue, encoding: Encoding, left: Sequence[VideoEntry]) -> None:
+        self._target = target
+        self._pixels = {video.id: _pixels(video, catalogue.rows) for video in left}
+        self._lossless = encoding.is_lossless
+        self._all_pixels, self._done_pixels = sum(self._pixels.values()), 0
+        self.made = 0
+        free = shutil.disk_usage(target).free
+        if self.expected > free - LEAST_FREE_BYTES:
+            raise CorpusError(
+                f"{target}: about {self.expected / 1e9:.1f} GB are to be written, and the disk has "
+                f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; make room, keep fewer rows, "
+                "name fewer videos by --list, or take --codec h264"
+            )
+
+    def done(self, video: VideoEntry, made: int) -> None:
+        """A video is dealt with, and so many bytes were made of it."""
+        self._done_pixels += self._pixels[video.id]
+        self.made += made
+
+    @property
+    def expected(self) -> int:
+        """How many bytes there will be: by those that were made, as soon as they say something."""
+        if self.made and self._done_pixels > _TELLING_SHARE * self._all_pixels:
+            return int(self.made / self._done_pixels * self._all_pixels)
+        return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels) if self._lossless else 0
+
+    def check(self) -> None:
+        """Raises CorpusError where the disk is nearly full."""
+        free = shutil.disk_usage(self._target).free
+        if free < LEAST_FREE_BYTES:
+            raise CorpusError(
+                f"{self._target}: the disk has {free / 1e9:.2f} GB left, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; "
+                "what is done is kept, and the same command goes on when there is room"
+            )
+
+
+def _pixels(video: VideoEntry, rows: Rows) -> int:
+    try:
+        top, bottom = rows.bounds(video.height_px)
+    except UsageError:
+        return 0
+    return video.frames * (bottom - top) * video.width_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,15 +237,15 @@ def _outcomes(
         try:
             jobs.append(_Job(video, _window(video, catalogue.rows), standing.get(video.id)))
         except UsageError as error:
-            yield video, _record(video, 0, 0, str(error))
+            yield video, _record(video, 0, 0, str(error), encoding)
 
     def transcodings() -> Iterator[tuple[_Job, Transcoding]]:
         for job in jobs:
             id = job.video.id
             index = catalogue.frame_index(id).to_bytes()
             yield job, Transcoding(
-                catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second, job.window, encoding,
-                target, target / id, scene,
+                id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
+                job.window, encoding, target, target / id, scene,
             )  # fmt: skip
 
     for (job, _), result in run_isolated(_attempt, transcodings(), processes, lambda job: _deadline_seconds(job[0])):
@@ -195,7 +260,7 @@ def _outcomes(
             yield job.video, Problem(job.video.id, result)
         else:
             assert not isinstance(result, Scene)
-            yield job.video, _record(job.video, *job.window[2:], result)
+            yield job.video, _record(job.video, *job.window[2:], result, encoding)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +295,9 @@ def _attempt(job: tuple[_Job, Transcoding]) -> Made | Scene | str:
         return f"preparing failed: {type(error).__name__}: {error}"
 
 
-def _record(video: VideoEntry, height: int, width: int, result: Made | str) -> PreparedVideo:
+def _record(video: VideoEntry, height: int, width: int, result: Made | str, encoding: Encoding) -> PreparedVideo:
+    if encoding.is_lossless:
+        height, width = video.height_px, video.width_px
     rate = video.frames_per_second
     # A fingerprint begins with the size in bytes.
     size = int(video.fingerprint.partition("-")[0])

@@ -1,4 +1,8 @@
-"""One video into its prepared form: decode, encode under a temporary name, verify, rename."""
+"""One video into its prepared form: decode, write under a temporary name, verify, rename.
+
+A lossless file is verified by reading all of it back: it has to give the very frames that were decoded. A lossy one is
+decoded again and compared with its source.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +15,25 @@ from fractions import Fraction
 from itertools import islice
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import numpy.typing as npt
-from av.video.frame import VideoFrame
+import xxhash
 
 from v2v_protocol.errors import VideoError
 from v2v_server.catalogue.look import Look
 from v2v_server.catalogue.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import Encoding, encode_luma
-from v2v_server.video.decode import decode_luma
+from v2v_server.store.clips import stored_pictures
+from v2v_server.store.format import Head, group_frames_for
+from v2v_server.store.packing import SIZES
+from v2v_server.store.reader import StoreFile
+from v2v_server.store.writer import StoreWriter
+from v2v_server.video.decode import BIT_EXACT_CODECS, decode_luma, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
-from v2v_server.video.orientation import Orientation, Window
+from v2v_server.video.orientation import Window
 from v2v_server.video.probe import probe
-from v2v_server.video.source import opened, pictures, reason
-from v2v_server.video.tiles import parts
 
 PARTIAL_SUFFIX = ".v2v-partial"
 HIGHEST_PSNR_DB = 100.0
@@ -43,8 +48,10 @@ class Transcoding:
     """One video to be prepared.
 
     Attributes:
+        video: its id.
         source: the file.
         fingerprint: which it must have.
+        codec: FFmpeg's name of its format.
         index: ``FrameIndex.to_bytes()`` of it.
         frames_per_second: its average rate, NaN where unknown; gives the time stamps where the index has none.
         window: of its upright pictures, what to keep.
@@ -54,8 +61,10 @@ class Transcoding:
         scene: whether to take the statistics of what it shows.
     """
 
+    video: str
     source: Path
     fingerprint: str
+    codec: str
     index: bytes
     frames_per_second: float
     window: Window
@@ -92,7 +101,6 @@ def transcode(job: Transcoding) -> Made:
     """
     check_fingerprint(job.source, job.fingerprint)
     index = FrameIndex.from_bytes(job.index)
-    pts, time_base = _times(job, index)
     if not job.target.parent.resolve().is_relative_to(job.root):
         raise VideoError(os.fspath(job.source), None, f"{job.target.parent} is a link out of the destination")
     job.target.parent.mkdir(parents=True, exist_ok=True)
@@ -100,15 +108,13 @@ def transcode(job: Transcoding) -> Made:
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     partial = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     try:
-        height, width = job.window[2:]
-        frames = luma_frames(job.source, index, job.window)
+        frames = _frames(job, index)
         seen = Look()
         if job.scene:
             frames = _watched(frames, seen)
-        encode_luma(partial, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)
-        made = _verified(job, index, partial, pts, time_base)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
+        made = (
+            _stored(job, index, partial, frames) if job.encoding.is_lossless else _encoded(job, index, partial, frames)
+        )
         partial.replace(job.target)
     finally:
         partial.unlink(missing_ok=True)
@@ -123,7 +129,7 @@ def look_again(job: Transcoding) -> Scene:
     """
     check_fingerprint(job.source, job.fingerprint)
     seen = Look()
-    for frame in islice(luma_frames(job.source, FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES):
+    for frame in islice(_frames(job, FrameIndex.from_bytes(job.index)), MOST_FRAMES):
         seen.add(frame)
     return seen.scene()
 
@@ -136,66 +142,44 @@ def _watched(frames: Iterator[npt.NDArray[np.uint8]], seen: Look) -> Iterator[np
         yield frame
 
 
-def luma_frames(path: str | os.PathLike[str], index: FrameIndex, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
-    """All frames of a file, one by one: what :func:`v2v_server.video.decode.decode_luma` gives for the whole range, in
-    the memory of one.
-
-    Args:
-        path: the file.
-        index: its whole index.
-        window: (top, left, height, width) in the upright picture, pixels.
-
-    Yields:
-        [height, width] uint8, full-range luma.
-
-    Raises:
-        VideoError: a frame is missing or damaged, or the picture's size or format is not the same all along.
-    """
-    if not index.tiles:
-        yield from _track_frames(path, index, window)
-        return
-    needed = parts(window, index.tiles)
-    tiles = [_track_frames(path, index.of_tile(part.track), part.window, part.track) for part in needed]
-    for columns in zip(*tiles, strict=True):
-        yield np.concatenate(columns, axis=1)
+def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint8]]:
+    return stream_luma(job.source, index, 0, len(index), job.window)
 
 
-def _track_frames(
-    path: str | os.PathLike[str], index: FrameIndex, window: Window, track: int = 0
-) -> Iterator[npt.NDArray[np.uint8]]:
-    name = os.fspath(path)
-    done = 0
-    with opened(path, track=track) as (container, stream):
-        try:
-            for frame in pictures(container, stream):
-                if index.seekable and frame.pts is not None and frame.pts < index.pts[0]:
-                    continue
-                _check(name, frame, index, done)
-                if done == 0:
-                    luma, orientation = LumaFormat.of(frame), Orientation.of(frame)
-                    size = orientation.size(index.height_px, index.width_px)
-                    stored = orientation.stored_window(window, index.height_px, index.width_px)
-                if (frame.height, frame.width) != size or not luma.describes(frame):
-                    raise VideoError(name, done, "the picture's size or format changes here")
-                frames = np.empty((1, *stored[2:]), np.uint8)
-                copy_luma(luma_plane(frame, luma), luma, stored, frames[0])
-                stretch(frames, luma)
-                yield orientation.upright(frames)[0]
-                done += 1
-                if done == len(index):
-                    return
-        except av.FFmpegError as error:
-            raise VideoError(name, done, f"does not decode: {reason(error)}") from error
-    raise VideoError(name, done, "the file ends before it")
+def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
+    """Makes a file of the store, and reads it back."""
+    packing = SIZES[job.encoding.size]
+    top, _, rows, width = job.window
+    rate = job.frames_per_second
+    head = Head(
+        video=job.video, fingerprint=job.fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
+        first=0, count=len(index), frames=len(index), frames_per_second=0.0 if math.isnan(rate) else rate,
+        codec=job.codec, bit_exact=job.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width),
+        packing=packing.method, index=job.index,
+    )  # fmt: skip
+    wanted, got = xxhash.xxh3_128(), xxhash.xxh3_128()
+    with StoreWriter(made, head, packing) as writer:
+        for picture in frames:
+            wanted.update(np.ascontiguousarray(picture).data)
+            writer.add(picture)
+        writer.close(lasting=True)
+    with StoreFile(made, job.fingerprint) as stored:
+        for picture in stored_pictures(stored, job.window):
+            got.update(np.ascontiguousarray(picture).data)
+    if wanted.digest() != got.digest():
+        raise VideoError(os.fspath(job.source), None, "verification: what was stored does not give back its frames")
+    return Made(fingerprint(made), made.stat().st_size, HIGHEST_PSNR_DB, HIGHEST_PSNR_DB)
 
 
-def _check(name: str, frame: VideoFrame, index: FrameIndex, ordinal: int) -> None:
-    if frame.is_corrupt:
-        raise VideoError(name, ordinal, "is damaged")
-    if index.seekable and frame.pts != index.pts[ordinal]:
-        raise VideoError(
-            name, ordinal, f"the decoder delivers time stamp {frame.pts} where {index.pts[ordinal]} should come"
-        )
+def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
+    """Encodes a video, and compares it with its source."""
+    pts, time_base = _times(job, index)
+    height, width = job.window[2:]
+    encode_luma(made, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)
+    verified = _verified(job, index, made, pts, time_base)
+    with made.open("rb") as file:
+        os.fsync(file.fileno())
+    return verified
 
 
 def _times(job: Transcoding, index: FrameIndex) -> tuple[list[int], Fraction]:
@@ -228,7 +212,7 @@ def _verified(job: Transcoding, index: FrameIndex, made: Path, pts: list[int], t
 def _squared_errors(job: Transcoding, index: FrameIndex, made: Path, found: FrameIndex) -> npt.NDArray[np.float64]:
     """[n] mean squared error of each prepared frame, as the server will decode it, against the source's."""
     errors = np.empty(len(index))
-    for ordinal, wanted in enumerate(luma_frames(job.source, index, job.window)):
+    for ordinal, wanted in enumerate(_frames(job, index)):
         at = ordinal % _COMPARED_FRAMES
         if at == 0:
             count = min(_COMPARED_FRAMES, len(index) - ordinal)

@@ -28,7 +28,7 @@ from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Header:
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        codec, quality, gop, tile_px, tile_overlap_px: see :class:`v2v_server.prepare.encode.Encoding`.
+        codec, size, quality, gop: see :class:`v2v_server.prepare.encode.Encoding`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
             that are set aside do not count.
         source: name of the source folder, for people.
@@ -47,26 +47,25 @@ class Header:
 
     rows: str
     codec: str
+    size: str
     quality: int
     gop: int
     videos: int
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
-    tile_px: int = 0
-    tile_overlap_px: int = 0
 
     @property
     def encoding(self) -> Encoding:
         """How its files are encoded."""
-        return Encoding(self.codec, self.quality, self.gop, self.tile_px, self.tile_overlap_px)
+        return Encoding(self.codec, self.size, self.quality, self.gop)
 
     def same_settings(self, other: Header) -> bool:
         """Whether videos of both may lie in one folder."""
         return (self.rows, self.encoding) == (other.rows, other.encoding)
 
     def settings(self) -> str:
-        """rows, codec, quality, gop and tiles as text."""
+        """rows and encoding as text."""
         return f"rows {self.rows}, {self.encoding}"
 
 
@@ -78,7 +77,8 @@ class PreparedVideo:
         id: of the source, and the path of the prepared file below the folder.
         source_fingerprint, source_bytes: of the source file.
         frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
-        height_px, width_px: of the prepared picture; 0 where the source has not the rows asked for.
+        height_px, width_px: of the prepared picture, 0 where the source has not the rows asked for; in a lossless
+            folder of the source's picture, of which the file keeps some rows.
         fingerprint, bytes: of the prepared file; "" and 0 with a problem.
         psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
         worst_psnr_db: the same of the worst frame.
@@ -117,8 +117,19 @@ class Manifest:
     videos: dict[str, PreparedVideo]
     aside: dict[str, PreparedVideo] = field(default_factory=dict)
 
-    def check_served(self, rows: Rows | None) -> None:
-        """Make sure that the folder can be served, and its rows are not to be cut again.
+    @property
+    def lossless(self) -> bool:
+        """Whether its files give the very pixels of their sources: the folder is then served as the source is."""
+        return self.header.encoding.is_lossless
+
+    def served_rows(self, rows: Rows | None) -> Rows:
+        """Which rows of its pictures a corpus of this folder has: all of a lossy one.
+
+        A lossless one has pictures of the source's size, of which those rows may be used that are kept, or others
+        where all are kept.
+
+        Args:
+            rows: that are asked for.
 
         Raises:
             CorpusError: it is not finished, or other rows are asked for than it holds.
@@ -128,11 +139,16 @@ class Manifest:
                 f"{self.root}: prepared are {len(self.videos)} of {self.header.videos} videos; run v2v-prepare again "
                 "to finish (what is done is kept)"
             )
-        if rows is not None and str(rows) not in ("full", self.header.rows):
+        asked = None if rows is None or str(rows) == "full" else rows
+        kept = Rows.parse(self.header.rows)
+        if self.lossless and asked is not None and kept == Rows():
+            return asked
+        if asked is not None and asked != kept:
             raise CorpusError(
                 f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
                 "source only; leave --rows out, or serve the source"
             )
+        return kept if self.lossless else Rows()
 
     def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
         """The ids that a corpus of this folder has; files that the manifest does not know are none.
@@ -160,9 +176,10 @@ class Manifest:
         """The record of a prepared file, with what has to agree with its source even where there is no sound file:
         the sequences of all others keep their places only if the source's frames are counted."""
         video = self.videos[record.id]
+        made = video.fingerprint or f"none-of-{video.source_fingerprint}"
         return replace(
             record,
-            fingerprint=video.fingerprint or f"none-of-{video.source_fingerprint}",
+            fingerprint=video.source_fingerprint if self.lossless else made,
             frames=video.frames,
             height_px=video.height_px,
             width_px=video.width_px,

@@ -58,7 +58,4 @@ def _line(item: Header | PreparedVideo, aside: bool = False) -> bytes:
     values: dict[str, object] = asdict(item)
     if aside:
         values["aside"] = True
-    for newer in ("scene", "tile_px", "tile_overlap_px"):  # earlier versions of this program know no such field
-        if not values.get(newer, True):
-            del values[newer]
     return json.dumps(values, allow_nan=False).encode() + b"\n"

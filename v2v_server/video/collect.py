@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -24,13 +24,10 @@ class Cut:
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
-        core_left_px: the column from which on the window is, in every bit, what a window that begins there would be;
-            None: its first (:func:`v2v_server.video.tiles.parts`).
     """
 
     count: int
     window: Window | None = None
-    core_left_px: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +35,13 @@ class Task:
     """Which frames of a file are to be decoded.
 
     Attributes:
-        path, index, start, stride: see :func:`v2v_server.video.decode.decode_cuts`; the index is
-            that of the track.
-        track: of the file.
+        path, index, start, stride: see :func:`v2v_server.video.decode.decode_cuts`.
     """
 
     path: str
     index: FrameIndex
     start: int
     stride: int
-    track: int = 0
 
 
 def window_of(cut: Cut) -> Window:
@@ -59,19 +53,18 @@ def window_of(cut: Cut) -> Window:
 class Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, task: Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]]) -> None:
+    def __init__(self, task: Task, cuts: Sequence[Cut]) -> None:
         self.task = task
         self.index = index = task.index
-        self.codec = ""
+        self.codec = ""  # FFmpeg's name, once decoding has begun
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
-        self._into = into
         self._stride = stride = task.stride
         first, most = task.start - index.first, max(cut.count for cut in cuts)
         self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
         self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
-        self._taken = 0
+        self.taken = 0
         self._cursor = 0  # where the next frame is expected in the index
         self._damaged = False
         self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
@@ -87,8 +80,8 @@ class Stack:
         if self._damaged:
             self.refuse("is damaged, or refers to a damaged or lost frame")
         self._copy(frame)
-        self._taken += 1
-        return self._taken == len(self._expected)
+        self.taken += 1
+        return self.taken == len(self._expected)
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
         """Whether the decoder has left out a frame that the index lists in front of this one."""
@@ -104,12 +97,12 @@ class Stack:
             return ordinal >= self.task.start and (ordinal - self.task.start) % self._stride == 0
         if frame.pts is None:
             self.refuse("the decoder delivers a frame without a time stamp")
-        expected = self._expected[self._taken]
+        expected = self._expected[self.taken]
         if frame.pts == expected:
             return True
         if frame.pts > expected:
             self.refuse(f"is missing: the decoder delivers time stamp {frame.pts} where {expected} should come")
-        if self._taken and not self._is_passed_over(frame.pts):
+        if self.taken and not self._is_passed_over(frame.pts):
             self.refuse(
                 f"the decoder delivers time stamp {frame.pts}, which the index does not have, before {expected}"
             )
@@ -123,7 +116,7 @@ class Stack:
         if not self._parts:
             self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
-            self._parts = [self._part(number, cut) for number, cut in enumerate(self._cuts)]
+            self._parts = [self._part(cut) for cut in self._cuts]
         if (frame.height, frame.width) != self._size:
             height, width = self._orientation.size(frame.height, frame.width)
             self.refuse(
@@ -131,23 +124,17 @@ class Stack:
             )
         if not self._luma.describes(frame):
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
-        samples = luma_plane(frame, self._luma)
-        for stored, raw in self._parts:
-            if self._taken < len(raw):
-                copy_luma(samples, self._luma, stored, raw[self._taken])
+        self._keep(luma_plane(frame, self._luma))
 
-    def _part(self, number: int, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
+        for stored, raw in self._parts:
+            if self.taken < len(raw):
+                copy_luma(samples, self._luma, stored, raw[self.taken])
+
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
         window = window_of(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
-        if self._into and self._orientation == Orientation():
-            return stored, self._into[number]
         return stored, np.empty((cut.count, *stored[2:]), np.uint8)
-
-    def close(self, codec: str) -> None:
-        """The end of the pass: make sure that every asked frame came."""
-        if self._taken < len(self._expected):
-            self.refuse("the file ends before it")
-        self.codec = codec
 
     def refuse(self, why: str) -> NoReturn:
         """Blame the next frame that should have come.
@@ -155,10 +142,30 @@ class Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.task.path, self.task.start + self._taken * self._stride, why)
+        raise VideoError(self.task.path, self.task.start + self.taken * self._stride, why)
 
     def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
         """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
         for _, raw in self._parts:
             stretch(raw, self._luma)
-            yield self._orientation.upright(raw) if raw.flags.c_contiguous else raw
+            yield self._orientation.upright(raw)
+
+
+class Stream(Stack):
+    """Keeps only the last of the asked frames, of one cut."""
+
+    def __init__(self, task: Task, cut: Cut) -> None:
+        super().__init__(task, [cut])
+
+    def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
+        ((stored, raw),) = self._parts
+        copy_luma(samples, self._luma, stored, raw[0])
+
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+        return super()._part(replace(cut, count=1))
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """The last frame that was taken, [h, w] uint8: upright, in full range; valid until the next is taken."""
+        (grey,) = self.grey()
+        picture: npt.NDArray[np.uint8] = grey[0]
+        return picture

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import av
@@ -26,12 +27,11 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, Stack, Task, window_of
+from v2v_server.video.collect import Cut, Stack, Stream, Task
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
-from v2v_server.video.tiles import Part, parts
 
 BIT_EXACT_CODECS = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo"})
 """Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
@@ -49,12 +49,14 @@ class DecodedClip:
         seconds: [count] float64, presentation times; NaN where unknown.
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.
+        origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
     """
 
     frames: npt.NDArray[np.uint8]
     seconds: npt.NDArray[np.float64]
     codec: str
     bit_exact: bool
+    origin: str = ""
 
 
 class _SeekFailed(Exception):
@@ -76,7 +78,7 @@ def decode_cuts(
     *,
     stride: int = 1,
 ) -> tuple[DecodedClip, ...]:
-    """Several cuts of the frames from ``start`` on, from one pass of the decoder (one a tile, where there are tiles).
+    """Several cuts of the frames from ``start`` on, from one pass of the decoder.
 
     Memory: the cuts themselves (frames x height x width bytes each) and what the decoder holds.
 
@@ -96,8 +98,7 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    decode = _decode_tiles if index.tiles else _decode_track
-    taken, codec = decode(Task(os.fspath(path), index, start, stride), checked)
+    taken, codec = _decode(Task(os.fspath(path), index, start, stride), checked)
     return tuple(
         DecodedClip(
             grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
@@ -119,58 +120,65 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode_tiles(task: Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """The cuts of a picture in tiles: each tile that one of them touches is decoded, by itself, and no other."""
-    whole = [np.empty((cut.count, *window_of(cut)[2:]), np.uint8) for cut in cuts]
-    needed: dict[int, list[tuple[int, Part]]] = {}
-    for number, cut in enumerate(cuts):
-        for part in parts(window_of(cut), task.index.tiles, cut.core_left_px):
-            needed.setdefault(part.track, []).append((number, part))
-    codec = ""
-    for track, wanted in needed.items():
-        tile = replace(task, index=task.index.of_tile(track), track=track)
-        into = [whole[number][:, :, part.left : part.left + part.window[3]] for number, part in wanted]
-        taken, codec = _decode_track(tile, [Cut(cuts[number].count, part.window) for number, part in wanted], into)
-        for place, frames in zip(into, taken, strict=True):
-            if frames is not place:
-                place[...] = frames
-    return whole, codec
+def _decode(task: Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+    """The cuts, [count, h, w] uint8 each, and the codec's name."""
+    for frames_of in (_from_keyframe_on, _from_beginning):
+        stack = Stack(task, cuts)
+        try:
+            for _ in _fill(stack, frames_of(stack)):
+                pass
+            return list(stack.grey()), stack.codec
+        except _SeekFailed:
+            continue
+        except VideoError:
+            if frames_of is _from_beginning:
+                raise
+    raise AssertionError("decoding from the beginning has the last word")
 
 
-def _decode_track(
-    task: Task, cuts: Sequence[Cut], into: Sequence[npt.NDArray[np.uint8]] = ()
-) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """The cuts of the pictures of one track, [count, h, w] uint8 each, and the codec's name.
+def stream_luma(
+    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """The frames of :func:`decode_luma` one by one, in the memory of one.
 
-    Args:
-        into: arrays for the cuts, which are used where the stored picture stands upright.
-    """
-    stack = Stack(task, cuts, into)
-    try:
-        done = _decode_quickly(stack)
-    except (_SeekFailed, VideoError):
-        done = False
-        stack = Stack(task, cuts, into)
-    if not done:
-        _decode_plainly(stack)
-    return list(stack.grey()), stack.codec
-
-
-def _decode_quickly(stack: Stack) -> bool:
-    """Decode from the last keyframe at or before the range, leaving out what nothing refers to; False when there is
-    nothing to be saved.
+    Yields:
+        [h, w] uint8, C-contiguous, full-range luma.
 
     Raises:
-        _SeekFailed, VideoError: it did not work out; decoding plainly has the last word.
+        UsageError, VideoError: see :func:`decode_cuts`.
+    """
+    index.position(start, count)
+    cut, task, done = Cut(count, _checked(window, index)), Task(os.fspath(path), index, start, 1), 0
+    for frames_of in (_from_keyframe_on, _from_beginning):
+        stream = Stream(task, cut)
+        try:
+            for _ in _fill(stream, frames_of(stream)):
+                if stream.taken > done:
+                    done += 1
+                    yield stream.picture()
+            return
+        except _SeekFailed:
+            continue
+        except VideoError:
+            if frames_of is _from_beginning:
+                raise
+
+
+def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
+    """The frames from the last keyframe at or before the range, without those that nothing refers to.
+
+    Raises:
+        _SeekFailed, VideoError: it did not work out, or there is nothing to be saved; decoding from the beginning has
+            the last word.
     """
     task, index = stack.task, stack.task.index
     if not index.seekable or task.start == 0:
-        return False
+        raise _SeekFailed
     which = int(np.searchsorted(index.keyframes, task.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
     begin = int(index.pts[index.position(task.start, 1)])
-    with opened(task.path, task.track) as (container, stream):
-        codec = stream.codec_context.codec.canonical_name
+    with opened(task.path) as (container, stream):
+        codec = stack.codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
         try:
@@ -182,28 +190,31 @@ def _decode_quickly(stack: Stack) -> bool:
                 pts, dts = int(index.pts[keyframe - index.first]), int(index.keyframe_dts[which])
                 source = _packets_from(container, stream, pts, dts)
             frames = _decoded(stream, _needed(source, begin, prefix) if prefix else source)
-            _fill(stack, _from_keyframe(frames, pts) if keyframe else frames)
+            yield from _from_keyframe(frames, pts) if keyframe else frames
         except av.FFmpegError as error:
             raise _SeekFailed from error
-        stack.close(codec)
-    return True
 
 
-def _decode_plainly(stack: Stack) -> None:
-    """Decode every frame from the beginning of the file."""
+def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
+    """Every frame of the file."""
     task = stack.task
-    with opened(task.path, task.track) as (container, stream):
+    with opened(task.path) as (container, stream):
+        stack.codec = stream.codec_context.codec.canonical_name
         try:
-            _fill(stack, _decoded(stream, packets(container, stream)))
+            yield from _decoded(stream, packets(container, stream))
         except av.FFmpegError as error:
             stack.refuse(f"does not decode: {reason(error)}")
-        stack.close(stream.codec_context.codec.canonical_name)
 
 
-def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> None:
-    for frame in frames:
-        if stack.take(frame):
-            return
+def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:
+    """Shows frame after frame to a stack, until it has what it wants; a step after each."""
+    with closing(frames):  # type: ignore[type-var]  # a generator
+        for frame in frames:
+            complete = stack.take(frame)
+            yield
+            if complete:
+                return
+    stack.refuse("the file ends before it")
 
 
 def _decoded(stream: VideoStream, source: Iterator[Packet[VideoStream]]) -> Iterator[VideoFrame]:

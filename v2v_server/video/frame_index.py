@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,31 +19,9 @@ LARGEST_FRAMES = 2**24
 
 LARGEST_SIDE_PX = 2**16 - 1
 
-MOST_TILES = 64
-
 _MAGIC = b"VFI1"
-_MAGIC_TILED = b"VFI2"  # the tiles follow the header
 _HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, seekable
 _INT64 = np.dtype("<i8")
-
-
-class Tile(NamedTuple):
-    """The columns of a picture that one track holds: from ``left_px`` on, ``width_px`` of them."""
-
-    left_px: int
-    width_px: int
-
-    @property
-    def right_px(self) -> int:
-        """The column behind the last."""
-        return self.left_px + self.width_px
-
-
-def make_up(tiles: Sequence[Tile], width_px: int) -> bool:
-    """Whether tiles, from left to right, hold every column of a picture; they may overlap."""
-    if not tiles or tiles[0].left_px or tiles[-1].right_px != width_px or not all(tile.width_px > 0 for tile in tiles):
-        return False
-    return all(a.left_px < b.left_px <= a.right_px < b.right_px for a, b in itertools.pairwise(tiles))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +38,6 @@ class FrameIndex:
         height_px, width_px: size of the upright picture (rotation metadata applied).
         seekable: False when the time stamps are missing, not unique or not to be trusted (H.264 with B-frames in
             AVI): decoding then counts frames from the beginning of the file.
-        tiles: which columns each track holds, from left to right (see :mod:`v2v_server.video.tiles`); empty where
-            one track holds the picture. All tracks have these frames.
     """
 
     first: int
@@ -75,7 +48,6 @@ class FrameIndex:
     height_px: int
     width_px: int
     seekable: bool
-    tiles: tuple[Tile, ...] = ()
 
     def __len__(self) -> int:
         return len(self.pts)
@@ -119,10 +91,6 @@ class FrameIndex:
             keyframe_dts=self.keyframe_dts[kept],
         )
 
-    def of_tile(self, track: int) -> FrameIndex:
-        """The index of one tile alone."""
-        return replace(self, width_px=self.tiles[track].width_px, tiles=())
-
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Presentation times of frames start .. start + count - 1.
 
@@ -141,11 +109,9 @@ class FrameIndex:
     def to_bytes(self) -> bytes:
         """A compact encoding: a few bytes a frame at a varying rate, next to nothing at a constant one."""
         head = _HEADER.pack(
-            _MAGIC_TILED if self.tiles else _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
+            _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
             self.height_px, self.width_px, self.seekable,
         )  # fmt: skip
-        if self.tiles:
-            head += struct.pack(f"<B{2 * len(self.tiles)}H", len(self.tiles), *itertools.chain(*self.tiles))
         if not self.seekable:
             return head
         parts = (_steps(_steps(self.pts)), _steps(self.keyframes), _steps(self.keyframe_dts))
@@ -161,17 +127,16 @@ class FrameIndex:
         if len(data) < _HEADER.size:
             raise ProtocolError(f"frame index of {len(data)} bytes: shorter than its header of {_HEADER.size}")
         magic, first, frames, keys, numerator, denominator, height, width, seekable = _HEADER.unpack_from(data)
-        if magic not in (_MAGIC, _MAGIC_TILED):
-            raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r} or {_MAGIC_TILED!r}")
+        if magic != _MAGIC:
+            raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r}")
         if not 1 <= frames <= most_frames or first + frames > LARGEST_FRAMES or keys > frames:
             raise ProtocolError(f"frame index: {frames} frames from {first}, {keys} keyframes; limit {most_frames}")
         if not (numerator and denominator and height and width) or seekable > 1:
             raise ProtocolError(
                 f"frame index: time base {numerator}/{denominator}, {width}x{height} px, seekable {seekable}"
             )
-        tiles, rest = _tiles(data[_HEADER.size :], width) if magic == _MAGIC_TILED else ((), data[_HEADER.size :])
         stored = (frames + 2 * keys) * _INT64.itemsize if seekable else 0
-        values = np.frombuffer(_inflated(rest, stored), _INT64).astype(np.int64)
+        values = np.frombuffer(_inflated(data[_HEADER.size :], stored), _INT64).astype(np.int64)
         if seekable:
             pts, keyframes, dts = np.split(values, [frames, frames + keys])
             pts, keyframes, dts = np.cumsum(np.cumsum(pts)), np.cumsum(keyframes), np.cumsum(dts)
@@ -185,7 +150,7 @@ class FrameIndex:
             raise ProtocolError(
                 f"frame index: keyframes outside frames {first} .. {first + frames - 1}, or in disorder"
             )
-        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, bool(seekable), tiles)
+        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, bool(seekable))
 
 
 def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px: int) -> FrameIndex:
@@ -193,19 +158,6 @@ def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
     return FrameIndex(0, pts, none, none, time_base, height_px, width_px, seekable=False)
-
-
-def _tiles(data: bytes, width_px: int) -> tuple[tuple[Tile, ...], bytes]:
-    """The tiles behind the header, and what follows them."""
-    count = data[0] if data else 0
-    end = 1 + 4 * count
-    if not 2 <= count <= MOST_TILES or len(data) < end:
-        raise ProtocolError(f"frame index: {count} tiles in {len(data)} bytes; 2 .. {MOST_TILES} can be")
-    tiles = tuple(Tile(*pair) for pair in struct.iter_unpack("<2H", data[1:end]))
-    if not make_up(tiles, width_px):
-        shown = ", ".join(f"{tile.left_px} .. {tile.right_px}" for tile in tiles)
-        raise ProtocolError(f"frame index: columns {shown} do not make up a picture of {width_px} px")
-    return tiles, data[end:]
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from array import array
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import av
@@ -22,7 +22,6 @@ from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, is_hidden
 from v2v_server.video.source import opened, packets, pictures, reason, time_base
-from v2v_server.video.tiles import tiles_of
 
 LONGEST_CPU_SECONDS = 1200.0
 """Processor time that listing the frames of a file may take: of the longest films it is seconds, and some minutes where
@@ -71,7 +70,6 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     name = os.fspath(path)
     try:
         with opened(name) as (container, stream):
-            tiles = tiles_of(name, container)
             head, shown = _walk(name, container, stream)
             base = time_base(stream)
             # Read before the container is closed: the stream's fields are gone after that.
@@ -81,15 +79,9 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     except av.FFmpegError as error:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
     height, width = Orientation.of(head).size(head.height, head.width)
-    if tiles:
-        width = tiles[-1].right_px
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
         raise VideoError(name, None, f"its picture of {width}x{height} px is larger than {LARGEST_SIDE_PX} px a side")
     index = None if reorders else _index(shown, head, base, (height, width))
-    if tiles:
-        if index is None or Orientation.of(head) != Orientation():
-            raise VideoError(name, None, "calls its tracks tiles, but they are turned or cannot be sought")
-        index = replace(index, tiles=tiles)
     if index is None:
         index = unseekable(_count_by_decoding(name), base, height, width)
     if not len(index):

@@ -48,7 +48,7 @@ _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], track: int = 0) -> Iterator[tuple[InputContainer, VideoStream]]:
+def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
     Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only. A file is opened by
@@ -56,10 +56,9 @@ def opened(path: str | os.PathLike[str], track: int = 0) -> Iterator[tuple[Input
 
     Args:
         path: the file.
-        track: which of the video tracks: a tile, see :mod:`v2v_server.video.tiles`.
 
     Raises:
-        VideoError: the file cannot be opened, has no such video track, or is of a format or size that is not read.
+        VideoError: the file cannot be opened, has no video track, or is of a format or size that is not read.
     """
     name = os.fspath(path)
     try:
@@ -76,10 +75,10 @@ def opened(path: str | os.PathLike[str], track: int = 0) -> Iterator[tuple[Input
     except UnicodeError as error:
         raise VideoError(name, None, f"cannot be opened: its name is not valid text ({error})") from error
     try:
-        tracks = picture_tracks(container)
-        if track >= len(tracks):
-            raise VideoError(name, None, f"has no video track {track}" if track else "has no video track")
-        stream = tracks[track]
+        tracks = [track for track in container.streams.video if not track.disposition & _STILL]
+        if not tracks:
+            raise VideoError(name, None, "has no video track")
+        stream = tracks[0]
         if stream.codec_context is None:
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
         decoder = stream.codec_context
@@ -97,11 +96,6 @@ def opened(path: str | os.PathLike[str], track: int = 0) -> Iterator[tuple[Input
         yield container, stream
     finally:
         container.close()
-
-
-def picture_tracks(container: InputContainer) -> list[VideoStream]:
-    """The video tracks that are no cover art."""
-    return [stream for stream in container.streams.video if not stream.disposition & _STILL]
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:

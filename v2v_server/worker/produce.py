@@ -27,9 +27,9 @@ from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
-from v2v_server.video.decode import DecodedClip, decode_cuts
-from v2v_server.video.fingerprint import check_fingerprint
+from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
@@ -84,14 +84,13 @@ def draft_of(lease: Lease, index: int) -> Draft:
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
-    core_left_px = window.left_px  # what the view takes is the same with flow and without
     plan = _plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if plan is not None and plan.still:
             flow = replace(flow, margin_px=0)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window, core_left_px), flow, plan)
+    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
 
 
 def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:
@@ -110,13 +109,13 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decode
     spec = drafts[0].spec
     path = _below(root, lease.video)
     try:
-        check_fingerprint(path, lease.fingerprint)
-        clips = decode_cuts(
+        clips = clips_of(
             path,
+            lease.fingerprint,
             _frame_index(lease, spec.recipe.frames_needed),
             lease.start_frame,
             [draft.cut for draft in drafts],
-            stride=spec.recipe.frame_stride,
+            spec.recipe.frame_stride,
         )
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
@@ -179,7 +178,6 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             array[...] = flow.flow
         elif name == "flow_valid" and flow is not None and flow.valid is not None:
             array[...] = flow.valid
-    codec = decoded.clip.codec
     return Sample(
         arrays=into,
         provenance=Provenance(
@@ -192,11 +190,17 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             params=params,
             saturated_bins=saturated,
             irregular_timestamps=irregular,
-            decoder=codec if decoded.clip.bit_exact else f"{codec} (host-dependent)",
+            decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if draft.plan is None else draft.plan.reason,
         ),
     )
+
+
+def _decoder(clip: DecodedClip) -> str:
+    """What a provenance says of where the pixels came from."""
+    host = "" if clip.bit_exact else " (host-dependent)"
+    return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:

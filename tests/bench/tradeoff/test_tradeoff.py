@@ -199,7 +199,10 @@ def test_every_setting_is_a_configuration_of_the_server(setting: Setting, tmp_pa
     assert config.rows == "top:0.54"
     assert config.spec.samples_per_decode == setting.samples_per_decode
     how = ENCODINGS.get(setting.form)
-    command = "" if how is None else f"--codec {how.codec} --quality {how.quality} --gop {how.gop}"
+    command = ""
+    if how is not None:
+        kind = f"--size {how.size}" if how.is_lossless else f"--quality {how.quality} --gop {how.gop}"
+        command = f"--codec {how.codec} {kind}"
     assert command in file.read_text(encoding="utf-8")
 
 
@@ -311,12 +314,12 @@ def test_a_corpus_without_videos_is_status_2(tmp_path: Path, capsys: pytest.Capt
 def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, picture, chosen = tmp_path / "tradeoff.json", tmp_path / "tradeoff.png", tmp_path / "chosen.yaml"
     flags = ["--videos", str(clips(tmp_path / "clips")), "--rows", "full", "--clips", "2", "--places", "3"]
-    flags += ["--forms", "mpeg4 4", "--budget-minutes", "0.01", "--max-error", "0", "--preset-out", str(chosen)]
+    flags += ["--forms", "h264 23", "--budget-minutes", "0.01", "--max-error", "0", "--preset-out", str(chosen)]
     assert tradeoff.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) == 0
     found = records(out)
     by_name = {item["name"]: item for item in found if item["measure"] == "setting"}
-    assert set(by_name) == {setting.name for setting in settings(["mpeg4 4"])}
-    exact, prepared = by_name[EXACT.name], by_name[Setting("mpeg4 4").name]
+    assert set(by_name) == {setting.name for setting in settings(["h264 23"])}
+    exact, prepared = by_name[EXACT.name], by_name[Setting("h264 23").name]
     assert exact["speed_ratio"] == 1
     for threshold in ("0.05", "0.2", "0.5", "1", "2"):
         assert exact[f"bins_changed_at_{threshold}"] == 0

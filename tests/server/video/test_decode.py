@@ -227,7 +227,7 @@ def test_a_seek_is_really_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     def refuse(stack: object) -> None:
         raise AssertionError("decoded from the beginning")
 
-    monkeypatch.setattr(decode, "_decode_plainly", refuse)
+    monkeypatch.setattr(decode, "_from_beginning", refuse)
     np.testing.assert_array_equal(decode_luma(path, index, 45, 5).frames, plain.frames)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import zlib
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_server.video.frame_index import MOST_TILES, NO_TIMESTAMP, FrameIndex, Tile, unseekable
+from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex, unseekable
 
 steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=60)
 
@@ -23,13 +22,11 @@ def indices(draw: st.DrawFn) -> FrameIndex:
     keys = np.array(sorted(draw(st.sets(st.integers(first, first + len(pts) - 1)))), np.int64)
     dts = np.array([draw(st.sampled_from([NO_TIMESTAMP, -5, 0, 2**50])) for _ in keys], np.int64)
     base = (draw(st.integers(1, 2**32 - 1)), draw(st.integers(1, 2**32 - 1)))
-    edges = sorted(draw(st.sets(st.integers(1, 60_000), min_size=2, max_size=MOST_TILES) | st.just(set())))
-    tiles = tuple(Tile(left, right - left) for left, right in itertools.pairwise([0, *edges]))
-    return FrameIndex(first, pts, keys, dts, base, 336, edges[-1] if edges else 596, seekable=True, tiles=tiles)
+    return FrameIndex(first, pts, keys, dts, base, 336, 596, seekable=True)
 
 
 def assert_equal(one: FrameIndex, other: FrameIndex) -> None:
-    for name in ("first", "time_base", "height_px", "width_px", "seekable", "tiles"):
+    for name in ("first", "time_base", "height_px", "width_px", "seekable"):
         assert getattr(one, name) == getattr(other, name)
     for name in ("pts", "keyframes", "keyframe_dts"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -115,31 +112,3 @@ def test_disorder_is_refused() -> None:
     index = FrameIndex(0, np.array([0, 2, 1]), np.array([0]), np.array([0]), (1, 25), 48, 64, seekable=True)
     with pytest.raises(ProtocolError, match="do not increase"):
         FrameIndex.from_bytes(index.to_bytes())
-
-
-@pytest.mark.parametrize(
-    ("tiles", "message"),
-    [
-        ([(0, 64), (64, 33)], "columns 0 .. 64, 64 .. 97 do not make up a picture of 96 px"),
-        ([(0, 64), (65, 31)], "do not make up"),  # a gap
-        ([(1, 63), (64, 32)], "do not make up"),  # the first column
-        ([(0, 96), (10, 86)], "do not make up"),  # one inside the other
-        ([(0, 32), (0, 96)], "do not make up"),
-        ([(0, 96), (96, 0)], "do not make up"),
-        ([(0, 96)], "1 tiles"),
-        ([(at, 1) for at in range(96)], "96 tiles"),
-    ],
-)
-def test_tiles_that_cannot_be_are_refused(tiles: list[tuple[int, int]], message: str) -> None:
-    pts, none = np.arange(7), np.empty(0, np.int64)
-    index = FrameIndex(0, pts, none, none, (1, 25), 48, 96, seekable=True, tiles=tuple(Tile(*tile) for tile in tiles))
-    with pytest.raises(ProtocolError, match=message):
-        FrameIndex.from_bytes(index.to_bytes())
-
-
-def test_tiles_that_end_early_are_refused() -> None:
-    tiles = (Tile(0, 64), Tile(48, 48))
-    index = FrameIndex(0, np.arange(7), np.array([0]), np.array([0]), (1, 25), 48, 96, seekable=True, tiles=tiles)
-    assert FrameIndex.from_bytes(index.to_bytes()).tiles == tiles
-    with pytest.raises(ProtocolError, match="2 tiles in 8 bytes"):
-        FrameIndex.from_bytes(index.to_bytes()[:41])

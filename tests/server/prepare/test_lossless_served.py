@@ -1,0 +1,189 @@
+"""A lossless corpus is its source: the same digest, and the same samples to the last byte."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.server.prepare.test_prepare import run
+from tests.server.video.test_real_videos import FOLDER, FRAMES, SOUND
+from v2v_bench.leases import open_leases, whole_sample
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
+from v2v_protocol.messages import Lease
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Sample
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.offline.remake import remake
+from v2v_server.prepare.encode import Encoding
+from v2v_server.video.rows import Rows
+from v2v_server.worker.produce import draft_of
+
+ROWS = "top:0.9"
+SMALL = Recipe(voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32)
+LOSSLESS = Encoding.of("lossless")
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """(source, store): rotated, 10 bit, 4:4:4, odd sizes, varying rate, full range, without time stamps, damaged."""
+    folder = tmp_path_factory.mktemp("lossless")
+    source = folder / "source"
+    (source / "sub").mkdir(parents=True)
+    write_clip(source / "a.mp4", panned_luma(75, 90, 70), b_frames=2)
+    write_clip(source / "b.webm", panned_luma(30, 96, 81), codec="libvpx-vp9")
+    odd = panned_luma(33, 49, 63)
+    write_clip(source / "sub" / "c.avi", odd, codec="mjpeg", pixel_format="yuvj420p", full_range=True)
+    write_clip(source / "turned.mov", panned_luma(31, 48, 96), rotation_degrees=90)
+    write_clip(source / "ten.mp4", panned_luma(20).astype(np.uint16) * 4, pixel_format="yuv420p10le")
+    write_clip(source / "444.mp4", panned_luma(20), pixel_format="yuv444p")
+    stamps = (np.arange(30) * 33 + np.arange(30) % 4 * 3 + 500).tolist()
+    write_clip(source / "varying.mkv", panned_luma(30), pts=stamps)
+    write_clip(source / "untimed.h264", panned_luma(20), rate=50, b_frames=2)
+    write_clip(source / "small.mp4", panned_luma(20, 16, 16))
+    assert run(source, folder / "store", LOSSLESS, rows=ROWS).complete
+    return source, folder / "store"
+
+
+def samples(root: Path, rows: str, spec: StreamSpec, arrays: tuple[str, ...], count: int) -> Iterator[Sample]:
+    from dataclasses import replace
+    from itertools import islice
+
+    with open_leases(root, rows, spec) as (folder, leases):
+        for lease in islice(leases, count):
+            yield whole_sample(replace(lease, arrays=arrays), folder)
+
+
+def require_equal(store: Sample, source: Sample, where: str) -> None:
+    assert store.provenance.decoder == f"{source.provenance.decoder}, from the {where}"
+    as_dict: dict[str, Any] = source.provenance.to_dict()
+    assert store.provenance.to_dict() == as_dict | {"decoder": store.provenance.decoder}
+    assert store.arrays.keys() == source.arrays.keys()
+    for name, array in source.arrays.items():
+        np.testing.assert_array_equal(store.arrays[name], array, strict=True, err_msg=name)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_samples_are_those_of_the_source(
+    pair: tuple[Path, Path], stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path))
+    spec = StreamSpec(recipe=SMALL if stride == 1 else Recipe(
+        voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32, frame_stride=2, resize_scale=(0.9, 1.2)
+    ))  # fmt: skip
+    arrays = ("voxels", "frames")
+    both = zip(samples(pair[1], "full", spec, arrays, 40), samples(pair[0], ROWS, spec, arrays, 40), strict=True)
+    videos = set()
+    for store, source in both:
+        require_equal(store, source, "store")
+        videos.add(source.provenance.video)
+    assert len(videos) == 8
+
+
+def test_same_digests(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    with (
+        closing(open_catalogue(pair[0], rows=Rows.parse(ROWS), cache_dir=tmp_path, processes=0, scene=True)) as source,
+        closing(open_catalogue(pair[1], cache_dir=tmp_path, processes=0, scene=True)) as store,
+    ):
+        assert (store.digest, store.scene_digest, store.rows) == (source.digest, source.scene_digest, source.rows)
+        assert store.prepared is not None
+        assert store.prepared.source_digest == source.digest
+        for video in source.videos:
+            assert store.frame_index(video.id).to_bytes() == source.frame_index(video.id).to_bytes()
+            assert store.scene(video.id).to_bytes() == source.scene(video.id).to_bytes()
+
+
+def test_the_scenes_in_the_manifest_are_those_of_the_source(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    run(pair[0], tmp_path / "store", LOSSLESS, rows=ROWS, scene=True)
+    with (
+        closing(open_catalogue(pair[0], rows=Rows.parse(ROWS), cache_dir=tmp_path, processes=0, scene=True)) as source,
+        closing(open_catalogue(tmp_path / "store", cache_dir=tmp_path, processes=0, scene=True)) as store,
+    ):
+        assert store.scene_digest == source.scene_digest
+
+
+def test_a_store_of_whole_pictures_takes_any_rows(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    run(pair[0], tmp_path / "store", LOSSLESS)
+    for rows in ("full", "top:0.5", "0.2:0.8"):
+        opened = [open_catalogue(at, rows=Rows.parse(rows), cache_dir=tmp_path, processes=0)
+                  for at in (pair[0], tmp_path / "store")]  # fmt: skip
+        assert opened[0].digest == opened[1].digest
+        for catalogue in opened:
+            catalogue.close()
+    with pytest.raises(CorpusError, match="rows top:0.5 asked for, but this prepared folder holds rows top:0.9"):
+        open_catalogue(pair[1], rows=Rows.parse("top:0.5"), cache_dir=tmp_path, processes=0)
+
+
+def test_rows_that_a_picture_has_not_change_no_digest(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    report = run(pair[0], tmp_path / "store", LOSSLESS, rows="top:60px")
+    assert {video.id for video in report.failed} > {"444.mp4", "small.mp4"}
+    with (
+        closing(open_catalogue(pair[0], rows=Rows.parse("top:60px"), cache_dir=tmp_path, processes=0)) as source,
+        closing(open_catalogue(tmp_path / "store", cache_dir=tmp_path, processes=0)) as store,
+    ):
+        assert store.digest == source.digest
+
+
+def test_a_damaged_file_keeps_its_place(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """Its samples are made of the next candidate; a file of the store by itself is no video."""
+    store = tmp_path / "store"
+    shutil.copytree(pair[1], store)
+    content = bytearray((store / "a.mp4").read_bytes())
+    content[-2000:] = bytes(2000)
+    (store / "a.mp4").write_bytes(content)
+    spec = StreamSpec(recipe=SMALL, shuffle=False)
+    with closing(open_catalogue(store, cache_dir=tmp_path, processes=0)) as damaged:
+        refusals = [
+            refusal
+            for index in range(20)
+            for refusal in remake(damaged, spec, seed=0, epoch=0, index=index).provenance.refusals
+        ]
+    assert {refusal.video for refusal in refusals} == {"a.mp4"}
+    assert all("in the store" in refusal.reason for refusal in refusals)
+    (tmp_path / "plain").mkdir()
+    shutil.copy(pair[1] / "444.mp4", tmp_path / "plain")
+    with pytest.raises(CorpusError, match="is a file of a lossless corpus by itself: serve the whole folder"):
+        open_catalogue(tmp_path / "plain", cache_dir=tmp_path, processes=0)
+
+
+def test_another_video_under_the_name_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(pair[1], store)
+    with open_leases(store, "full", StreamSpec(recipe=SMALL)) as (folder, leases):
+        lease: Lease = next(leases)
+        (other,) = [name for name in ("a.mp4", "b.webm") if name != lease.video][:1]
+        shutil.copy(pair[1] / other, store / lease.video)
+        assert draft_of(lease, lease.indices[0]).cut.count
+        with pytest.raises(VideoChanged, match="was made of another file"):
+            whole_sample(lease, folder)
+        (store / lease.video).unlink()
+        with pytest.raises(VideoError, match="cannot be read"):
+            whole_sample(lease, folder)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FRAMES, reason=f"no MANIFEST.tsv beside {FOLDER}; set V2V_TEST_VIDEOS")
+@pytest.mark.parametrize("size", ["dense", "fast"])
+def test_samples_of_real_footage(size: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every shared clip, under both of the paper's recipes."""
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path))
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in SOUND:
+        (source / name).symlink_to(FOLDER / name)
+    assert run(source, tmp_path / "store", Encoding.of("lossless", size), processes=2).complete
+    videos = set()
+    for preset, arrays in (("paper", ("voxels", "frames")), ("paper-flow", ("voxels", "frames", "flow", "flow_valid"))):
+        spec = StreamSpec.from_dict({"recipe": {"preset": preset, "voxels_per_clip": 8}, "max_sequences_per_video": 1})
+        both = (samples(root, "full", spec, arrays, len(SOUND)) for root in (tmp_path / "store", source))
+        for store, exact in zip(*both, strict=True):
+            require_equal(store, exact, "store")
+            videos.add(exact.provenance.video)
+    assert len(videos) >= 15

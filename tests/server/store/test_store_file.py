@@ -1,0 +1,225 @@
+"""Files of the store: what is written comes back, and what is damaged is refused."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, is_store_file
+from v2v_server.store.packing import DENSE, FAST, QUICK, Packing, UnpackingError, unpack
+from v2v_server.store.reader import StoreFile
+from v2v_server.store.writer import StoreWriter
+
+PACKINGS = st.sampled_from([DENSE, FAST, QUICK])
+in_folder = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def head_of(luma: npt.NDArray[np.uint8], packing: Packing = QUICK, **more: Any) -> Head:
+    count, rows, width = luma.shape
+    plain = Head("a.mp4", "f", rows, width, 0, rows, 0, count, count, 25.0, "h264", True, GROUP_FRAMES, packing.method)
+    return replace(plain, **more)
+
+
+def written(path: Path, luma: npt.NDArray[np.uint8], packing: Packing = QUICK, **more: Any) -> Path:
+    with StoreWriter(path, head_of(luma, packing, **more), packing) as writer:
+        for picture in luma:
+            writer.add(picture)
+        writer.close()
+    assert path.stat().st_size == writer.bytes
+    return path
+
+
+@st.composite
+def lumas(draw: st.DrawFn) -> npt.NDArray[np.uint8]:
+    """Noise, a still scene, or black; of any size."""
+    shape = draw(st.integers(1, 70)), draw(st.integers(1, 70)), draw(st.integers(1, 100))
+    kind, random = draw(st.sampled_from(["noise", "still", "black"])), np.random.default_rng(draw(st.integers(0, 99)))
+    if kind == "black":
+        return np.zeros(shape, np.uint8)
+    noise = random.integers(0, 256, shape, np.uint8)
+    return noise if kind == "noise" else np.broadcast_to(noise[:1], shape).copy()
+
+
+@in_folder
+@given(lumas(), PACKINGS, st.integers(1, GROUP_FRAMES), st.data())
+def test_any_crop_of_any_luma_comes_back(
+    tmp_path: Path, luma: npt.NDArray[np.uint8], packing: Packing, group: int, data: st.DataObject
+) -> None:
+    count, rows, width = luma.shape
+    first, top = data.draw(st.integers(0, 500)), data.draw(st.integers(0, 50))
+    whole = {"height_px": top + rows + 3, "top": top, "first": first, "frames": first + count + 7, "group": group}
+    path = written(tmp_path / "x", luma, packing, **whole)
+    assert is_store_file(path)
+    with StoreFile(path, "f") as stored:
+        assert stored.head == head_of(luma, packing, **whole)
+        for _ in range(3):
+            t, y, x = (data.draw(st.integers(0, size - 1)) for size in luma.shape)
+            stride = data.draw(st.integers(1, 5))
+            last, height, wide = data.draw(st.integers(t, count - 1)), rows - y, width - x
+            height, wide = data.draw(st.integers(1, height)), data.draw(st.integers(1, wide))
+            wanted = luma[t : last + 1 : stride, y : y + height, x : x + wide]
+            out = np.full(wanted.shape, 77, np.uint8)
+            stored.read(first + t, stride, (top + y, x, height, wide), out)
+            np.testing.assert_array_equal(out, wanted)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, npt.NDArray[np.uint8]]:
+    luma = np.random.default_rng(0).integers(0, 256, (40, 40, 70), np.uint8)
+    luma[5:] //= 64  # noise that compresses, and such as does not
+    return written(tmp_path_factory.mktemp("sound") / "x", luma), luma
+
+
+def reads_right_or_refuses(path: Path, luma: npt.NDArray[np.uint8]) -> bool:
+    """Whether it was read."""
+    try:
+        with StoreFile(path, "f") as stored:
+            out = np.empty_like(luma)
+            stored.read(0, 1, (0, 0, *luma.shape[1:]), out)
+    except VideoError:
+        return False
+    np.testing.assert_array_equal(out, luma)
+    return True
+
+
+@settings(in_folder, max_examples=200)
+@given(st.data())
+def test_a_flipped_bit_is_found(tmp_path: Path, sound: tuple[Path, npt.NDArray[np.uint8]], data: st.DataObject) -> None:
+    path, luma = sound
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, 400) | st.integers(0, len(content) - 1))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    (tmp_path / "x").write_bytes(content)
+    assert not reads_right_or_refuses(tmp_path / "x", luma)
+
+
+@in_folder
+@given(st.data())
+def test_a_file_that_is_cut_short_is_found(
+    tmp_path: Path, sound: tuple[Path, npt.NDArray[np.uint8]], data: st.DataObject
+) -> None:
+    path, luma = sound
+    content = path.read_bytes()
+    (tmp_path / "x").write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
+    assert not reads_right_or_refuses(tmp_path / "x", luma)
+
+
+@in_folder
+@given(st.data())
+def test_blocks_at_anothers_place_are_found(
+    tmp_path: Path, sound: tuple[Path, npt.NDArray[np.uint8]], data: st.DataObject
+) -> None:
+    """A stretch of the file written over another one, as a file system may leave it."""
+    path, luma = sound
+    content = bytearray(path.read_bytes())
+    size = data.draw(st.integers(1, 600))
+    source, target = (data.draw(st.integers(0, len(content) - size)) for _ in range(2))
+    content[target : target + size] = content[source : source + size]
+    (tmp_path / "x").write_bytes(content)
+    assert reads_right_or_refuses(tmp_path / "x", luma) == (content == path.read_bytes())
+
+
+def test_a_file_that_shrinks_while_it_is_read(sound: tuple[Path, npt.NDArray[np.uint8]], tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(sound[0].read_bytes())
+    with StoreFile(tmp_path / "x") as stored:
+        os.truncate(tmp_path / "x", 3000)
+        with pytest.raises(VideoError, match=r"frame (0|32): in the store .* have the file made anew"):
+            stored.read(0, 1, (0, 0, 40, 70), np.empty((40, 40, 70), np.uint8))
+
+
+def test_only_the_blocks_of_a_crop_are_read(tmp_path: Path) -> None:
+    """All others may be damaged."""
+    luma = np.random.default_rng(1).integers(0, 256, (64, 96, 96), np.uint8)
+    path = written(tmp_path / "x", luma)
+    with StoreFile(path) as stored:
+        record = stored._record(1)
+    content = bytearray(path.read_bytes())
+    begin, end = record.starts[4], record.starts[5]  # of the middle block of nine
+    kept = content[begin:end]
+    table_end = len(head_of(luma).to_bytes()) + 2 * head_of(luma).record_bytes
+    content[table_end:] = bytes(len(content) - table_end)
+    content[begin:end] = kept
+    path.write_bytes(content)
+    out = np.empty((32, 32, 32), np.uint8)
+    with StoreFile(path) as stored:
+        stored.read(32, 1, (32, 32, 32, 32), out)
+        np.testing.assert_array_equal(out, luma[32:, 32:64, 32:64])
+        with pytest.raises(VideoError, match="frame 32: in the store block 3 is damaged"):
+            stored.read(32, 1, (32, 31, 32, 32), out)
+        with pytest.raises(VideoError, match="frame 0: in the store block 4 is damaged"):
+            stored.read(31, 1, (32, 32, 32, 32), out)
+
+
+def test_what_is_not_kept_is_refused(sound: tuple[Path, npt.NDArray[np.uint8]]) -> None:
+    with StoreFile(sound[0]) as stored:
+        for start, stride, window, shape in (
+            (39, 1, (0, 0, 4, 4), (2, 4, 4)), (0, 40, (0, 0, 4, 4), (2, 4, 4)), (0, 0, (0, 0, 4, 4), (2, 4, 4)),
+            (-1, 1, (0, 0, 4, 4), (2, 4, 4)), (0, 1, (37, 0, 4, 4), (2, 4, 4)), (0, 1, (0, 67, 4, 4), (2, 4, 4)),
+            (0, 1, (0, 0, 4, 4), (2, 4, 5)), (0, 1, (0, 0, 4, 4), (0, 4, 4)), (0, 1, (0, -1, 4, 4), (2, 4, 4)),
+        ):  # fmt: skip
+            with pytest.raises(UsageError, match="not in this file"):
+                stored.read(start, stride, window, np.empty(shape, np.uint8))
+
+
+def test_a_file_of_another_source_is_refused(sound: tuple[Path, npt.NDArray[np.uint8]], tmp_path: Path) -> None:
+    with pytest.raises(VideoChanged, match="was made of another file: f instead of g"):
+        StoreFile(sound[0], "g")
+    with pytest.raises(VideoUnreadable, match="No such file"):
+        StoreFile(tmp_path / "none", "f")
+    (tmp_path / "video").write_bytes(b"\0\0\0\x1cftypisom" * 5)
+    assert not is_store_file(tmp_path / "video")
+    assert not is_store_file(tmp_path / "none")
+    with pytest.raises(VideoError, match="no file of the store"):
+        StoreFile(tmp_path / "video")
+
+
+def test_a_file_is_none_before_it_is_closed(tmp_path: Path) -> None:
+    luma = np.zeros((64, 8, 8), np.uint8)
+    with StoreWriter(tmp_path / "x", head_of(luma), QUICK) as writer:
+        for picture in luma[:40]:
+            writer.add(picture)
+        with pytest.raises(UsageError, match="40 frames of 64"):
+            writer.close()
+    assert not is_store_file(tmp_path / "x")
+    with StoreWriter(tmp_path / "x", head_of(luma), QUICK) as writer:
+        with pytest.raises(UsageError, match="frame 0 of 64"):
+            writer.add(np.zeros((8, 9), np.uint8))
+        for picture in luma:
+            writer.add(picture)
+        with pytest.raises(UsageError, match="frame 64 of 64"):
+            writer.add(luma[0])
+
+
+def test_large_pictures_come_in_small_groups() -> None:
+    assert group_frames_for(181, 596) == GROUP_FRAMES
+    assert group_frames_for(4320, 8192) == 1
+    assert 1 < group_frames_for(2160, 3840) < 16
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"count": 0}, {"rows": 9}, {"first": 1}, {"group": 0}, {"group": 33}, {"packing": "gzip"}, {"video": 3}]
+)
+def test_heads_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ProtocolError):
+        replace(head_of(np.zeros((4, 8, 8), np.uint8)), **wrong)
+
+
+@pytest.mark.parametrize("method", ["zstd", "lz4"])
+def test_a_block_is_unpacked_into_the_bytes_that_it_should_have_and_no_more(method: str) -> None:
+    packing = {"zstd": DENSE, "lz4": FAST}[method]
+    packed = packing.packer()(bytes(1000))
+    assert unpack(method, packed, 1000) == bytes(1000)
+    for size in (10, 999, 1001):
+        with pytest.raises(UnpackingError):
+            unpack(method, packed, size)
+    with pytest.raises(UnpackingError):
+        unpack(method, b"nonsense", 1000)

@@ -1,0 +1,111 @@
+"""The pixels of a video, wherever they are: decoded, or read from a file of the store that was made of it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.format import is_store_file
+from v2v_server.store.reader import StoreFile
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
+from v2v_server.video.fingerprint import check_fingerprint
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.orientation import Window
+from v2v_server.video.probe import VideoFacts, probe
+
+STORE_FORMAT = "v2v store"
+"""Stands for the format of a store file by itself, which only a lossless corpus can serve."""
+
+
+def clips_of(
+    path: str | os.PathLike[str], fingerprint: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int
+) -> tuple[DecodedClip, ...]:
+    """Several cuts of the frames from ``start`` on: see :func:`v2v_server.video.decode.decode_cuts`.
+
+    Args:
+        path: a video, or a file of the store.
+        fingerprint: of the video; of the one that the file of the store was made of.
+
+    Raises:
+        UsageError, VideoError: see there; also where another video lies here, or was the source.
+    """
+    if not is_store_file(path):
+        check_fingerprint(path, fingerprint)
+        return decode_cuts(path, index, start, cuts, stride=stride)
+    with StoreFile(path, fingerprint) as stored:
+        return tuple(stored_clip(stored, index, start, cut, stride) for cut in cuts)
+
+
+def stored_clip(stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int) -> DecodedClip:
+    """One cut, from an open file of the store that keeps all of it."""
+    head = stored.head
+    window = cut.window or (head.top, 0, head.rows, head.width_px)
+    frames = np.empty((cut.count, *window[2:]), np.uint8)
+    stored.read(start, stride, window, frames)
+    seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
+    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store")
+
+
+def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:
+    """Make sure that a file is the video that was catalogued, or was made of it.
+
+    Raises:
+        VideoError: it is another one, or cannot be read.
+    """
+    if is_store_file(path):
+        StoreFile(path, fingerprint).__exit__(None, None, None)
+    else:
+        check_fingerprint(path, fingerprint)
+
+
+def pictures_of(path: str | os.PathLike[str], index: FrameIndex, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
+    """All frames of a video, one by one: see :func:`v2v_server.video.decode.stream_luma`."""
+    if not is_store_file(path):
+        yield from stream_luma(path, index, 0, len(index), window)
+        return
+    with StoreFile(path) as stored:
+        yield from stored_pictures(stored, window)
+
+
+def stored_pictures(stored: StoreFile, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
+    """All frames that an open file of the store keeps, one by one."""
+    head = stored.head
+    for number in range(head.groups):
+        frames = np.empty((head.group_frames(number), *window[2:]), np.uint8)
+        stored.read(head.first + number * head.group, 1, window, frames)
+        yield from frames
+
+
+def facts_of(path: str | os.PathLike[str]) -> VideoFacts:
+    """What a file holds: see :func:`v2v_server.video.probe.probe`. Of a file of the store: what its source holds.
+
+    Raises:
+        VideoError: see there.
+    """
+    if not is_store_file(path):
+        return probe(path)
+    with StoreFile(path) as stored:
+        head = stored.head
+    try:
+        index = FrameIndex.from_bytes(head.index)
+    except ProtocolError as error:
+        raise VideoError(os.fspath(path), None, f"its index is damaged: {error}") from error
+    if (len(index), index.height_px, index.width_px) != (head.frames, head.height_px, head.width_px):
+        raise VideoError(os.fspath(path), None, f"its index has {index}, and its head {head.frames} frames")
+    return VideoFacts(
+        frames=head.frames,
+        height_px=head.height_px,
+        width_px=head.width_px,
+        codec=STORE_FORMAT,
+        pixel_format="gray",
+        frames_per_second=head.frames_per_second or math.nan,
+        rotation_degrees=0,
+        full_range=True,
+        index=index,
+    )

@@ -1,0 +1,203 @@
+"""What a store file looks like: the luma of a video, or of a piece of it, in blocks that are read one by one.
+
+    magic, length of the head, check of the head      8 + 4 + 8 bytes
+    head                                              msgpack, see :class:`Head`
+    table                                             a record of equal size for each group of frames
+    blocks                                            in any order
+
+A group is up to :attr:`Head.group` consecutive frames, a block is a group of frames of a rectangle of up to
+:data:`BLOCK_ROWS` x :data:`BLOCK_COLUMNS` pixels. A record of the table says where the first block of its group begins,
+how long each block is (they follow each other row by row), what its bytes hash to, and what the record itself hashes
+to. Every hash starts from the place of what it covers, so that nothing passes for something else.
+
+A file is written under another name, its head last, and renamed when it is whole. It is read with ``pread`` and never
+mapped: a mapped file that is cut short kills who reads it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import asdict, dataclass, fields
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+import xxhash
+
+from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.packing import METHODS
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+
+MAGIC = b"V2VSTOR1"
+BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
+GROUP_FRAMES = 32
+_LARGEST_GROUP_BYTES = 64 << 20
+_PREFIX = struct.Struct("<8sIQ")
+_LARGEST_HEAD_BYTES = 64 << 20
+_BLOCK = np.dtype([("bytes", "<u4"), ("check", "<u8")])
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """What a store file says of itself.
+
+    Attributes:
+        video: the source's id, for people.
+        fingerprint: of the source file.
+        height_px, width_px: of the source's upright picture.
+        top, rows: the rows of it that are kept.
+        first, count: the frames that are kept, by their ordinals in the source.
+        frames: how many the source has.
+        frames_per_second: of the source; 0 where unknown.
+        codec: FFmpeg's name of the source's format.
+        bit_exact: whether every host decodes the source to these bytes.
+        group: frames of a group.
+        packing: method of :mod:`v2v_server.store.packing`.
+        index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
+    """
+
+    video: str
+    fingerprint: str
+    height_px: int
+    width_px: int
+    top: int
+    rows: int
+    first: int
+    count: int
+    frames: int
+    frames_per_second: float
+    codec: str
+    bit_exact: bool
+    group: int
+    packing: str
+    index: bytes = b""
+
+    def __post_init__(self) -> None:
+        kinds = {"str": str, "int": int, "float": float, "bool": bool, "bytes": bytes}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if type(value) is not kinds[str(item.type)]:
+                raise ProtocolError(f"{item.name} is {value!r:.80}")
+        inside = (
+            1 <= self.height_px <= LARGEST_SIDE_PX
+            and 1 <= self.width_px <= LARGEST_SIDE_PX
+            and 0 <= self.top < self.top + self.rows <= self.height_px
+            and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
+            and 1 <= self.group <= GROUP_FRAMES
+            and self.packing in METHODS
+        )
+        if not inside:
+            raise ProtocolError(
+                f"{self.count} frames from {self.first} of {self.frames}, rows {self.top} + {self.rows} of "
+                f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}"
+            )
+
+    @property
+    def groups(self) -> int:
+        """How many groups of frames there are."""
+        return -(-self.count // self.group)
+
+    @property
+    def down(self) -> int:
+        """How many rows of blocks a picture has."""
+        return -(-self.rows // BLOCK_ROWS)
+
+    @property
+    def across(self) -> int:
+        """How many blocks a row of them has."""
+        return -(-self.width_px // BLOCK_COLUMNS)
+
+    @property
+    def record_bytes(self) -> int:
+        """Size of a record of the table."""
+        return 8 + self.down * self.across * _BLOCK.itemsize + 8
+
+    def group_frames(self, group: int) -> int:
+        """How many frames a group has."""
+        return min(self.group, self.count - group * self.group)
+
+    def to_bytes(self) -> bytes:
+        """Everything in front of the table."""
+        head = msgpack.packb(asdict(self))
+        return _PREFIX.pack(MAGIC, len(head), _check(head, 0)) + head
+
+
+def group_frames_for(rows: int, width_px: int) -> int:
+    """How many frames a group has: fewer where pictures are so large that who writes them would need much memory."""
+    return max(1, min(GROUP_FRAMES, _LARGEST_GROUP_BYTES // (rows * width_px)))
+
+
+def read_head(path: str, file: int) -> tuple[Head, int]:
+    """The head of an open file, and where the table begins.
+
+    Raises:
+        VideoError: it is no store file, or its head is damaged.
+        OSError: it cannot be read.
+    """
+    prefix = os.pread(file, _PREFIX.size, 0)
+    if len(prefix) < _PREFIX.size or not prefix.startswith(MAGIC):
+        raise VideoError(path, None, f"begins with {prefix[:8]!r}: no file of the store, or one that was cut short")
+    _, length, check = _PREFIX.unpack(prefix)
+    head = os.pread(file, length, _PREFIX.size) if length <= _LARGEST_HEAD_BYTES else b""
+    if len(head) != length or _check(head, 0) != check:
+        raise VideoError(path, None, "its head is damaged; have the file made anew")
+    try:
+        return Head(**msgpack.unpackb(head)), _PREFIX.size + length
+    except (ProtocolError, TypeError, ValueError) as error:
+        raise VideoError(path, None, f"its head makes no sense: {error}") from error
+
+
+def is_store_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a file begins like one of the store. A file that cannot be read does not."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: list[int]) -> bytes:
+    """A record of the table.
+
+    Args:
+        head: of the file.
+        group: its number.
+        offset: where its first block begins.
+        sizes, checks: of its blocks, row by row.
+    """
+    blocks = np.empty(head.down * head.across, _BLOCK)
+    blocks["bytes"], blocks["check"] = sizes, checks
+    body = struct.pack("<Q", offset) + blocks.tobytes()
+    return body + struct.pack("<Q", _check(body, group + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Where the blocks of a group lie.
+
+    Attributes:
+        starts: [blocks + 1] where each begins, and where the last ends.
+        checks: [blocks] what each hashes to.
+    """
+
+    starts: list[int]
+    checks: list[int]
+
+
+def unpack_record(group: int, data: bytes) -> Record | None:
+    """The record of a group; None if it is damaged."""
+    if len(data) < 16 or _check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
+        return None
+    blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
+    starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))
+    return Record(starts.tolist(), blocks["check"].tolist())
+
+
+def block_check(block: bytes | memoryview, group: int, number: int) -> int:
+    """What a block hashes to, at its place."""
+    return _check(block, group << 32 | number)
+
+
+def _check(data: bytes | memoryview, place: int) -> int:
+    return xxhash.xxh3_64_intdigest(data, place)
