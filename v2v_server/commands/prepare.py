@@ -89,8 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    quality = CODECS[arguments.codec].default if arguments.quality is None else arguments.quality
-    encoding = Encoding(arguments.codec, quality, arguments.gop, arguments.tile_px, arguments.tile_overlap_px)
+    encoding = Encoding.of(arguments.codec, arguments.size, arguments.quality, arguments.gop)
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()

@@ -107,5 +107,6 @@ def facts_of(path: str | os.PathLike[str]) -> VideoFacts:
         frames_per_second=head.frames_per_second or math.nan,
         rotation_degrees=0,
         full_range=True,
+        interlaced=False,
         index=index,
     )

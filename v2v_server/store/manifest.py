@@ -24,6 +24,7 @@ from v2v_server.catalogue.files import answers
 from v2v_server.catalogue.index_file import Record
 from v2v_server.catalogue.scene import Scene
 from v2v_server.prepare.encode import Encoding
+from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -168,8 +169,15 @@ class Manifest:
         return tuple(id for id in wanted if id not in refused)
 
     def describes(self, record: Record) -> bool:
-        """Whether the file that was probed is the one that was prepared."""
+        """Whether the file that was probed is the one that was prepared.
+
+        A lossless one may be damaged since: it says itself what it was made of, and each of its blocks is checked when
+        it is read. The source itself will do in its place.
+        """
         video = self.videos[record.id]
+        if self.lossless:
+            is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
+            return record.problem is None and record.frames == video.frames and is_either
         return (record.fingerprint, record.frames) == (video.fingerprint, video.frames)
 
     def as_source(self, record: Record) -> Record:

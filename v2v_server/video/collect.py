@@ -158,14 +158,15 @@ class Stream(Stack):
         super().__init__(task, [cut])
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
-        ((stored, raw),) = self._parts
-        copy_luma(samples, self._luma, stored, raw[0])
+        ((stored, last),) = self._parts
+        self._parts = [(stored, np.empty_like(last))]  # whoever has the last one may keep it
+        copy_luma(samples, self._luma, stored, self._parts[0][1][0])
 
     def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
         return super()._part(replace(cut, count=1))
 
     def picture(self) -> npt.NDArray[np.uint8]:
-        """The last frame that was taken, [h, w] uint8: upright, in full range; valid until the next is taken."""
+        """The last frame that was taken, [h, w] uint8: upright, in full range."""
         (grey,) = self.grey()
         picture: npt.NDArray[np.uint8] = grey[0]
         return picture
