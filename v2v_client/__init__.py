@@ -9,8 +9,9 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.in_process import V2VDataset
-from v2v_client.memory.allocator import keep_freed_memory
+from v2v_client.memory.buffers import keep_freed_memory
 from v2v_protocol.errors import (
+    NoWorkers,
     ProtocolError,
     RecipeError,
     RemoteError,
@@ -24,6 +25,7 @@ from v2v_protocol.errors import (
 
 __all__ = [
     "Batch",
+    "NoWorkers",
     "ProtocolError",
     "RecipeError",
     "RemoteError",

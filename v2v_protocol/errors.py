@@ -14,6 +14,7 @@
     |-- RemoteError              the server answered a request with a refusal (code, text)
     |   `-- SampleUnavailable        one sample could not be made from any of its candidates
     |-- ServerLost               nobody: the server did not answer within the deadline
+    |   `-- NoWorkers                it answers, but nobody can make a sample
     `-- WorkerCrashLoop          the workers die without finishing anything
 
 A message says what is wrong, the number, the limit and what to do about it.
@@ -121,6 +122,10 @@ class SampleUnavailable(RemoteError):
 
 class ServerLost(V2VError):
     """The server did not answer within the deadline; the message names address and last sample."""
+
+
+class NoWorkers(ServerLost):
+    """The server answers, but it had no worker that could make a sample within the deadline; the message says why."""
 
 
 class WorkerCrashLoop(V2VError):

@@ -158,7 +158,13 @@ class Denied:
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """Answers Ping."""
+    """Answers Ping.
+
+    Attributes:
+        trouble: why nobody can make a sample now, and what to do about it; empty where somebody can.
+    """
+
+    trouble: str = ""
 
 
 # --- worker -> server -------------------------------------------------------------------------------------------------

@@ -33,10 +33,21 @@ from v2v_server.supervise.protocol import Supervisor
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.video.rows import Rows
 
+_MANY_WORKERS_A_CORE = 4
 _TURN_SECONDS = 0.1
 """Of the loop without any message; also from one look at deadlines and deaths to the next."""
 _LONGEST_TURN_SECONDS = 1.0
 """What goes beyond is time in which nobody was listened to."""
+
+
+def question_workers(workers: int, cores: int) -> str:
+    """A line on more workers than can be of use; empty where there is nothing to say."""
+    if workers <= _MANY_WORKERS_A_CORE * cores:
+        return ""
+    return (
+        f"warning: --workers {workers} on {cores} cores: each keeps one core busy, and more than that only "
+        f"cost memory; --workers {cores} makes as many samples"
+    )
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -99,6 +110,8 @@ def serve(config: ServeConfig) -> None:
         pool = Pool(catalogue.root, label)
         server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file)
         try:
+            if question := question_workers(config.workers, usable_cores()):
+                _say(question)
             pool.start(sockets.worker_address)
             pool.scale(config.workers)
             while not stop.is_set() and config.parent_pid in (0, os.getppid()):

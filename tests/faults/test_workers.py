@@ -20,7 +20,7 @@ from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.errors import ServerLost
+from v2v_protocol.errors import NoWorkers, ServerLost
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.quarantine import read_quarantine
 from v2v_server.catalogue.catalogue import open_catalogue
@@ -52,22 +52,50 @@ def cache(tmp_path: Path) -> Path:
     return tmp_path / "cache"
 
 
+def free_address() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
+
+
+def worker_command(address: str, videos: Path) -> list[str]:
+    return [sys.executable, "-m", "v2v_server.commands.worker", "--connect", address, "--videos", str(videos)]
+
+
+def test_where_no_sample_can_come_the_consumer_says_why_and_ends(clips: Path, tmp_path: Path) -> None:
+    """A server without workers; and one whose only worker has another folder, until one comes that has the videos."""
+    address = free_address()
+    with LocalServer(clips, workers=0, flags=[*SMALL_FLAGS, "--worker-bind", address]) as server:
+
+        def first(timeout_seconds: float) -> Batch:
+            return next(iter(V2VStreamDataset(server.address, recipe=SMALL, timeout_seconds=timeout_seconds)))
+
+        with pytest.raises(NoWorkers, match="no worker is connected"):
+            first(3.0)
+        with subprocess.Popen(worker_command(address, tmp_path)) as lacking:
+            try:
+                # Until it is there, and has failed, nobody can say more than that none is connected.
+                text = ""
+                while "can read its videos" not in text:
+                    with pytest.raises(NoWorkers) as caught:
+                        first(4.0)
+                    text = str(caught.value)
+                assert "--videos" in text
+                with subprocess.Popen(worker_command(address, clips)) as having:
+                    try:
+                        assert first(60.0).indices[0] == 0
+                    finally:
+                        having.terminate()
+            finally:
+                lacking.terminate()
+
+
 def test_a_worker_whose_host_lacks_the_videos_changes_nothing(
     clips: Path, tmp_path: Path, reference: list[str]
 ) -> None:
     """It fails fastest, so it is asked most: an empty mount point, say."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    command = [
-        sys.executable,
-        "-m",
-        "v2v_server.commands.worker",
-        "--connect",
-        address,
-        "--videos",
-        str(tmp_path),
-    ]
+    address = free_address()
+    command = worker_command(address, tmp_path)
     with LocalServer(clips, workers=1, flags=[*SMALL_FLAGS, "--worker-bind", address]) as server:
         with subprocess.Popen(command) as lacking:
             try:

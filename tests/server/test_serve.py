@@ -24,7 +24,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict, read_quarantine
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
-from v2v_server.serve import Server
+from v2v_server.serve import Server, question_workers
 
 VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = Record(VERDICT, Request(b"c", 0, 0))
@@ -179,3 +179,8 @@ def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
     server.turn(0.0)
     server.turn(0.0)
     assert dispatcher.times == [50.0, 51.0, 52.0]
+
+
+def test_more_workers_than_can_be_of_use_are_questioned() -> None:
+    assert "--workers 500 on 2 cores" in question_workers(500, 2)
+    assert question_workers(8, 2) == ""

@@ -4,6 +4,12 @@
 It is an anonymous file whose size is sealed, so that no peer can make a page fault fail. A batch that is whole is a
 private mapping of it: what its holder writes stays his, and no worker can see it. A mapping that nobody has written to
 serves the next batch as well.
+
+Memory is used again once its last user is gone. An array that is lent (:func:`lend`) does not own its memory but refers
+to a small *loan* object that does: NumPy keeps the object behind ``__array_interface__`` alive as the array's base.
+Whatever is made from that array without copying, a view, a torch tensor, a tensor's storage, another tensor or array of
+the same storage, keeps the loan alive; its finalizer gives the memory back. No reference is counted by hand, and no
+promise of the user is needed.
 """
 
 from __future__ import annotations
@@ -19,9 +25,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_client.memory.loan import Bytes, lend
 from v2v_protocol.arena import ArenaName, Slot, array_offsets
 from v2v_protocol.sample import Form, Layout, new_arrays
+
+Bytes = npt.NDArray[np.uint8]
 
 _DESCRIPTORS_AN_ARENA = 8
 """It has two open files, its own and its mapping's; all arenas leave three quarters of what a process may have."""
@@ -29,6 +36,45 @@ _POPULATE_READ = 22
 """MADV_POPULATE_READ of Linux 5.14, asm-generic/mman-common.h: all pages at once is cheaper than one at a time."""
 _THE_FILES = np.uint64(1 << 63 | 1 << 61)
 """In /proc/PID/pagemap: the page is there, and it is a file's."""
+
+
+class _Loan:
+    """Owner, in the eyes of NumPy, of borrowed memory."""
+
+    __slots__ = ("__array_interface__", "__weakref__")
+
+    def __init__(self, memory: Bytes) -> None:
+        address = memory.ctypes.data, False
+        self.__array_interface__ = {"version": 3, "data": address, "shape": memory.shape, "typestr": "|u1"}
+
+
+def lend(memory: Bytes, back: Callable[[Bytes], object]) -> Bytes:
+    """The memory as another array.
+
+    Args:
+        memory: kept until it is back.
+        back: called with the memory once nothing refers to that array any more, in whatever thread that happens; not at
+            the end of the process.
+    """
+    loan = _Loan(memory)
+    # The finalizer holds the memory while the loan lives.
+    weakref.finalize(loan, back, memory).atexit = False
+    return np.asarray(loan)
+
+
+def batch_bytes(layout: Layout, slots: int) -> int:
+    """Size of the memory of a batch of so many samples."""
+    return array_offsets(Form.of(layout).sizes, slots)[-1]
+
+
+def batch_arrays(memory: Bytes, layout: Layout, slots: int) -> dict[str, npt.NDArray[Any]]:
+    """The rows of each array, [slots, ...], in the memory of a batch, without a copy."""
+    sizes = Form.of(layout).sizes
+    places = zip(layout.items(), sizes, array_offsets(sizes, slots), strict=False)  # after the last begins nothing
+    return {
+        name: memory[offset : offset + slots * size].view(dtype).reshape(slots, *shape)
+        for (name, (dtype, shape)), size, offset in places
+    }
 
 
 class Arena:
@@ -104,13 +150,7 @@ class Arena:
             self._memory = memory
             unused()
 
-        whole = lend(memory, memory.dtype, memory.shape, back)
-        arrays = {}
-        for name, (dtype, shape) in self._layout.items():
-            offset = self._offsets[name]
-            rows = whole[offset : offset + self._slots * self._sizes[name]]
-            arrays[name] = rows.view(dtype).reshape(self._slots, *shape)
-        return arrays
+        return batch_arrays(lend(memory, back), self._layout, self._slots)
 
     def _mapped(self) -> Bytes:
         """All of it, privately, with all its pages."""

@@ -1,7 +1,7 @@
 """Memory for batches that is used again, but never while anything still looks at it.
 
 Fresh memory costs more than the copy into it: the kernel hands out zeroed pages one fault at a time. So memory whose
-last user is gone (:mod:`v2v_client.memory.loan`) goes back to its pool.
+last user is gone (:func:`v2v_client.memory.arena.lend`) is kept for the next batch.
 
 A process that was forked while somebody looked at an arena may look at it for as long as it likes, and nobody here
 would know: such an arena is not used again.
@@ -9,120 +9,92 @@ would know: such an arena is not used again.
 
 from __future__ import annotations
 
-import math
+import ctypes
 import os
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_client.memory.arena import Arena, open_arena
-from v2v_client.memory.loan import lend
+from v2v_client.memory.arena import Arena, Bytes, batch_arrays, batch_bytes, lend, open_arena
 from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Layout
 
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""Parameters of mallopt(3), from glibc's malloc.h."""
+_NEVER_BYTES = (1 << 31) - 1
 
-class BufferPool:
-    """Arrays of one dtype and shape.
+
+class BatchMemory:
+    """The rows of one batch that is being filled.
+
+    Its workers may put samples into the slots of an arena. Where a sample came otherwise, and a worker may still write
+    to its slot, the batch leaves the arena for memory that no other process can reach.
 
     Args:
-        dtype, shape: of the arrays.
-        spare: most buffers kept while nobody uses them.
+        buffers: where memory of its own comes from.
+        arena: where workers may put samples; None for memory of its own from the beginning.
+
+    Attributes:
+        lent: whether there were slots.
+        in_place: samples that a worker put into their row.
     """
 
-    def __init__(self, dtype: str, shape: tuple[int, ...], spare: int) -> None:
-        self._dtype = np.dtype(dtype)
-        self._shape = shape
-        # A deque, because finalizers may run in any thread (that of DataLoader's pinning, say): its methods are atomic.
-        self._free: deque[npt.NDArray[np.uint8]] = deque(maxlen=spare)
-
-    def take(self) -> npt.NDArray[Any]:
-        """A C-contiguous array of unspecified content; its memory comes back when the last reference to it dies."""
-        try:
-            memory = self._free.pop()
-        except IndexError:
-            memory = np.empty(math.prod(self._shape) * self._dtype.itemsize, np.uint8)
-        return lend(memory, self._dtype, self._shape, self._free.append)
-
-
-class Memory(Protocol):
-    """The rows of one batch."""
+    def __init__(self, buffers: BatchBuffers, arena: Arena | None) -> None:
+        self._buffers = buffers
+        self._arena = arena
+        self._own = buffers.arrays() if arena is None else {}
+        self._left: Arena | None = None
+        self._filled: list[int] = []
+        self.lent = arena is not None
+        self.in_place = 0
 
     def slot(self, row: int) -> Slot | None:
         """Where a worker of this host may put the sample of that row."""
+        return None if self._arena is None else self._arena.slot(row)
 
-    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Copies a sample into a row."""
+    def fill(self, row: int, arrays: Mapping[str, npt.NDArray[Any]] | None, *, slot_is_free: bool = True) -> None:
+        """A sample has come.
+
+        Args:
+            row: of the batch.
+            arrays: copied into it; None where a worker has put them into the row's slot.
+            slot_is_free: whether no worker writes to that slot any more.
+        """
+        if not slot_is_free and self._arena is not None:
+            self._left, self._arena, self._own = self._arena, None, self._buffers.arrays()
+            for before in self._filled:
+                self._put(before, self._left.get(before))
+        if arrays is not None:
+            self._put(row, arrays)
+        else:
+            self.in_place += 1
+            if self._left is not None:
+                self._put(row, self._left.get(row))
+        self._filled.append(row)
+
+    def _put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        if self._arena is not None:
+            self._arena.put(row, arrays)
+            return
+        for name, array in arrays.items():
+            self._own[name][row] = array
 
     def whole(self) -> dict[str, npt.NDArray[Any]]:
         """All rows of each array, once they are filled. To be called once, and nothing else after it."""
-
-
-class OwnMemory:
-    """Memory that this process alone can reach.
-
-    Args:
-        arrays: with a row for each sample, by name.
-    """
-
-    def __init__(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        self._arrays = arrays
-
-    def slot(self, row: int) -> Slot | None:
-        """See :class:`Memory`."""
-        return None
-
-    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """See :class:`Memory`."""
-        for name, array in arrays.items():
-            self._arrays[name][row] = array
-
-    def whole(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Memory`."""
-        return self._arrays
-
-
-class SharedMemory:
-    """An arena, which comes back when its batch is not used any more; one whose batch never became whole does not."""
-
-    def __init__(self, arena: Arena, free: deque[Arena]) -> None:
-        self._arena = arena
-        self._free = free
-
-    def slot(self, row: int) -> Slot | None:
-        """See :class:`Memory`."""
-        return self._arena.slot(row)
-
-    def put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """See :class:`Memory`."""
-        self._arena.put(row, arrays)
-
-    def get(self, row: int) -> dict[str, npt.NDArray[Any]]:
-        """A copy of what is in a row."""
-        return self._arena.get(row)
-
-    def whole(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Memory`."""
-        arena, free, forks = self._arena, self._free, _forks
-
-        def unused() -> None:
-            if forks == _forks:
-                free.append(arena)
-
-        return arena.arrays(unused)
+        return self._own if self._arena is None else self._buffers.lent_arrays(self._arena)
 
 
 class BatchBuffers:
     """The memory of a dataset's batches, which one iteration leaves to the next."""
 
     def __init__(self) -> None:
-        self._form: object = None
-        self._pools: dict[str, BufferPool] = {}
+        self._form: tuple[Layout, int, int] = {}, 0, 0
+        # Deques: finalizers may run in any thread (that of DataLoader's pinning, say), and their methods are atomic.
+        self._free: deque[Bytes] = deque()
         self._arenas: deque[Arena] = deque()
-        self._layout: Layout = {}
-        self._batch_size = 0
 
     def shape(self, layout: Layout, batch_size: int, spare: int) -> None:
         """What is taken from now on is for batches of that many samples; memory of another form is let go.
@@ -134,24 +106,43 @@ class BatchBuffers:
         """
         form = dict(layout), batch_size, spare
         if form != self._form:
-            self._form, self._layout, self._batch_size = form, layout, batch_size
-            self._arenas = deque(maxlen=spare)
-            self._pools = {
-                name: BufferPool(dtype, (batch_size, *shape), spare) for name, (dtype, shape) in layout.items()
-            }
+            self._form = form
+            self._free, self._arenas = deque(maxlen=spare), deque(maxlen=spare)
 
-    def own(self) -> OwnMemory:
-        """Memory for a batch, of unspecified content, that no other process can reach."""
-        return OwnMemory({name: pool.take() for name, pool in self._pools.items()})
+    def take(self, *, shared: bool) -> BatchMemory:
+        """Memory for a batch, of unspecified content.
 
-    def shared(self) -> SharedMemory | None:
-        """The same, with slots for the workers of this host; None where the system has no such memory."""
+        Args:
+            shared: with slots for the workers of this host, where the system has such memory.
+        """
+        return BatchMemory(self, self._take_arena() if shared else None)
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays for a batch that no other process can reach; they come back when nothing looks at them any more."""
+        layout, batch_size, _ = self._form
+        try:
+            memory = self._free.pop()
+        except IndexError:
+            memory = np.empty(batch_bytes(layout, batch_size), np.uint8)
+        return batch_arrays(lend(memory, self._free.append), layout, batch_size)
+
+    def _take_arena(self) -> Arena | None:
         while self._arenas:
             arena = self._arenas.pop()
             if arena.process == os.getpid():  # otherwise the process that this one was forked from may go on with it
-                return SharedMemory(arena, self._arenas)
-        opened = open_arena(self._layout, self._batch_size)
-        return None if opened is None else SharedMemory(opened, self._arenas)
+                return arena
+        return open_arena(*self._form[:2])
+
+    def lent_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
+        """The arrays of an arena whose batch is whole; it comes back when nothing looks at them any more. One whose
+        batch never became whole does not."""
+        free, forks = self._arenas, _forks
+
+        def unused() -> None:
+            if forks == _forks:
+                free.append(arena)
+
+        return arena.arrays(unused)
 
 
 _forks = 0
@@ -164,3 +155,21 @@ def _note_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_note_fork)
+
+
+def keep_freed_memory(_loader_worker: int = 0) -> bool:
+    """Makes this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
+
+    Every sample is received into fresh memory, and fresh memory from the kernel is cleared and mapped page by page.
+    Kept memory costs nothing of that. The price: the process stays as large as it ever was. It is a decision about the
+    whole process, so nothing calls this by itself: call it before the first iteration, and with loader workers give
+    it to them, ``DataLoader(dataset, batch_size=None, num_workers=2, worker_init_fn=keep_freed_memory)``.
+
+    Returns:
+        whether the C library understood; only glibc does.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is None:
+        return False
+    # Both: a large block is otherwise mapped by itself and unmapped when freed, or trimmed off the end of the heap.
+    return bool(mallopt(_M_MMAP_THRESHOLD, 1 << 30)) and bool(mallopt(_M_TRIM_THRESHOLD, _NEVER_BYTES))

@@ -1,10 +1,15 @@
-"""Which slot a sample may come to lie in, and what its arrival means for that (:mod:`v2v_protocol.arena`). Pure."""
+"""Which slot a sample may come to lie in, and what its arrival means for that (:mod:`v2v_protocol.arena`). Pure.
+
+Where none are offered (the system has no such memory, or it is not wanted) samples come in messages.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import Enum, auto
 
-from v2v_protocol.arena import Slot
+from v2v_protocol.arena import NO_SLOT, Slot
+from v2v_protocol.messages import Want
 
 
 class Answer(Enum):
@@ -17,35 +22,45 @@ class Answer(Enum):
 
 
 class Slots:
-    """Keeps account of the slots that were named for samples, not of their bytes."""
+    """Keeps account of the slots that the requests of one connection name, not of their bytes."""
 
     def __init__(self) -> None:
-        self._of: dict[int, Slot] = {}
+        self._offered: dict[int, Slot] = {}
+        self._named: dict[int, Slot] = {}
 
-    def of(self, index: int) -> Slot | None:
-        """The slot that this sample may come to lie in."""
-        return self._of.get(index)
+    def offer(self, slots: Mapping[int, Slot]) -> None:
+        """Where samples may come to lie that were never asked for yet, by index."""
+        self._offered.update(slots)
 
-    def name(self, index: int, slot: Slot) -> None:
-        """A slot is named for a sample that has none.
+    def want(self, epoch: int, indices: Sequence[int]) -> Want:
+        """A request for samples, each with the slot that was offered for it.
 
-        Not to be called for a sample that is asked for again: its first worker may be at it still, with its first slot.
+        One that was asked for before is asked for without: its first worker may be at it still, and has one.
         """
-        self._of[index] = slot
+        slots = [self._offered.pop(index, None) for index in indices]
+        self._named.update({index: slot for index, slot in zip(indices, slots, strict=True) if slot is not None})
+        if not any(slots):
+            return Want(epoch, tuple(indices))
+        return Want(
+            epoch,
+            tuple(indices),
+            tuple("" if slot is None else slot.arena for slot in slots),
+            tuple(NO_SLOT if slot is None else slot.number for slot in slots),
+        )
 
-    def answered(self, index: int, named: int, *, in_message: bool) -> Answer:
+    def answered(self, index: int, number: int, *, in_message: bool) -> Answer:
         """A sample arrived.
 
         Args:
             index: which.
-            named: number of the slot that its header names.
+            number: of the slot that its header names.
             in_message: whether the arrays came with it.
         """
-        slot = self.of(index)
-        returned = slot is not None and named == slot.number
+        slot = self._named.get(index)
+        returned = slot is not None and number == slot.number
         if not in_message and not returned:
             return Answer.NOWHERE
-        self._of.pop(index, None)
+        self._named.pop(index, None)
         if not in_message:
             return Answer.THERE
         return Answer.MESSAGE if returned or slot is None else Answer.ABANDONED

@@ -15,13 +15,36 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from threading import Thread
-from typing import Any
+from typing import Any, Protocol
 
 import zmq
 
 from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.wire import Frames
 
 _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
+
+
+class Transport(Protocol):
+    """What a connection needs of a link: a :class:`Link`, or the queues of a test. Closed, it raises ServerLost."""
+
+    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
+        """See :meth:`Link.connect`."""
+
+    def disconnect(self, *, linger_ms: int) -> None:
+        """See :meth:`Link.disconnect`."""
+
+    def send(self, frames: Sequence[Any]) -> None:
+        """See :meth:`Link.send`."""
+
+    def receive(self, seconds: float) -> Frames | None:
+        """See :meth:`Link.receive`."""
+
+    def remade(self) -> bool:
+        """See :meth:`Link.remade`."""
+
+    def close(self) -> None:
+        """See :meth:`Link.close`."""
 
 
 class Link:
@@ -125,7 +148,7 @@ class Link:
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot send: {error}") from error
 
-    def receive(self, seconds: float) -> list[zmq.Frame] | None:
+    def receive(self, seconds: float) -> Frames | None:
         """The next message; None when none came in that time, or the network was heard of instead."""
         socket = self._open(self._socket)
         try:
@@ -133,7 +156,7 @@ class Link:
                 frames = [socket.recv(zmq.NOBLOCK, copy=False)]
                 while frames[-1].more:  # recv_multipart asks the socket instead, which takes longer
                     frames.append(socket.recv(zmq.NOBLOCK, copy=False))
-                return frames
+                return [frame.buffer for frame in frames]
             return None
         except zmq.Again:
             return None  # a connection that just ended took its messages with it

@@ -116,7 +116,7 @@ class Dispatcher:
             case Hello():
                 return [self._hello(identity, message, now)]
             case Ping():
-                return [ToConsumer(identity, encode(Pong()))]
+                return [ToConsumer(identity, encode(Pong(self._workers.trouble(self._expected_workers))))]
             case Goodbye():
                 self.consumer_lost(identity)
                 return []
@@ -233,7 +233,7 @@ class Dispatcher:
         if not found:
             return [*self._candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
         self.counters.missing_videos += 1
-        self._workers.rest(missing.identity, now)
+        self._workers.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)
         return self._assign(now)
 
@@ -288,6 +288,7 @@ class Dispatcher:
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
                 actions.append(ToConsumer(request.session, payload))
+        self._workers.can_work(identity)
         self._leases.finished(result.lease, identity, now, decoded=decoded)
         self._leases.begun(result.begins, identity, now)
         return actions + self._assign(now)
@@ -298,6 +299,7 @@ class Dispatcher:
         if request is None or session is None:
             return self._assign(now)
         if not failed.here:
+            self._workers.can_work(identity)
             return [*self._candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
         # The catalogue is of this host's files: if the video is here, other workers can have it too.
         video = self._candidates.sequence(session, request).video

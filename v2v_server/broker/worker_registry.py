@@ -25,6 +25,7 @@ class _Worker:
     credit: int
     liveness: Liveness
     given_up: bool = False
+    unreadable: str = ""  # what its host could not read last; empty since it has done anything
 
 
 class Workers:
@@ -75,9 +76,32 @@ class Workers:
         worker.liveness.heard(now)
         return True
 
-    def rest(self, identity: bytes, now: float) -> None:
-        """It gets no work for a while."""
+    def can_work(self, identity: bytes) -> None:
+        """It has done something: its host can read videos."""
         if identity in self._workers:
+            self._workers[identity].unreadable = ""
+
+    def trouble(self, expected: int) -> str:
+        """Why none of them can make a sample, and what to do about it; empty where one can, as far as is known.
+
+        Args:
+            expected: how many there should be.
+        """
+        if not self._workers:
+            start = f"{expected} should come; see what v2v-serve says of them" if expected else "start v2v-worker"
+            return f"no worker is connected to the server: {start}, or v2v-serve with --workers N"
+        reasons = [worker.unreadable for worker in self._workers.values()]
+        if not all(reasons):
+            return ""
+        return (
+            f"none of the server's workers ({len(reasons)}) can read its videos: {reasons[0]:.300}; give v2v-worker "
+            "the folder that v2v-serve has (--videos)"
+        )
+
+    def rest(self, identity: bytes, now: float, unreadable: str) -> None:
+        """It gets no work for a while: its host could not read that."""
+        if identity in self._workers:
+            self._workers[identity].unreadable = unreadable
             self._resting[identity] = now + REST_SECONDS
             self._changed.add(identity)
 

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_client.memory.arena import Arena, open_arena
-from v2v_client.memory.slots import Answer, Slots
 from v2v_protocol.arena import MOST_SLOTS, NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_server.worker.handover import slot_arrays
@@ -244,17 +243,3 @@ def test_arrays_begin_at_whole_pages_and_do_not_overlap(sizes: list[int], slots:
     for size, begin, end in zip(sizes, offsets, offsets[1:], strict=False):
         assert begin % mmap.PAGESIZE == 0
         assert size * slots <= end - begin < size * slots + mmap.PAGESIZE
-
-
-def test_what_an_arrival_says_of_its_slot() -> None:
-    slots = Slots()
-    for index in (10, 11, 12, 13):
-        slots.name(index, Slot("a", index - 9))
-    assert slots.answered(10, 1, in_message=False) is Answer.THERE
-    assert slots.of(10) is None
-    assert slots.answered(11, 2, in_message=True) is Answer.MESSAGE
-    assert slots.answered(12, NO_SLOT, in_message=True) is Answer.ABANDONED
-    assert slots.answered(13, 3, in_message=False) is Answer.NOWHERE
-    assert slots.of(13) == Slot("a", 4)
-    assert slots.answered(99, NO_SLOT, in_message=True) is Answer.MESSAGE
-    assert slots.answered(99, 7, in_message=False) is Answer.NOWHERE

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2v_client.memory.buffers import BatchBuffers, BufferPool, Memory, SharedMemory
+from v2v_client.memory.buffers import BatchBuffers, BatchMemory
 
 
 def address(array: np.ndarray) -> int:
@@ -52,78 +52,78 @@ HOLDS = [
 ]
 
 
+LAYOUT = {"voxels": ("int8", (2, 3)), "frames": ("uint8", (5,))}
+
+
+def shaped(batch_size: int = 4, spare: int = 2) -> BatchBuffers:
+    buffers = BatchBuffers()
+    buffers.shape(LAYOUT, batch_size, spare=spare)
+    return buffers
+
+
 @pytest.mark.parametrize("hold", HOLDS)
-def test_a_buffer_is_not_used_again_while_anything_looks_at_it(hold):
-    pool = BufferPool("int16", (3, 4), spare=2)
-    array = pool.take()
+def test_memory_is_not_used_again_while_anything_looks_at_it(hold):
+    buffers = shaped()
+    array = buffers.arrays()["voxels"].reshape(4, 6)
     array[:] = 7
     first = address(array)
     held = hold(array)
     del array
-    other = pool.take()
+    other = buffers.arrays()["voxels"]
     assert address(other) != first
     other[:] = 9
     del held
     gc.collect()
-    again = pool.take()
-    assert address(again) == first, "the last user is gone, yet the buffer did not come back"
-    assert (again == 7).all(), "somebody wrote into a buffer that was held"
+    again = buffers.arrays()["voxels"]
+    assert address(again) == first, "the last user is gone, yet the memory did not come back"
+    assert (again == 7).all(), "somebody wrote into memory that was held"
 
 
 def test_arrays_have_the_asked_form():
-    array = BufferPool("float32", (2, 3, 4), spare=1).take()
-    assert array.shape == (2, 3, 4)
-    assert array.dtype == np.float32
-    assert array.flags.c_contiguous
-    assert array.flags.writeable
+    for name, array in shaped().arrays().items():
+        dtype, shape = LAYOUT[name]
+        assert array.shape == (4, *shape)
+        assert array.dtype == dtype
+        assert array.flags.c_contiguous
+        assert array.flags.writeable
+        assert address(array) % array.dtype.alignment == 0
 
 
-def test_no_more_buffers_are_kept_than_stated():
-    pool = BufferPool("uint8", (1024,), spare=2)
-    arrays = [pool.take() for _ in range(5)]
+def test_no_more_memory_is_kept_than_stated():
+    buffers = shaped()
+    arrays = [buffers.arrays()["voxels"] for _ in range(5)]
     addresses = {address(array) for array in arrays}
     del arrays
     gc.collect()
-    kept = [pool.take() for _ in range(2)]
+    kept = [buffers.arrays()["voxels"] for _ in range(2)]
     assert {address(array) for array in kept} <= addresses
-    assert len(pool._free) == 0
+    assert len(buffers._free) == 0
 
 
-def test_a_buffer_outlives_its_pool():
-    pool = BufferPool("uint8", (1 << 20,), spare=1)
-    array = pool.take()
+def test_memory_outlives_its_buffers():
+    array = shaped(1 << 16).arrays()["voxels"]
     array[:] = 5
-    del pool
     gc.collect()
     assert (array == 5).all()
-
-
-LAYOUT = {"voxels": ("int8", (2, 3)), "frames": ("uint8", (5,))}
-
-
-def shaped(batch_size: int = 4) -> BatchBuffers:
-    buffers = BatchBuffers()
-    buffers.shape(LAYOUT, batch_size, spare=2)
-    return buffers
 
 
 def sample(value: int) -> dict[str, np.ndarray]:
     return {name: np.full(shape, value, dtype) for name, (dtype, shape) in LAYOUT.items()}
 
 
-def filled(memory: Memory) -> dict[str, np.ndarray]:
+def filled(memory: BatchMemory) -> dict[str, np.ndarray]:
     for row in range(4):
-        memory.put(row, sample(row))
+        memory.fill(row, sample(row))
     return memory.whole()
 
 
-def arena_of(memory: SharedMemory) -> str:
+def arena_of(memory: BatchMemory) -> str:
     return memory.slot(0).arena
 
 
-@pytest.mark.parametrize("kind", ["own", "shared"])
-def test_a_batch_has_the_rows_that_were_put(kind):
-    whole = filled(getattr(shaped(), kind)())
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_batch_has_the_rows_that_were_put(shared):
+    whole = filled(shaped().take(shared=shared))
     assert {name: (str(array.dtype), array.shape) for name, array in whole.items()} == {
         "voxels": ("int8", (4, 2, 3)),
         "frames": ("uint8", (4, 5)),
@@ -131,37 +131,54 @@ def test_a_batch_has_the_rows_that_were_put(kind):
     assert all((array[row] == row).all() for array in whole.values() for row in range(4))
 
 
+def test_a_batch_leaves_its_arena_where_a_worker_may_still_write():
+    """With the samples that are there, and those that other workers put there yet."""
+    buffers = shaped()
+    memory = buffers.take(shared=True)
+    for row in range(4):
+        arena = memory._arena or memory._left
+        if row in (1, 3):
+            arena.put(row, sample(row))  # as a worker does
+        memory.fill(row, None if row in (1, 3) else sample(row), slot_is_free=row != 2)
+    assert memory.lent
+    assert memory.in_place == 2
+    left = memory._left
+    whole = memory.whole()
+    left.put(2, sample(99))
+    assert all((array[row] == row).all() for array in whole.values() for row in range(4))
+
+
 def test_memory_of_another_form_is_let_go():
     buffers = shaped()
-    place = address(buffers.own().whole()["voxels"])
+    place = address(buffers.arrays()["voxels"])
     buffers.shape(dict(LAYOUT), 4, spare=2)
-    assert address(buffers.own().whole()["voxels"]) == place
+    assert address(buffers.arrays()["voxels"]) == place
     buffers.shape(LAYOUT, 2, spare=2)
-    assert buffers.own().whole()["voxels"].shape == (2, 2, 3)
+    assert buffers.arrays()["voxels"].shape == (2, 2, 3)
 
 
 @pytest.mark.parametrize("hold", HOLDS)
 def test_an_arena_is_not_used_again_while_anything_looks_at_its_batch(hold):
     buffers = shaped()
-    memory = buffers.shared()
+    memory = buffers.take(shared=True)
     name, whole = arena_of(memory), filled(memory)
     held = hold(whole["voxels"].reshape(4, 6))
     del memory, whole
     gc.collect()
-    others = [buffers.shared() for _ in range(3)]
+    others = [buffers.take(shared=True) for _ in range(3)]
     assert name not in map(arena_of, others)
     del held
     gc.collect()
-    assert arena_of(buffers.shared()) == name
+    assert arena_of(buffers.take(shared=True)) == name
 
 
 def test_an_arena_whose_batch_never_became_whole_is_not_used_again():
     buffers = shaped()
-    memory = buffers.shared()
+    memory = buffers.take(shared=True)
     name = arena_of(memory)
     del memory
     gc.collect()
-    assert arena_of(buffers.shared()) != name
+    assert arena_of(buffers.take(shared=True)) != name
 
 
 @contextmanager
@@ -190,7 +207,7 @@ def forked(check):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
     buffers = shaped()
-    memory = buffers.shared()
+    memory = buffers.take(shared=True)
     name, mine = arena_of(memory), filled(memory)
 
     def still_there():
@@ -202,24 +219,24 @@ def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
         del memory
         gc.collect()
         for _ in range(3):
-            memory = buffers.shared()
+            memory = buffers.take(shared=True)
             assert arena_of(memory) != name
-            memory.put(2, sample(99))
+            memory.fill(2, sample(99))
             memory.whole()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_process_does_not_use_the_arenas_of_its_parent():
     buffers = shaped()
-    memory = buffers.shared()
+    memory = buffers.take(shared=True)
     name = arena_of(memory)
     filled(memory)
     del memory
     gc.collect()
 
     def uses_another():
-        assert arena_of(buffers.shared()) != name
+        assert arena_of(buffers.take(shared=True)) != name
 
     with forked(uses_another):
         pass
-    assert arena_of(buffers.shared()) == name
+    assert arena_of(buffers.take(shared=True)) == name

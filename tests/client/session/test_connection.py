@@ -19,9 +19,11 @@ from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
 from v2v_client.session import link
 from v2v_client.session.connection import Connection
+from v2v_client.session.conversation import Event
 from v2v_client.session.liveness import Patience
 from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.wire import Frames
 
 NEVER_BY_THE_CLOCK = Patience(timeout_seconds=20.0, ping_seconds=1000.0, rewant_seconds=1000.0)
 
@@ -41,7 +43,8 @@ def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(se
         connection.want(range(4))
         until(lambda: len(server.wants) == 4)
         server.call(lambda: server.answer(0, 0))
-        connection._resume()  # the network was cut and is back: all four are asked for again
+        connection._conversation.happens(Event.CUT, connection._now())
+        connection.want(())  # and all four are asked for again
         until(lambda: len(server.wants) == 8)
         assert _next(connection) == 0
         connection.want([4])
@@ -78,7 +81,7 @@ def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypa
         connection.open()
         listen = link.Link.receive
 
-        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+        def receive(self: link.Link, seconds: float) -> Frames | None:
             if len(stopped) < 3:
                 stopped.append(3600.0)
                 return None
@@ -102,7 +105,7 @@ def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
         listen = link.Link.receive
 
-        def receive(self: link.Link, seconds: float) -> list[zmq.Frame] | None:
+        def receive(self: link.Link, seconds: float) -> Frames | None:
             if len(waited) < 20:
                 waited.append(0.9)
                 return None
@@ -111,7 +114,7 @@ def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
         monkeypatch.setattr(link.Link, "receive", receive)
         connection.open()
         assert connection.receive(wait=False) is None
-        assert connection._liveness.silence(clock()) >= 0.0
+        assert connection._conversation.silence(connection._now()) >= 0.0
 
 
 @pytest.mark.parametrize(
@@ -133,6 +136,7 @@ def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeSe
     with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
         connection.open()
         made_anew = connection._open_link()
+        assert isinstance(made_anew, link.Link)
         made_anew.connect(1 << 20, keep_name=True)
         assert made_anew._socket is not None
         assert made_anew._socket.getsockopt(zmq.IPV6) == 0

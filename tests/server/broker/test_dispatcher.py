@@ -156,8 +156,8 @@ def test_an_index_is_not_made_twice_while_it_is_in_work() -> None:
 
 def test_pings_are_answered() -> None:
     at = peers()
-    assert at.consumer_says(b"c", Ping()) == [Pong()]
     at.join()
+    assert at.consumer_says(b"c", Ping()) == [Pong()]
     at.worker_says(b"w", Ping())
     assert at.told[b"w"] == [Pong()]
     at.carry_out(at.dispatcher.stop_workers())
@@ -393,6 +393,31 @@ def test_a_video_that_only_the_workers_host_lacks_is_made_elsewhere() -> None:
     assert sorted(at.samples()) == [(0, 3), (0, 4), (0, 5), (0, 6)]
     counters = at.dispatcher.counters
     assert (counters.missing_videos, counters.refused_candidates, counters.faults) == (1, 0, 1)
+
+
+def test_who_waits_is_told_that_nobody_can_make_a_sample() -> None:
+    at = peers()
+
+    def trouble() -> str:
+        (pong,) = at.consumer_says(b"c", Ping())
+        assert isinstance(pong, Pong)
+        return pong.trouble
+
+    assert "no worker is connected" in trouble()
+    at.join(b"w1", credit=1)
+    at.hello()
+    at.want(3)
+    assert not trouble()
+    at.fail(b"w1", reason="No such file or directory", frame=None, here=True)
+    assert "can read its videos" in trouble()
+    assert "No such file or directory" in trouble()
+    at.tick(REST_SECONDS)  # it tries again, and there is no news
+    assert "No such file or directory" in trouble()
+    at.join(b"w2", credit=1)
+    assert not trouble()
+    at.die(b"w2")
+    at.work_off(b"w1")
+    assert not trouble()
 
 
 def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:

@@ -95,7 +95,7 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
         elif what == "give up":
             table.workers.hanging(DEADLINE * 10)
         elif what == "rest":
-            table.workers.rest(identity, float(how))
+            table.workers.rest(identity, float(how), "a.mp4: not there")
         elif what == "wake":
             table.workers.wake(how + REST_SECONDS)
         resting = table.workers._resting
@@ -208,15 +208,15 @@ def test_nobody_is_added_to_a_lone_task_as_a_twin() -> None:
 
 def test_who_rests_gets_nothing_until_it_wakes() -> None:
     table = Table(a=2, b=2)
-    table.workers.rest(b"a", 5.0)
-    table.workers.rest(b"stranger", 5.0)
+    table.workers.rest(b"a", 5.0, "a.mp4: not there")
+    table.workers.rest(b"stranger", 5.0, "a.mp4: not there")
     assert (table.next(), table.next(other_than=b"b"), table.workers.for_lone_request()) == (b"b", None, b"b")
     table.workers.wake(5.0 + REST_SECONDS - 0.1)
     assert table.next(other_than=b"b") is None
     table.workers.wake(5.0 + REST_SECONDS)
     assert table.next() == b"a"
     # Another process of that name has not failed.
-    table.workers.rest(b"a", 20.0)
+    table.workers.rest(b"a", 20.0, "a.mp4: not there")
     table.workers.remove(b"a")
     table.workers.add(b"a", 2, 20.0)
     assert table.next() == b"a"

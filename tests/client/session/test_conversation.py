@@ -1,0 +1,266 @@
+"""What a consumer says, and when: by a clock that jumps to whatever is due next, without a socket."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.client.fake_server import SPEC, expected
+from v2v_client.position.state import Stream
+from v2v_client.session.connection import Connection
+from v2v_client.session.conversation import TRANSITIONS, Conversation, Event, State
+from v2v_client.session.liveness import ListeningClock, Patience
+from v2v_protocol.errors import NoWorkers, ServerLost, UsageError
+from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, Want, Welcome
+from v2v_protocol.sample import Provenance, SampleId, SampleParams
+from v2v_protocol.wire import Frames, decode, encode, encode_sample
+
+PATIENCE = Patience(timeout_seconds=60, ping_seconds=2, rewant_seconds=10)
+WELCOME = Welcome(SPEC.to_dict(), SPEC.digest, "catalogue", 1, sequences=20, credit=3)
+STREAM = Stream.of(WELCOME)
+HELLO = Hello(SPEC.to_dict(), ("voxels", "frames"), 4, 5)
+FORGOTTEN = Denied(ErrorCode.UNKNOWN_SESSION, "say Hello")
+
+
+def begun(*, welcomed: bool = True, patience: Patience = PATIENCE) -> Conversation:
+    talk = Conversation("tcp://x:1", HELLO, 0, pinned=STREAM, pinned_by="a test", patience=patience, now=0.0)
+    talk.happens(Event.OPENED, 0.0)
+    if welcomed:
+        talk.hear(WELCOME, [], 0.0)
+        talk.want([0, 1])
+        talk.outbox.clear()
+    return talk
+
+
+def said(talk: Conversation) -> list[Message]:
+    outbox, talk.outbox = talk.outbox, []
+    return outbox
+
+
+def timeline(
+    talk: Conversation, until: float, answer: Callable[[Message], Message | None] = lambda _: None
+) -> list[tuple[float, Any]]:
+    """What is done in a silence, and when."""
+    now, done = 0.0, []
+    while now < until:
+        now += talk.next_due(now)
+        try:
+            if talk.tick(now):
+                done.append((now, "anew"))
+        except ServerLost as error:
+            return [*done, (now, type(error))]
+        messages = said(talk)
+        done += [(now, type(message)) for message in messages]
+        for message in messages:
+            reply = answer(message)
+            if reply is not None:
+                talk.hear(reply, [], now)
+                done += [(now, type(message)) for message in said(talk)]
+    return done
+
+
+def pongs(message: Message) -> Message | None:
+    return Pong() if isinstance(message, Ping) else None
+
+
+def at(done: list[tuple[float, Any]], what: Any) -> list[float]:
+    return [now for now, kind in done if kind is what or kind == what]
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_state_can_be_reached_and_left() -> None:
+    assert set(TRANSITIONS) == set(State)
+    assert {state for row in TRANSITIONS.values() for state in row.values()} == set(State)
+    assert all(TRANSITIONS.values())
+
+
+@given(st.lists(st.sampled_from(Event), max_size=20))
+def test_nothing_is_asked_before_the_server_knows_us(events: list[Event]) -> None:
+    talk = Conversation("tcp://x:1", HELLO, 0, pinned=STREAM, pinned_by="a test", patience=PATIENCE, now=0.0)
+    talk.credit = 3
+    talk.want([7, 8])
+    greeted = False
+    for event in events:
+        talk.happens(event, 0.0)
+        for message in said(talk):
+            match message:
+                case Hello():
+                    greeted = talk.state is State.GREETING
+                case Want():
+                    assert greeted
+                    assert talk.state is State.WELCOMED
+                    assert message.indices == (7, 8)
+                case _:
+                    assert isinstance(message, Goodbye)
+
+
+def test_a_forgotten_session_is_opened_again_once_and_everything_is_asked_again() -> None:
+    talk = begun()
+    for _ in range(2):  # each request is denied
+        talk.hear(FORGOTTEN, [], 1.0)
+    assert [type(message) for message in said(talk)] == [Hello]
+    talk.hear(WELCOME, [], 1.0)
+    assert said(talk) == [Want(0, (0, 1))]
+
+
+# --- silence ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_dead_server_is_pinged_then_connected_anew_ever_more_rarely_then_given_up() -> None:
+    done = timeline(begun(), 100.0)
+    assert at(done, Ping) == [2, 4, 6, 8]
+    assert at(done, "anew") == [10, 30]
+    assert at(done, Hello)[0] == 10
+    assert done[-1] == (60, ServerLost)
+
+
+def test_a_server_that_only_answers_pings_is_asked_again_ever_more_rarely_and_never_given_up() -> None:
+    done = timeline(begun(), 200.0, pongs)
+    asked = [now for now in at(done, Want) if now % 10 == 0]
+    assert {10, 30, 70, 130, 190} <= set(asked)
+    assert "anew" not in [kind for _, kind in done]
+    assert done[-1][0] >= 200
+
+
+def test_hello_is_said_again_ever_more_rarely() -> None:
+    talk = begun(welcomed=False, patience=Patience(60, 2, 1000))
+    assert said(talk) == [HELLO]
+    assert at(timeline(talk, 60.0), Hello) == [2, 6, 14, 30]
+
+
+@pytest.mark.parametrize("timeout_seconds", [0.5, 2.0, 3.0])
+def test_nobody_is_given_up_unasked(timeout_seconds: float) -> None:
+    """However short the deadline is beside the time between pings: a server that is busy says nothing by itself."""
+    assert at(timeline(begun(patience=Patience(timeout_seconds)), 10.0), Ping)[0] < timeout_seconds
+
+
+# --- nobody who could -------------------------------------------------------------------------------------------------
+
+
+def test_a_server_without_workers_is_told_of_and_then_given_up(caplog: pytest.LogCaptureFixture) -> None:
+    def troubled(message: Message) -> Message | None:
+        return Pong("no worker is connected: start v2v-worker") if isinstance(message, Ping) else None
+
+    with caplog.at_level(logging.WARNING), pytest.raises(NoWorkers, match="no worker is connected: start v2v-worker"):
+        timeline_raising(begun(), troubled)
+    (warning,) = caplog.records
+    assert "no sample for 6 s, because no worker is connected" in warning.getMessage()
+
+
+def timeline_raising(talk: Conversation, answer: Callable[[Message], Message | None]) -> None:
+    now = 0.0
+    while now < 100.0:
+        now += talk.next_due(now)
+        talk.tick(now)
+        for reply in filter(None, map(answer, said(talk))):
+            talk.hear(reply, [], now)
+
+
+def test_trouble_that_passes_is_forgotten() -> None:
+    pings = 0
+
+    def sometimes(message: Message) -> Message | None:
+        nonlocal pings
+        pings += isinstance(message, Ping)
+        return Pong("no worker is connected" if pings % 10 else "") if isinstance(message, Ping) else None
+
+    assert timeline(begun(), 200.0, sometimes)[-1][0] >= 200
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0, 1e6), st.floats(0, 50))
+def test_time_spent_elsewhere_does_not_count(away: float, listened: float) -> None:
+    clock = ListeningClock(0.0)
+    clock.pause(listened)
+    clock.listen(listened + away)
+    assert clock.time(listened + away) == pytest.approx(listened, abs=1e-6)
+
+
+def test_a_time_in_which_this_process_was_stopped_does_not_count() -> None:
+    clock = ListeningClock(0.0)
+    clock.woke(1.5, due=1.0)
+    assert clock.time(1.5) == 1.5
+    clock.woke(1000.0, due=2.0)
+    assert clock.time(1000.0) == 2.0
+
+
+@pytest.mark.parametrize("name", ["timeout_seconds", "ping_seconds", "rewant_seconds"])
+def test_times_are_positive(name: str) -> None:
+    with pytest.raises(UsageError, match=name):
+        Patience(**{name: 0.0})
+
+
+# --- over queues ------------------------------------------------------------------------------------------------------
+
+
+class Queues:
+    """A link to a server in this thread, whose answers are lost until ``silent_until``; waiting passes the time."""
+
+    def __init__(self, silent_until: float = 0.0) -> None:
+        self.now = 0.0
+        self.silent_until = silent_until
+        self.connected: list[bool] = []
+        self.answers: list[Frames] = []
+        self.left = 0
+
+    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
+        self.connected.append(keep_name)
+        self.answers.clear()
+
+    def disconnect(self, *, linger_ms: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def remade(self) -> bool:
+        return False
+
+    def send(self, frames: Sequence[Any]) -> None:
+        message = decode(frames[0])
+        self.left += isinstance(message, Goodbye)
+        if self.now >= self.silent_until:
+            match message:
+                case Hello():
+                    self.answers.append(encode(WELCOME))
+                case Want():
+                    self.answers += [sample(index) for index in reversed(message.indices)]
+
+    def receive(self, seconds: float) -> Frames | None:
+        if self.answers:
+            return self.answers.pop(0)
+        self.now += seconds
+        return None
+
+
+def sample(index: int) -> Frames:
+    arrays = {name: expected(name, 5, 0, index) for name in HELLO.arrays}
+    params = SampleParams(0.2, 0.3, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
+    identity = SampleId(SPEC.digest, "catalogue", 1, 5, 0, index)
+    provenance = Provenance(identity, "a.mp4", "7:00", 0, 0, (), params, 0, 0, "h264 exact", 0)
+    return encode_sample(
+        epoch=0, index=index, arrays=arrays, provenance=provenance.to_dict(), worker="w", cpu_seconds=0.1
+    )
+
+
+@pytest.mark.parametrize(("silent_until", "made_anew"), [(0.0, 0), (25.0, 2)])
+def test_a_connection_works_over_queues_too(silent_until: float, made_anew: int) -> None:
+    """Without a socket or a thread; a silence of twenty-five seconds takes no time."""
+    link = Queues(silent_until)
+    connection = Connection("tcp://x:1", HELLO, 0, patience=PATIENCE, clock=lambda: link.now, transport=lambda _: link)
+    connection.open()
+    connection.want(range(7))
+    arrivals = [connection.receive() for _ in range(7)]
+    connection.close()
+    assert sorted(arrival.header.index for arrival in arrivals if arrival is not None) == list(range(7))
+    assert link.connected.count(True) == made_anew
+    assert link.left == 2  # to learn the layout, and at the end
