@@ -17,9 +17,9 @@ from v2v_client.delivery import deliver
 from v2v_client.loaders import require_epoch_of_ours, require_in_step_with_lightning, send_before_exit
 from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options
-from v2v_client.position.position import Consumer, Iteration, Position
+from v2v_client.position.plan import Consumer, EpochPlan
+from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, Stream
-from v2v_client.position.world import EpochPlan
 from v2v_client.session.connection import Connection
 from v2v_client.session.liveness import Patience
 from v2v_protocol.errors import StateMismatch, UsageError
@@ -147,12 +147,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
     @property
     def epoch(self) -> int:
         """The epoch that the next iteration delivers."""
-        return self._position.standing().epoch
+        return self._position.agreed().epoch
 
     @property
     def stream(self) -> Stream | None:
         """What the samples are made of: resolved spec, digests, sequences per epoch; None before the first Welcome."""
-        return self._position.standing().stream
+        return self._position.agreed().stream
 
     def describe(self) -> dict[str, Any]:
         """The stream and this consumer's part in it as plain values, for a log.
@@ -179,10 +179,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             V2VError: no server answers, or it refuses: see iterating.
         """
-        standing = self._position.standing()
-        stream = standing.stream or self._offered
+        agreed = self._position.agreed()
+        stream = agreed.stream or self._offered
         if stream is None:
-            with closing(self._connection(standing.epoch)) as connection:
+            with closing(self._connection(agreed.epoch)) as connection:
                 connection.open()
                 # Not pinned: the spacing of siblings is settled by how many loader workers iterate.
                 stream = self._offered = connection.stream
@@ -274,8 +274,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 self._position.reached(
                     begun,
                     consumer.after(stream, epoch, plan, number, seen)
-                    if begun.loader is None
-                    else consumer.in_share(stream, begun, begun.loader, done, seen),
+                    if not begun.shared
+                    else begun.after(consumer, stream, done, seen),
                     last=number == batches[-1],
                 )
                 yield batch

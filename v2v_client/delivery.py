@@ -12,7 +12,7 @@ import torch
 from v2v_client.batch import Batch
 from v2v_client.memory.buffers import BatchBuffers, BatchMemory
 from v2v_client.ordering import ReorderWindow
-from v2v_client.position.world import EpochPlan
+from v2v_client.position.plan import EpochPlan
 from v2v_client.session.connection import Connection
 from v2v_client.session.conversation import Arrival
 from v2v_protocol.messages import SampleHeader

@@ -1,9 +1,8 @@
-"""Where one copy of a dataset stands: its state, and where its next iteration begins.
+"""Where one copy of a dataset stands, and where its next iteration begins.
 
-What all copies of a dataset agree on (the original, and one in each loader worker) is in their log,
-:mod:`v2v_client.position.progress`. Here is what one of them knows beyond it: which of its iterations is the newest,
-the state after the last batch that came out of it, and how far a loader worker had come that a stateful loader
-restores.
+What all copies agree on is in :mod:`v2v_client.position.shared`. Here is what one of them knows beyond it: which of its
+iterations is the newest, the state after the last batch that came out of it, and how far a loader worker had come that
+a stateful loader restores.
 """
 
 from __future__ import annotations
@@ -14,28 +13,12 @@ from typing import Any
 
 from torch.utils.data import get_worker_info
 
-from v2v_client.position.progress import Progress, Standing
-from v2v_client.position.state import LoaderShare, ResumeState, Stream
-from v2v_client.position.world import EpochPlan, resumed
+from v2v_client.position.plan import Consumer, EpochPlan
+from v2v_client.position.shared import Agreed, Shared
+from v2v_client.position.state import ResumeState, Stream
 from v2v_protocol.errors import UsageError
 
 _NO_BATCH_YET = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Loader:
-    """The loader worker that iterates.
-
-    Attributes:
-        worker, workers: which of how many.
-        iteration: a name that the loader workers of one iteration share.
-        number: which start of that iteration this is.
-    """
-
-    worker: int
-    workers: int
-    iteration: str
-    number: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,134 +29,69 @@ class Iteration:
         number: which of this copy's.
         epoch: that it delivers.
         state: where in it; None at its beginning.
-        loader: None where no loader worker iterates.
+        beginnings: how often an epoch had been set or begun until then.
+        shared: its number among those of loader workers; 0 where none of them iterates.
+        worker, workers: which of how many loader workers; 0 of 1 where none iterates.
         done: batches of the loader worker's share that were delivered before.
-        beginnings: how often an epoch had been set or begun until then; of no use with a loader worker.
     """
 
     number: int
     epoch: int
     state: ResumeState | None
-    loader: Loader | None = None
-    done: int = _NO_BATCH_YET
     beginnings: int = 0
-
-    @property
-    def workers(self) -> int:
-        """Loader workers that share the epoch; 1 without."""
-        return 1 if self.loader is None else self.loader.workers
+    shared: int = 0
+    worker: int = 0
+    workers: int = 1
+    done: int = _NO_BATCH_YET
 
     def batches(self, plan: EpochPlan) -> range:
         """Numbers of the batches that are still to be delivered here."""
-        worker = 0 if self.loader is None else self.loader.worker
-        return plan.batches_of_worker(worker, self.workers)[self.done :]
+        return plan.batches_of_worker(self.worker, self.workers)[self.done :]
 
-
-@dataclass(frozen=True, slots=True)
-class Consumer:
-    """One rank's part in a stream: what turns places in it into states.
-
-    Attributes:
-        seed: of the stream.
-        batch_size: samples of one rank's batch.
-        rank, world_size: which of how many.
-    """
-
-    seed: int
-    batch_size: int
-    rank: int
-    world_size: int
-
-    def plan(self, stream: Stream, state: ResumeState | None) -> EpochPlan:
-        """The batches of an epoch from ``state`` on; from its beginning without."""
-        origin, position = (0, 0) if state is None else (state.origin, state.position)
-        return EpochPlan(stream.sequences, self.world_size, self.rank, self.batch_size, origin, position)
-
-    def beginning(self, stream: Stream | None, epoch: int) -> ResumeState:
-        """The state before an epoch."""
-        return ResumeState(stream, self.seed, epoch, 0, 0, self.world_size)
-
-    def after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
-        """The rank's state after a batch; after the last one, that is the beginning of the next epoch."""
-        if batch + 1 == plan.batches:
-            return self.beginning(stream, epoch + 1)
-        position = plan.position_after(batch)
-        return ResumeState(stream, self.seed, epoch, plan.origin, position, plan.world_size, quarantine=quarantine)
-
-    def in_share(
-        self, stream: Stream | None, begun: Iteration, loader: Loader, done: int, quarantine: int | None = None
-    ) -> ResumeState:
-        """The state of a loader worker that has delivered ``done`` batches of its share."""
-        origin, position = (0, 0) if begun.state is None else (begun.state.origin, begun.state.position)
-        share = LoaderShare(loader.worker, loader.workers, self.batch_size, done)
-        return ResumeState(stream, self.seed, begun.epoch, origin, position, self.world_size, share, quarantine)
-
-    def rest(self, saved: ResumeState) -> ResumeState:
-        """A saved state under this world size; its epoch may hold no whole global batch any more."""
-        origin, position = resumed(
-            origin=saved.origin,
-            position=saved.position,
-            saved_world_size=saved.world_size,
-            world_size=self.world_size,
-        )
-        return dataclasses.replace(saved, origin=origin, position=position, world_size=self.world_size)
-
-    def taken_up(self, saved: ResumeState) -> ResumeState:
-        """A saved state under this world size; where nothing but what an epoch drops is left, the next epoch."""
-        state = self.rest(saved)
-        begun = state.position + state.origin > 0
-        if begun and state.stream is not None and self.plan(state.stream, state).batches == 0:
-            return dataclasses.replace(state, epoch=state.epoch + 1, origin=0, position=0, share=None)
-        return state
-
-    def require_share(self, state: ResumeState, loader: Any) -> None:
-        """
-        Args:
-            loader: PyTorch's description of the loader worker that this process is; None if it is none.
-
-        Raises:
-            UsageError: the state is that of a loader worker, and not of this one.
-        """
-        share = state.share
-        here = None if loader is None else (loader.id, loader.num_workers, self.batch_size, self.world_size)
-        if share is None or here == (share.worker, share.workers, share.batch_size, state.world_size):
-            return
-        raise UsageError(
-            f"this is the state of loader worker {share.worker} of {share.workers} (batch_size {share.batch_size}, "
-            f"world size {state.world_size}); only the same worker of an equal loader can go on from it. "
-            "Batch.resume_state holds for any number of loader workers"
+    def after(self, consumer: Consumer, stream: Stream | None, done: int, quarantine: int | None = None) -> ResumeState:
+        """The state of its loader worker, which has delivered ``done`` batches of its share."""
+        return consumer.in_share(
+            stream,
+            self.epoch,
+            self.state,
+            worker=self.worker,
+            workers=self.workers,
+            done=done,
+            quarantine=quarantine,
         )
 
 
 class Position:
-    """Where this copy stands. A shallow copy shares the log, and moves on by itself."""
+    """Where this copy stands. A shallow copy shares the record, and moves on by itself."""
 
     def __init__(self, epoch: int) -> None:
-        self._progress = Progress(epoch)
+        self._shared = Shared(epoch)
         self._iterations = 0
-        self._here: ResumeState | None = None  # after the last batch of this process; None where the log says
+        self._here: ResumeState | None = None  # after the last batch of this process; None where the record says
         self._loaded: ResumeState | None = None  # of this loader worker, from a stateful loader
+        self._to_start_from: ResumeState | None = None  # the same, until it iterates
         self._empty_rest: ResumeState | None = None  # what was loaded, where the next epoch was taken up instead
 
-    def standing(self) -> Standing:
+    def agreed(self) -> Agreed:
         """What the copies agree on now."""
-        return self._progress.standing()
+        return self._shared.agreed()
 
     def set_epoch(self, epoch: int) -> None:
         """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded."""
-        standing, rest = self.standing(), self._empty_rest
-        state = standing.state if standing.epoch == epoch else None
-        if rest is not None and rest.epoch == epoch and self._is_at_the_beginning_of(epoch + 1, standing):
-            # Whoever loads a state and then names its epoch has had these samples: all of them, but for a rest.
-            state = rest
-        self._progress.set(epoch, state)
+        with self._shared.change() as agreed:
+            state, rest = agreed.state if agreed.epoch == epoch else None, self._empty_rest
+            if rest is not None and rest.epoch == epoch and self._is_at_the_beginning_of(epoch + 1, agreed):
+                # Whoever loads a state and then names its epoch has had these samples: all of them, but for a rest.
+                state = rest
+            agreed.begin(epoch, state)
+            agreed.stale = False
         self._here = None
 
-    def _is_at_the_beginning_of(self, epoch: int, standing: Standing) -> bool:
+    def _is_at_the_beginning_of(self, epoch: int, agreed: Agreed) -> bool:
         """Whether a state was loaded that begins there, and no batch has come out since."""
-        return not standing.stale and all(
+        return not agreed.stale and all(
             state is not None and (state.epoch, state.origin, state.position) == (epoch, 0, 0)
-            for state in (self._here, standing.state)
+            for state in (self._here, agreed.state)
         )
 
     def state(self, consumer: Consumer) -> ResumeState:
@@ -184,13 +102,13 @@ class Position:
         """
         if self._here is not None and get_worker_info() is not None:
             return self._here
-        standing = self.standing()
-        if standing.stale:
+        agreed = self.agreed()
+        if agreed.stale:
             raise UsageError(
                 "state_dict: the batches went through DataLoader workers, and this process does not know which of them "
                 "were used; save Batch.resume_state of the last batch you trained on instead"
             )
-        return self._here or standing.state or consumer.beginning(standing.stream, standing.epoch)
+        return self._here or agreed.state or consumer.beginning(agreed.stream, agreed.epoch)
 
     def load(self, saved: ResumeState, consumer: Consumer) -> None:
         """The next iteration begins where ``saved`` was taken.
@@ -201,34 +119,43 @@ class Position:
         loader = get_worker_info()
         consumer.require_share(saved, loader)
         state = consumer.taken_up(saved)
-        shared = dataclasses.replace(state, share=None)
-        if loader is None:
-            self._progress.set(state.epoch, shared)
-            self._empty_rest = consumer.rest(saved) if state.epoch > saved.epoch else None
-        else:
-            self._progress.set(state.epoch, shared, iteration=self._name(loader), worker=loader.id)
-            self._loaded = state
         self._here = state
+        if loader is not None:
+            self._loaded = self._to_start_from = state
+            return
+        self._empty_rest = consumer.rest(saved) if state.epoch > saved.epoch else None
+        with self._shared.change() as agreed:
+            agreed.begin(state.epoch, dataclasses.replace(state, share=None))
+            agreed.stale = False
 
     def begin(self, consumer: Consumer) -> Iteration:
         """A new iteration; older ones say nothing about where we are from now on."""
         self._iterations += 1
         worker = get_worker_info()
         if worker is None:
-            self._progress.main()
-            standing = self.standing()
-            self._here = standing.state or consumer.beginning(standing.stream, standing.epoch)
-            return Iteration(self._iterations, standing.epoch, standing.state, beginnings=standing.beginnings)
-        name = self._name(worker)
-        number, epoch, state = self._progress.start(name, worker.id)
-        loader = Loader(worker.id, worker.num_workers, name, number)
-        begun = Iteration(self._iterations, epoch, state, loader, self._already_done(epoch, state))
-        known = None if state is None else state.stream
-        if known is not None and not begun.batches(consumer.plan(known, state)) and begun.done > 0:
+            with self._shared.change() as agreed:
+                agreed.stale = False
+            self._here = agreed.state or consumer.beginning(agreed.stream, agreed.epoch)
+            return Iteration(self._iterations, agreed.epoch, agreed.state, agreed.beginnings)
+        with self._shared.change() as agreed:
+            shared = agreed.start(self._name(worker), worker.id, self._to_start_from)
+        self._to_start_from = None
+        begun = Iteration(
+            self._iterations,
+            shared.epoch,
+            shared.state,
+            shared.beginnings,
+            shared.number,
+            worker.id,
+            worker.num_workers,
+            self._already_done(shared.epoch, shared.state),
+        )
+        known = None if shared.state is None else shared.state.stream
+        if known is not None and not begun.batches(consumer.plan(known, shared.state)) and begun.done > 0:
             # A stateful loader may discard this iterator unused; the epoch is over all the same.
             self.finish(begun, consumer)
         else:
-            self._here = consumer.in_share(self.standing().stream, begun, loader, begun.done)
+            self._here = begun.after(consumer, agreed.stream, begun.done)
         return begun
 
     def _name(self, worker: Any) -> str:
@@ -249,10 +176,9 @@ class Position:
         Raises:
             StateMismatch: a loader worker beside us was offered another one first.
         """
-        self._progress.pin(stream)
-        first = self.standing().stream
-        if first is not None:
-            first.require_same(stream, ours="another loader worker", theirs=address)
+        with self._shared.change() as agreed:
+            first = agreed.stream = agreed.stream or stream
+        first.require_same(stream, ours="another loader worker", theirs=address)
 
     def reached(self, begun: Iteration, state: ResumeState, *, last: bool) -> None:
         """A batch comes out of an iteration now.
@@ -271,11 +197,11 @@ class Position:
         if begun.number != self._iterations:
             return
         self._finish(begun)
-        self._here = None if begun.loader is None else consumer.beginning(self.standing().stream, begun.epoch + 1)
+        self._here = consumer.beginning(self.agreed().stream, begun.epoch + 1) if begun.shared else None
 
     def _finish(self, begun: Iteration) -> None:
-        loader = begun.loader
-        if loader is not None:
-            self._progress.finish(loader.iteration, loader.number, loader.worker, loader.workers)
-        elif self.standing().beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
-            self._progress.set(begun.epoch + 1, None)
+        with self._shared.change() as agreed:
+            if begun.shared:
+                agreed.finish(begun.shared, begun.worker, begun.workers)
+            elif agreed.beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
+                agreed.begin(begun.epoch + 1, None)

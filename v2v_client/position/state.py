@@ -126,7 +126,7 @@ class ResumeState:
     Attributes:
         stream: what the samples are made of; None before the first connection.
         seed, epoch: of the samples to come.
-        origin, position, world_size: see :mod:`v2v_client.position.world`.
+        origin, position, world_size: see :mod:`v2v_client.position.plan`.
         share: None for the state of a rank, which any number of loader workers can take up.
         quarantine: number of the quarantine snapshot to go on under; None for the server's newest.
     """

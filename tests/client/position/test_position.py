@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from v2v_client.position.position import Consumer, Iteration, Loader, Position
+from v2v_client.position.plan import Consumer
+from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, Stream
 from v2v_protocol.errors import UsageError
 
@@ -43,9 +44,7 @@ def test_a_rest_without_a_global_batch_is_the_next_epoch() -> None:
     "here", [None, SimpleNamespace(id=0, num_workers=2), SimpleNamespace(id=1, num_workers=3)], ids=str
 )
 def test_a_share_belongs_to_one_loader_worker(here: object) -> None:
-    begun = Iteration(1, 0, None, Loader(1, 2, "name", 1))
-    assert begun.loader is not None
-    state = ALONE.in_share(STREAM, begun, begun.loader, 2)
+    state = Iteration(1, 0, None, shared=1, worker=1, workers=2).after(ALONE, STREAM, done=2)
     ALONE.require_share(state, SimpleNamespace(id=1, num_workers=2))
     ALONE.require_share(ALONE.beginning(STREAM, 0), here)
     with pytest.raises(UsageError, match="loader worker 1 of 2"):

@@ -14,8 +14,11 @@ What is left after the last whole global batch of W b samples is dropped; a shuf
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
+from v2v_client.position.state import LoaderShare, ResumeState, Stream
 from v2v_protocol.errors import UsageError
 
 
@@ -116,3 +119,87 @@ def resumed(*, origin: int, position: int, saved_world_size: int, world_size: in
     if world_size == saved_world_size:
         return origin, position
     return origin + position * saved_world_size, 0
+
+
+@dataclass(frozen=True, slots=True)
+class Consumer:
+    """One rank's part in a stream: what turns places in it into states.
+
+    Attributes:
+        seed: of the stream.
+        batch_size: samples of one rank's batch.
+        rank, world_size: which of how many.
+    """
+
+    seed: int
+    batch_size: int
+    rank: int
+    world_size: int
+
+    def plan(self, stream: Stream, state: ResumeState | None) -> EpochPlan:
+        """The batches of an epoch from ``state`` on; from its beginning without."""
+        origin, position = (0, 0) if state is None else (state.origin, state.position)
+        return EpochPlan(stream.sequences, self.world_size, self.rank, self.batch_size, origin, position)
+
+    def beginning(self, stream: Stream | None, epoch: int) -> ResumeState:
+        """The state before an epoch."""
+        return ResumeState(stream, self.seed, epoch, 0, 0, self.world_size)
+
+    def after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
+        """The rank's state after a batch; after the last one, that is the beginning of the next epoch."""
+        if batch + 1 == plan.batches:
+            return self.beginning(stream, epoch + 1)
+        position = plan.position_after(batch)
+        return ResumeState(stream, self.seed, epoch, plan.origin, position, plan.world_size, quarantine=quarantine)
+
+    def in_share(
+        self,
+        stream: Stream | None,
+        epoch: int,
+        begun: ResumeState | None,
+        *,
+        worker: int,
+        workers: int,
+        done: int,
+        quarantine: int | None = None,
+    ) -> ResumeState:
+        """The state of a loader worker that has delivered ``done`` batches of its share since ``begun``."""
+        origin, position = (0, 0) if begun is None else (begun.origin, begun.position)
+        share = LoaderShare(worker, workers, self.batch_size, done)
+        return ResumeState(stream, self.seed, epoch, origin, position, self.world_size, share, quarantine)
+
+    def rest(self, saved: ResumeState) -> ResumeState:
+        """A saved state under this world size; its epoch may hold no whole global batch any more."""
+        origin, position = resumed(
+            origin=saved.origin,
+            position=saved.position,
+            saved_world_size=saved.world_size,
+            world_size=self.world_size,
+        )
+        return dataclasses.replace(saved, origin=origin, position=position, world_size=self.world_size)
+
+    def taken_up(self, saved: ResumeState) -> ResumeState:
+        """A saved state under this world size; where nothing but what an epoch drops is left, the next epoch."""
+        state = self.rest(saved)
+        begun = state.position + state.origin > 0
+        if begun and state.stream is not None and self.plan(state.stream, state).batches == 0:
+            return dataclasses.replace(state, epoch=state.epoch + 1, origin=0, position=0, share=None)
+        return state
+
+    def require_share(self, state: ResumeState, loader: Any) -> None:
+        """
+        Args:
+            loader: PyTorch's description of the loader worker that this process is; None if it is none.
+
+        Raises:
+            UsageError: the state is that of a loader worker, and not of this one.
+        """
+        share = state.share
+        here = None if loader is None else (loader.id, loader.num_workers, self.batch_size, self.world_size)
+        if share is None or here == (share.worker, share.workers, share.batch_size, state.world_size):
+            return
+        raise UsageError(
+            f"this is the state of loader worker {share.worker} of {share.workers} (batch_size {share.batch_size}, "
+            f"world size {state.world_size}); only the same worker of an equal loader can go on from it. "
+            "Batch.resume_state holds for any number of loader workers"
+        )

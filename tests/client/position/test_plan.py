@@ -2,7 +2,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from v2v_client.position.world import EpochPlan, resumed
+from v2v_client.position.plan import EpochPlan, resumed
 from v2v_protocol.errors import UsageError
 
 SEQUENCES = st.integers(0, 300)
