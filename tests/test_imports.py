@@ -21,8 +21,17 @@ FORBIDDEN: dict[str, set[str]] = {
 PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
-def imported(source: str) -> set[str]:
-    """Top-level names of everything a module imports, wherever in it: statements, and import_module("...") calls."""
+FLOORS = (
+    "system", "video", "config", "simulation", "flow", "store", "catalogue", "schedule", "broker", "worker",
+    "supervise", "console", "offline", "prepare", "serve", "commands",
+)  # fmt: skip
+"""The rooms of the server, from the ground up: each imports only from itself and from those before it."""
+DEBTS = {("store", "catalogue"), ("store", "prepare")}
+"""Imports that run back up, to be paid."""
+
+
+def imported_modules(source: str) -> set[str]:
+    """Full names of everything a module imports, wherever in it: statements, and import_module("...") calls."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -34,7 +43,12 @@ def imported(source: str) -> set[str]:
             called = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
             if called in ("import_module", "__import__"):
                 names.add(str(node.args[0].value))
-    return {name.split(".")[0] for name in names}
+    return names
+
+
+def imported(source: str) -> set[str]:
+    """The top-level names of these."""
+    return {name.split(".")[0] for name in imported_modules(source)}
 
 
 def modules(package: str) -> list[Path]:
@@ -73,6 +87,34 @@ def test_packages_keep_apart(package: str) -> None:
         if path.name == "in_process.py":
             crossed -= {"v2v_server"}  # the one door, opened when it is used
         assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
+
+
+def test_no_import_of_the_server_runs_back_up() -> None:
+    upward: set[tuple[str, str]] = set()
+    for path in modules("v2v_server"):
+        room = path.relative_to(ROOT / "v2v_server").parts[0].removesuffix(".py")
+        if room.startswith("__"):
+            continue
+        for name in imported_modules(path.read_text(encoding="utf-8")):
+            package, _, rest = name.partition(".")
+            other = rest.split(".")[0]
+            if package == "v2v_server" and FLOORS.index(other) > FLOORS.index(room):
+                upward.add((room, other))
+    assert upward == DEBTS
+
+
+def test_the_server_is_a_house_of_small_rooms() -> None:
+    server = ROOT / "v2v_server"
+    assert len(list(server.glob("*.py"))) <= 6
+    for folder in server.rglob("*/"):
+        assert len(list(folder.glob("*.py"))) <= 14, folder
+
+
+@pytest.mark.parametrize("room", ["broker", "console", "schedule", "supervise", "system", "worker"])
+def test_a_room_has_a_map_of_its_files(room: str) -> None:
+    folder = ROOT / "v2v_server" / room
+    on_the_map = {line.split()[0] for line in (folder / "__init__.py").read_text(encoding="utf-8").splitlines()[2:-1]}
+    assert on_the_map == {path.stem for path in folder.glob("*.py")} - {"__init__"}
 
 
 def test_imports_are_absolute() -> None:

@@ -240,7 +240,7 @@ class Lease:
         start_frame: first frame of the sequence.
         frame_index: ``FrameIndex.to_bytes()`` of at least the part of the file that is needed.
         candidate: which candidate of the index this is.
-        refusals: candidates passed over before, as ``Refusal`` fields: {"refusals": [...]}.
+        refusals: candidates passed over before, as ``Refusal.to_dict()`` says them: {"refusals": [...]}.
         deadline_seconds: a worker silent for longer than this is taken for hung.
         quarantine: number of the quarantine snapshot that let the candidate pass.
         scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe, effect_settings
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.settings import require_whole
 
 LARGEST_SEED = 2**64 - 1
@@ -105,20 +106,6 @@ class SampleParams:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
-    """A candidate that was passed over for an index: which video, where, why."""
-
-    candidate: int
-    video: str
-    frame: int | None
-    reason: str
-
-    def __str__(self) -> str:
-        where = "" if self.frame is None else f" at frame {self.frame}"
-        return f"{self.video}{where}: {self.reason}"
-
-
-@dataclass(frozen=True, slots=True)
 class Provenance:
     """Where a sample came from: enough to make it again and to explain it. Deterministic: no clock, no host.
 
@@ -128,7 +115,7 @@ class Provenance:
         fingerprint: size and hash of the source file.
         start_frame: first frame of the sequence, presentation order.
         candidate: 0, or which substitute of the index this is.
-        refusals: the candidates passed over before it.
+        refusals: of the candidates passed over before it, in their order.
         params: the draw.
         saturated_bins: voxel bins whose count did not fit the dtype and were clipped.
         irregular_timestamps: steps whose time stamps were missing or not increasing (noise per second used the
@@ -155,7 +142,7 @@ class Provenance:
         """Plain values, as they travel in the sample's header; ``scene`` only where there is something to say."""
         values = _fields(self) | {
             "id": _fields(self.id),
-            "refusals": tuple(map(_fields, self.refusals)),
+            "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
         if not self.scene:

@@ -11,12 +11,12 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
@@ -132,6 +132,7 @@ class Server:
         supervisor: has the workers' processes.
         quarantine: the snapshots.
         quarantine_file: where verdicts are written down.
+        clock: gives the time, seconds.
     """
 
     def __init__(
@@ -143,6 +144,7 @@ class Server:
         supervisor: Supervisor,
         quarantine: Quarantine,
         quarantine_file: Path,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._config = config
         self._catalogue = catalogue
@@ -151,7 +153,7 @@ class Server:
         self._supervisor = supervisor
         self._quarantine = quarantine
         self._quarantine_file = quarantine_file
-        self._clock = Clock()
+        self._clock = clock or Clock()
         self._next_tick = self._clock()
         self._status = StatusLine(sys.stderr)
         self._announced = False
@@ -206,7 +208,7 @@ class Server:
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
-                case Record() as record:
+                case Condemn() as record:
                     # Before anything that follows is sent.
                     todo.extendleft(reversed(dispatcher.recorded(record, self._record(record.verdict), now())))
                 case LookFor() as missing:

@@ -10,8 +10,9 @@ import numpy as np
 
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
@@ -31,7 +32,7 @@ class NamedCorpus:
 
     videos: tuple[VideoEntry, ...]
     rows: Rows = field(default_factory=Rows)
-    problems: tuple[Problem, ...] = ()
+    refusals: tuple[Refusal, ...] = ()
     root: Path = Path("/corpus")
     digest: str = "c" * 32
     unreadable: frozenset[str] = frozenset()

@@ -25,10 +25,11 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
-from v2v_protocol.sample import Refusal, array_layout, layout_bytes
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, Verdict
@@ -143,7 +144,7 @@ class Peers:
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
                     todo.extend(self.dispatcher.worker_lost(identity, Loss(cause, reason), self.now))
-                case Record() as record:
+                case Condemn() as record:
                     self.sent.append(("record", record.verdict))
                     todo.extendleft(reversed(self.dispatcher.recorded(record, self._write(record.verdict), self.now)))
                 case PassOver(refusal):

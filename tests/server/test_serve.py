@@ -13,10 +13,10 @@ import pytest
 from tests.server.queues import Queues, ToySupervisor
 from v2v_protocol.errors import VideoChanged
 from v2v_protocol.messages import Pong, Stop
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
-from v2v_server.broker.actions import Action, GiveUp, LookFor, PassOver, Record, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
@@ -27,7 +27,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.serve import Server, question_workers
 
 VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
-RECORD = Record(VERDICT, Request(b"c", 0, 0))
+RECORD = Condemn(VERDICT, Request(b"c", 0, 0))
 
 
 class Scripted:
@@ -47,7 +47,7 @@ class Scripted:
         said, self.first = self.first, []
         return said
 
-    def recorded(self, record: Record, written: list[Verdict], now: float) -> list[Action]:
+    def recorded(self, record: Condemn, written: list[Verdict], now: float) -> list[Action]:
         self.told.append(("recorded", record, written))
         return list(self.after_record)
 
@@ -115,7 +115,7 @@ def test_what_is_looked_for_is_reported(
         if not found:
             raise VideoChanged("a.mp4", None, "another file")
 
-    monkeypatch.setattr(serve_module, "check_fingerprint", check)
+    monkeypatch.setattr(serve_module, "check_file", check)
     missing = LookFor("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
     dispatcher = Scripted([missing, missing])
     served(dispatcher, tmp_path)
@@ -160,7 +160,7 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool,
 
 
 def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    served(Scripted([PassOver(Refusal(0, "a.mp4", 7, "cut short"))]), tmp_path)
+    served(Scripted([PassOver(Refusal("a.mp4", 7, "cut short"))]), tmp_path)
     assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
 
 

@@ -32,7 +32,8 @@ import numpy.typing as npt
 
 from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import Provenance, Refusal
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Provenance
 
 
 @dataclass(frozen=True, slots=True)

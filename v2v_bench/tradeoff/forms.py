@@ -107,7 +107,7 @@ def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> No
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
     if not table.count:
         raise CorpusError(f"--videos {catalogue.root}: no video gives a sequence of {spec.recipe.frames_needed} frames")
-    unusable = {rejection.video for rejection in table.rejections}
+    unusable = {refusal.video for refusal in table.refusals}
     distinct = {video.fingerprint: video for video in reversed(catalogue.videos) if video.id not in unusable}
     folder.mkdir(parents=True)
     for number, video in enumerate(sorted(distinct.values(), key=lambda video: video.id)[:most]):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from v2v_protocol.messages import Denied, ErrorCode
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict
@@ -42,7 +42,7 @@ class GiveUp:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class Condemn:
     """Write this verdict down before anything that follows is sent, and report what came of it.
 
     Attributes:
@@ -80,7 +80,7 @@ class PassOver:
     refusal: Refusal
 
 
-Action: TypeAlias = ToConsumer | ToWorker | GiveUp | Record | LookFor | PassOver
+Action: TypeAlias = ToConsumer | ToWorker | GiveUp | Condemn | LookFor | PassOver
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

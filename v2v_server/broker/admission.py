@@ -154,11 +154,7 @@ class Admission:
         if table is None:
             table = SequenceTable(self._catalogue.videos, self._catalogue.rows, spec)
             if not table.count:
-                first = table.rejections[0]
-                raise UsageError(
-                    f"none of the {len(table.rejections)} videos gives a sequence; {first.video}: {first.reason} "
-                    f"(would admit it: {first.remedy})"
-                )
+                raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
             while len(self._tables) >= MOST_TABLES:
                 del self._tables[next(iter(self._tables))]
             self._tables[geometry] = table

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from v2v_protocol.messages import Unavailable
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.wire import encode
-from v2v_server.broker.actions import Action, PassOver, Record, ToConsumer
+from v2v_server.broker.actions import Action, Condemn, PassOver, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
@@ -73,7 +73,7 @@ class Candidates:
         sequence = self.sequence(session, request)
         video, text = sequence.video, reason[:LONGEST_REASON]
         return [
-            Record(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), request)
+            Condemn(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), request)
         ]
 
     def refuse_condemned(self, request: Request, reason: str) -> list[Action]:
@@ -87,31 +87,34 @@ class Candidates:
         self._sessions.put_back(replace(request, deaths=0))
         return []
 
-    def refuse(self, request: Request, frame: int | None, reason: str, *, log: bool = True) -> list[Action]:
+    def refuse(
+        self, request: Request, frame: int | None, reason: str, kind: RefusalKind = RefusalKind.FAILED
+    ) -> list[Action]:
         """The request's candidate cannot be used: on to the next, or to the consumer with the whole story."""
         session = self._sessions.get(request.session)
         if session is None:
             return []
         self._counters.refused_candidates += 1
-        passed_over = next_candidate(request, self.sequence(session, request).video.id, frame, reason)
-        actions: list[Action] = [PassOver(passed_over.refusals[-1])] if log else []
+        refusal = Refusal(self.sequence(session, request).video.id, frame, reason, kind)
+        passed_over = next_candidate(request, refusal)
+        # What the quarantine refuses is no news to the operator.
+        actions: list[Action] = [PassOver(passed_over.refusals[-1])] if kind != RefusalKind.QUARANTINED else []
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions
         if not self._sessions.answered(request, 0.0):
             return actions
         self._counters.unavailable += 1
-        text = "; ".join(map(str, passed_over.refusals))
+        text = "; ".join(dict.fromkeys(map(str, passed_over.refusals)))
         return [*actions, ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
 
 
-def next_candidate(request: Request, video: str, frame: int | None, reason: str) -> Request:
+def next_candidate(request: Request, refusal: Refusal) -> Request:
     """The request at its next candidate.
 
     Args:
         request: at the one that is refused.
-        video: id of that candidate's video.
-        frame, reason: what is wrong with it, see :class:`v2v_protocol.sample.Refusal`.
+        refusal: of that candidate's video.
     """
-    refused = Refusal(request.candidate, video, frame, reason[:LONGEST_REASON])
-    return replace(request, candidate=request.candidate + 1, refusals=(*request.refusals, refused))
+    refusal = replace(refusal, reason=refusal.reason[:LONGEST_REASON])
+    return replace(request, candidate=request.candidate + 1, refusals=(*request.refusals, refusal))

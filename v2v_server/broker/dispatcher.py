@@ -30,10 +30,11 @@ from v2v_protocol.messages import (
     Want,
     WorkerHello,
 )
+from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, Frames, decode, encode
-from v2v_server.broker.actions import Action, GiveUp, LookFor, Record, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
@@ -205,8 +206,8 @@ class Dispatcher:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
-    def recorded(self, record: Record, written: Sequence[Verdict], now: float) -> list[Action]:
-        """What came of a :class:`Record`.
+    def recorded(self, record: Condemn, written: Sequence[Verdict], now: float) -> list[Action]:
+        """What came of a :class:`Condemn`.
 
         Args:
             record: the action.
@@ -365,7 +366,7 @@ class Dispatcher:
             if quarantined is None:
                 good.append(current)
             else:
-                actions += self._candidates.refuse(current, None, quarantined, log=False)
+                actions += self._candidates.refuse(current, None, quarantined, RefusalKind.QUARANTINED)
         for place, request in enumerate(good):
             actions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
         return actions

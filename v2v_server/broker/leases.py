@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from v2v_protocol.arena import Slot
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal
 
 SLOW_FACTOR = 3.0
 """A lease in work for this many times the median of its session's decoded clips is slow."""

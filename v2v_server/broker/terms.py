@@ -8,7 +8,6 @@ consumer's.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import abc
 from typing import Any
@@ -78,7 +77,7 @@ def lease_for(
         frame_index=catalogue.frame_index_bytes(video.id, sequence.start_frame, spec.recipe.frames_needed),
         candidate=request.candidate,
         quarantine=request.snapshot,
-        refusals={"refusals": [dataclasses.asdict(refusal) for refusal in request.refusals]},
+        refusals={"refusals": [refusal.to_dict() for refusal in request.refusals]},
         deadline_seconds=deadline_seconds,
         scene=scene,
         arena="" if request.slot is None else request.slot.arena,

@@ -21,7 +21,7 @@ _MOST_STALE = 64
 
 
 @dataclass(slots=True)
-class _Worker:
+class _Member:
     credit: int
     liveness: Liveness
     given_up: bool = False
@@ -37,7 +37,7 @@ class Workers:
 
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
-        self._workers: dict[bytes, _Worker] = {}
+        self._workers: dict[bytes, _Member] = {}
         self._resting: dict[bytes, float] = {}  # until when
         # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
         self._changed: set[bytes] = set()
@@ -57,7 +57,7 @@ class Workers:
 
     def add(self, identity: bytes, credit: int, now: float) -> None:
         """A worker said hello."""
-        self._workers[identity] = _Worker(
+        self._workers[identity] = _Member(
             max(1, min(credit, MOST_WORKER_CREDIT)), Liveness(now, gone_seconds=SILENCE_SECONDS)
         )
         self._changed.add(identity)

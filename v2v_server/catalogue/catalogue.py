@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
+from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_server.catalogue.files import (
     UNPRINTABLE,
     VIDEO_SUFFIXES,
@@ -63,14 +64,6 @@ class VideoEntry:
     runs: tuple[tuple[int, int], ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A file, folder or line of the list that gives no video, and why."""
-
-    id: str
-    reason: str
-
-
 @dataclass(frozen=True)
 class Catalogue:
     """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
@@ -79,7 +72,7 @@ class Catalogue:
         root: the folder that ids are relative to, resolved.
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
-        problems: what could not be taken in, by id.
+        refusals: files, folders and lines of the list that give no video, by id.
         notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
         prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare.prepare`). Its videos
@@ -91,7 +84,7 @@ class Catalogue:
     root: Path
     rows: Rows
     videos: tuple[VideoEntry, ...]
-    problems: tuple[Problem, ...]
+    refusals: tuple[Refusal, ...]
     notes: tuple[str, ...]
     digest: str
     prepared: Header | None
@@ -347,7 +340,7 @@ def _snapshot(
         root=root,
         rows=rows,
         videos=tuple(videos),
-        problems=tuple(Problem(id, problems[id]) for id in sorted(problems)),
+        refusals=tuple(Refusal(id, None, problems[id], RefusalKind.UNUSABLE) for id in sorted(problems)),
         notes=tuple(notes),
         digest=digest,
         prepared=None if manifest is None else manifest.header,

@@ -118,8 +118,10 @@ def _run(arguments: argparse.Namespace) -> int:
     for line in summary(report, encoding, time.monotonic() - started):
         print(line)
     if arguments.json is not None:
-        problems = (*report.not_looked_at, *report.unusable)
-        records = [asdict(video) for video in report.videos] + [asdict(problem) for problem in problems]
+        refused = (*report.not_looked_at, *report.unusable)
+        records = [asdict(video) for video in report.videos] + [
+            {"id": one.video, "reason": one.reason} for one in refused
+        ]
         write_json(arguments.json, records)
     return 0 if report.complete else FAILED
 
@@ -175,9 +177,9 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
         "have no statistics of their scenes (their files stay):",
-        [(problem.id, problem.reason) for problem in report.not_looked_at],
+        [(problem.video, problem.reason) for problem in report.not_looked_at],
     )
-    lines += _listed("cannot be used at all:", [(problem.id, problem.reason) for problem in report.unusable])
+    lines += _listed("cannot be used at all:", [(problem.video, problem.reason) for problem in report.unusable])
     return lines
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_server.catalogue.files import corpus_root
-from v2v_server.worker.conversation import run_worker, unshared_name
+from v2v_server.worker.process import run_worker, unshared_name
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TextIO
 
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.catalogue.catalogue import Catalogue
@@ -35,18 +36,17 @@ def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, lis
         lines.append(
             f"scene {spec.scene}: {cut} videos have cuts or empty parts; {table.spoilt} sequences are left out or moved"
         )
-    if table.rejections:
-        lines.append(f"{len(table.rejections)} videos give none under the server's own recipe:")
-        refused = [f"{one.video}: {one.reason}; would admit it: {one.remedy}" for one in table.rejections]
-        lines += _listed(refused, list_refused)
+    if table.refusals:
+        lines.append(f"{len(table.refusals)} videos give none under the server's own recipe:")
+        lines += _listed(table.refusals, list_refused)
         lines += _shorter_clips(table)
-    if catalogue.problems:
-        lines.append(f"{len(catalogue.problems)} files cannot be used at all:")
-        lines += _listed([f"{problem.id}: {problem.reason}" for problem in catalogue.problems], list_refused)
+    if catalogue.refusals:
+        lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")
+        lines += _listed(catalogue.refusals, list_refused)
     return lines
 
 
-def _listed(refused: Sequence[str], all_of_them: bool) -> list[str]:
+def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
     shown = refused if all_of_them else refused[:_SHOWN]
     rest = len(refused) - len(shown)
     return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
@@ -54,8 +54,7 @@ def _listed(refused: Sequence[str], all_of_them: bool) -> list[str]:
 
 def _shorter_clips(table: SequenceTable) -> list[str]:
     """How many of the videos that are too short a shorter clip would admit: half of them, and all."""
-    longest = sorted((rejection.voxels_per_clip for rejection in table.rejections), reverse=True)
-    longest = [voxels for voxels in longest if voxels]
+    longest = sorted(table.longest_clips, reverse=True)
     if not longest:
         return []
     choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))

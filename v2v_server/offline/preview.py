@@ -123,13 +123,12 @@ def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
         table = SequenceTable(catalogue.videos, catalogue.rows, stream)
         if table.count:
             return recipe
-        longest = max(rejection.voxels_per_clip for rejection in table.rejections)
+        longest = max(table.longest_clips, default=0)
         if longest:
             recipe = recipe.replace(voxels_per_clip=longest)
         elif min(recipe.crop_height_px, recipe.crop_width_px) * 3 // 4 >= _SMALLEST_CROP_PX:
             smaller = (side * 3 // 4 for side in (recipe.crop_height_px, recipe.crop_width_px))
             recipe = recipe.replace(**dict(zip(("crop_height_px", "crop_width_px"), smaller, strict=True)))
         else:
-            first = table.rejections[0]
-            raise CorpusError(f"no video can be shown: {first.video}: {first.reason}")
+            raise CorpusError(f"no video can be shown: {table.refusals[0]}")
         stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": recipe})

@@ -14,6 +14,7 @@ from v2v_pictures.camera import Camera, check_drawable
 from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.candidates import next_candidate
@@ -60,10 +61,7 @@ class Remaker:
         self._quarantine, self._snapshot = quarantine or Quarantine(), snapshot
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
-            story = "; ".join(
-                f"{item.video}: {item.reason} (would admit it: {item.remedy})" for item in table.rejections[:3]
-            )
-            raise CorpusError(f"no video gives a sequence: {story}")
+            raise CorpusError(f"no video gives a sequence: {'; '.join(map(str, table.refusals[:3]))}")
         self._schedule = Schedule.of(table, spec)
         self.count = self._schedule.count
 
@@ -86,7 +84,7 @@ class Remaker:
             video = sequence.video
             condemned = self._quarantine.refusal(self._snapshot, video.id, video.fingerprint, sequence.start_frame)
             if condemned is not None:
-                request = next_candidate(request, video.id, None, condemned)
+                request = next_candidate(request, Refusal(video.id, None, condemned, RefusalKind.QUARANTINED))
                 continue
             lease = lease_for(
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
@@ -96,7 +94,7 @@ class Remaker:
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise
-                request = next_candidate(request, lease.video, error.frame, error.reason)
+                request = next_candidate(request, Refusal(lease.video, error.frame, error.reason))
         refusals = "; ".join(dict.fromkeys(map(str, request.refusals)))
         raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: {refusals}")
 
@@ -173,8 +171,8 @@ def simulate_to_file(
     catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
     quarantine.verdicts(snapshot)  # before any work: whether there is such a snapshot
-    for problem in catalogue.problems:
-        print(f"cannot be used: {problem.id}: {problem.reason}")
+    for refusal in catalogue.refusals:
+        print(f"cannot be used: {refusal}")
     sample = remake(
         catalogue,
         stream,

@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_protocol.refusal import Refusal
+from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
 from v2v_server.catalogue.scene import Scene
 from v2v_server.prepare.encode import Encoding
 from v2v_server.prepare.report import Report
@@ -113,13 +114,13 @@ def prepare(
             aside = [record for id, record in known.items() if id not in wanted]
             with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
                 for video, outcome in _outcomes(catalogue, left, standing, target, encoding, scene, processes):
-                    if isinstance(outcome, Problem):
+                    if isinstance(outcome, Refusal):
                         not_looked_at.append(outcome)
                     else:
                         manifest.add(outcome)
                         made[outcome.id] = outcome
                     done += video.frames
-                    room.done(video, 0 if isinstance(outcome, Problem) else outcome.bytes)
+                    room.done(video, 0 if isinstance(outcome, Refusal) else outcome.bytes)
                     tell(done, total, room.made, room.expected)
                     room.check()
     except OSError as error:
@@ -128,7 +129,7 @@ def prepare(
     return Report(
         videos=tuple(records[id] for id in sorted(records)),
         kept=len(finished),
-        unusable=catalogue.problems,
+        unusable=catalogue.refusals,
         floor_db=floor_db,
         frame_floor_db=frame_floor_db,
         looked_at=len(made.keys() & standing.keys()),
@@ -230,7 +231,7 @@ def _outcomes(
     encoding: Encoding,
     scene: bool,
     processes: int,
-) -> Iterator[tuple[VideoEntry, PreparedVideo | Problem]]:
+) -> Iterator[tuple[VideoEntry, PreparedVideo | Refusal]]:
     """The new record of each video, in order of completion; a problem where the standing one has to stay as it is."""
     jobs = []
     for video in videos:
@@ -257,7 +258,7 @@ def _outcomes(
         if isinstance(result, Scene) and job.standing is not None:
             yield job.video, replace(job.standing, scene=_text(result))
         elif isinstance(result, str) and job.standing is not None:
-            yield job.video, Problem(job.video.id, result)
+            yield job.video, Refusal(job.video.id, None, result)
         else:
             assert not isinstance(result, Scene)
             yield job.video, _record(job.video, *job.window[2:], result, encoding)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from v2v_server.catalogue.catalogue import Problem
+from v2v_protocol.refusal import Refusal
 from v2v_server.store.manifest import PreparedVideo
 
 
@@ -26,12 +26,12 @@ class Report:
 
     videos: tuple[PreparedVideo, ...]
     kept: int
-    unusable: tuple[Problem, ...]
+    unusable: tuple[Refusal, ...]
     floor_db: float
     frame_floor_db: float
     looked_at: int = 0
     aside: int = 0
-    not_looked_at: tuple[Problem, ...] = ()
+    not_looked_at: tuple[Refusal, ...] = ()
 
     @property
     def prepared(self) -> tuple[PreparedVideo, ...]:

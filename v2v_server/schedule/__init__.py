@@ -1,0 +1,6 @@
+"""The schedule: pure, from (catalogue, spec, seed, epoch, index) to a sequence of frames.
+
+sequences     which sequences of which videos a spec may draw from
+permutation   a keyed permutation that is computed, never stored
+epoch         which sequence each index of an epoch is made from, and its candidates
+"""

@@ -15,27 +15,11 @@ from itertools import accumulate, islice
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
+from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import VideoEntry
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """A video that gives this spec no sequence.
-
-    Attributes:
-        video: its id.
-        reason: why not.
-        remedy: which setting would admit it, in words.
-        voxels_per_clip: the longest clip it would be long enough for; 0 where that is not the matter.
-    """
-
-    video: str
-    reason: str
-    remedy: str
-    voxels_per_clip: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +40,8 @@ class SequenceTable:
 
     Attributes:
         count: N, sequences in all.
-        rejections: the videos that give none.
+        refusals: the videos that give none.
+        longest_clips: of those that are too short, the ``voxels_per_clip`` that each is long enough for.
         spoilt: sequences of the places 0, L, 2L ... that are left out or moved because of what they show.
 
     Raises:
@@ -69,11 +54,15 @@ class SequenceTable:
         self.spoilt = 0
         admitted: list[VideoEntry] = []
         counts: list[int] = []
-        rejections: list[Rejection] = []
+        refusals: list[Refusal] = []
+        longest: list[int] = []
         for video in videos:
-            rejection = _rejection(video, rows, spec.recipe)
-            if rejection is not None:
-                rejections.append(rejection)
+            if video.frames < spec.recipe.frames_needed:
+                longest.append(_longest_clip(video.frames, spec.recipe))
+                refusals.append(_too_short(video, spec.recipe))
+                continue
+            if (refusal := _too_small(video, rows, spec.recipe)) is not None:
+                refusals.append(refusal)
                 continue
             fit = (video.frames - spec.recipe.frames_needed) // self._stride + 1
             count = min(fit, spec.max_sequences_per_video)
@@ -81,7 +70,9 @@ class SequenceTable:
                 starts = _starts(video, spec)
                 self.spoilt += len({self._stride * place for place in range(count)} - set(starts))
                 if not starts:
-                    rejections.append(_all_cut(video, spec.recipe))
+                    run = max((end - first for first, end in video.runs or ()), default=0)
+                    longest.append(_longest_clip(run, spec.recipe))
+                    refusals.append(_all_cut(video, run, spec.recipe))
                     continue
                 self._starts[len(admitted)] = starts
                 count = len(starts)
@@ -90,7 +81,8 @@ class SequenceTable:
         self._videos = tuple(admitted)
         self._ends = tuple(accumulate(counts))
         self.count = self._ends[-1] if self._ends else 0
-        self.rejections = tuple(rejections)
+        self.refusals = tuple(refusals)
+        self.longest_clips = tuple(voxels for voxels in longest if voxels)
 
     @property
     def videos(self) -> int:
@@ -124,39 +116,41 @@ def _starts(video: VideoEntry, spec: StreamSpec) -> tuple[int, ...]:
     return tuple(islice(starts, spec.max_sequences_per_video))
 
 
-def _all_cut(video: VideoEntry, recipe: Recipe) -> Rejection:
-    longest = max((end - first for first, end in video.runs or ()), default=0)
-    most = (longest - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels
+def _longest_clip(frames: int, recipe: Recipe) -> int:
+    """The ``voxels_per_clip`` that so many frames are enough for; 0: not even one."""
+    return max(0, (frames - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels)
+
+
+def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
+    return Refusal(video.id, None, reason, RefusalKind.UNSUITED, remedy=remedy)
+
+
+def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
+    most = _longest_clip(video.frames, recipe)
+    remedy = f"voxels_per_clip at most {most}" if most else "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+    if video.frames < 2:
+        remedy = "none: a voxel grid needs two frames"
+    return _unsuited(video, f"{video.frames} frames, the recipe needs {recipe.frames_needed}", remedy)
+
+
+def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
+    most = _longest_clip(longest_run, recipe)
     reason = (
-        f"at most {longest} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
+        f"at most {longest_run} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
     )
-    remedy = f"voxels_per_clip at most {most}, or scene off" if most >= 1 else "scene off"
-    return Rejection(video.id, reason, remedy, max(most, 0))
+    return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
 
 
-def _rejection(video: VideoEntry, rows: Rows, recipe: Recipe) -> Rejection | None:
-    needed = recipe.frames_needed
-    if video.frames < needed:
-        most = (video.frames - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels
-        remedy = (
-            f"voxels_per_clip at most {most}"
-            if most >= 1
-            else "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
-        )
-        if video.frames < 2:
-            remedy = "none: a voxel grid needs two frames"
-        return Rejection(video.id, f"{video.frames} frames, the recipe needs {needed}", remedy, max(most, 0))
+def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:
     try:
         top, bottom = rows.bounds(video.height_px)
     except UsageError as error:
-        return Rejection(video.id, str(error), "other rows")
+        return _unsuited(video, str(error), "other rows")
     height, width = bottom - top, video.width_px
-    if not admits(recipe, height, width):
-        # Rounded up, or the picture would still be a fraction of a pixel too small.
-        scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
-        return Rejection(
-            video.id,
-            f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}",
-            f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop",
-        )
-    return None
+    if admits(recipe, height, width):
+        return None
+    # Rounded up, or the picture would still be a fraction of a pixel too small.
+    scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
+    reason = f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
+    return _unsuited(video, reason, larger)

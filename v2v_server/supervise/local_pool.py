@@ -36,7 +36,7 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 
 @dataclass(slots=True, eq=False)
-class _Place:
+class _Post:
     number: int
     process: subprocess.Popen[bytes] | None = None
     logbook: Logbook | None = None
@@ -62,8 +62,8 @@ class Pool:
     """
 
     def __init__(self, root: Path, label: str) -> None:
-        self._places: list[_Place] = []
-        self._leaving: list[_Place] = []  # too many: told to leave
+        self._posts: list[_Post] = []
+        self._leaving: list[_Post] = []  # too many: told to leave
         self._numbered = 0
         self._root = root
         self._address = ""
@@ -76,7 +76,7 @@ class Pool:
     @property
     def crash_budget(self) -> int:
         """Deaths in a row, without any finished sample between them, that are survived."""
-        return 3 * len(self._places) + 4
+        return 3 * len(self._posts) + 4
 
     @property
     def running(self) -> int:
@@ -89,23 +89,23 @@ class Pool:
 
     def scale(self, workers: int) -> None:
         """There shall be so many; :meth:`watch` starts those that lack."""
-        while len(self._places) < workers:
-            self._places.append(_Place(self._numbered))
+        while len(self._posts) < workers:
+            self._posts.append(_Post(self._numbered))
             self._numbered += 1
-        self._places, surplus = self._places[:workers], self._places[workers:]
-        for place in surplus:
-            if place.process is not None:
-                place.process.terminate()  # it finishes the sample it is at, gives back the others and leaves
-                self._leaving.append(place)
+        self._posts, surplus = self._posts[:workers], self._posts[workers:]
+        for post in surplus:
+            if post.process is not None:
+                post.process.terminate()  # it finishes the sample it is at, gives back the others and leaves
+                self._leaving.append(post)
 
     def pids(self) -> list[int]:
         """Process ids of the workers that are alive."""
-        processes = [place.process for place in self._all() if place.process is not None]
+        processes = [post.process for post in self._all() if post.process is not None]
         return [process.pid for process in processes if process.poll() is None]
 
     def watches(self, identity: bytes) -> bool:
         """Whether :meth:`watch` will report how that worker ends: one of this pool's that was not given up."""
-        return any(place.identity == identity and place.process and not place.given_up for place in self._all())
+        return any(post.identity == identity and post.process and not post.given_up for post in self._all())
 
     def watch(self, now: float, samples: int) -> list[Death]:
         """Reaps the dead and starts what is due. To be called a few times a second.
@@ -121,37 +121,37 @@ class Pool:
             self._samples_seen = samples
             self._deaths_in_a_row = 0
         deaths = []
-        ended = {place.number for place in self._all() if place.process and place.process.poll() is not None}
+        ended = {post.number for post in self._all() if post.process and post.process.poll() is not None}
         memory_kills = _out_of_memory_kills()  # counted before its victims are gone, so these are in it
         if memory_kills > self._memory_kills:
             self._memory_kills, self._short_of_memory_until = memory_kills, now + _MEMORY_SECONDS
-        for place in self._all():
-            if place.process is None or place.number not in ended:
+        for post in self._all():
+            if post.process is None or post.number not in ended:
                 continue
-            at = None if place.logbook is None else place.logbook.lease()
-            loss = _post_mortem(place.process.returncode, short_of_memory=now < self._short_of_memory_until)
-            death = Death(place.identity, replace(loss, lease=at))
-            as_told = place in self._leaving and place.process.returncode in (0, -signal.SIGTERM)
-            if place in self._leaving:
-                self._leaving.remove(place)
-                place.close()
+            at = None if post.logbook is None else post.logbook.lease()
+            loss = _post_mortem(post.process.returncode, short_of_memory=now < self._short_of_memory_until)
+            death = Death(post.identity, replace(loss, lease=at))
+            as_told = post in self._leaving and post.process.returncode in (0, -signal.SIGTERM)
+            if post in self._leaving:
+                self._leaving.remove(post)
+                post.close()
             else:
-                self._put_off(place, death, now)
-            if not place.given_up and not as_told:
+                self._put_off(post, death, now)
+            if not post.given_up and not as_told:
                 deaths.append(death)
-        for place in self._places:
-            if place.process is None and now >= place.start_at:
+        for post in self._posts:
+            if post.process is None and now >= post.start_at:
                 try:
-                    self._start(place)
+                    self._start(post)
                 except OSError as error:
                     # Too many processes, or no memory for one more: that passes, and must not end those that run.
                     text = f"could not be started: {error.strerror or error}"
-                    deaths.append(Death(place.identity, Loss(Cause.KILLED, text)))
-                    self._put_off(place, deaths[-1], now)
+                    deaths.append(Death(post.identity, Loss(Cause.KILLED, text)))
+                    self._put_off(post, deaths[-1], now)
         return deaths
 
-    def _put_off(self, place: _Place, death: Death, now: float) -> None:
-        """Lets some time pass before the next process of a place.
+    def _put_off(self, post: _Post, death: Death, now: float) -> None:
+        """Lets some time pass before the next process of a post.
 
         Raises:
             WorkerCrashLoop: the crash budget is used up.
@@ -166,7 +166,7 @@ class Pool:
         # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
         doublings = min(self._deaths_in_a_row - 1, 16)
         delay = min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS)
-        place.process, place.start_at = None, now + delay
+        post.process, post.start_at = None, now + delay
 
     def give_up(self, identity: bytes, reason: str) -> Loss | None:
         """Kills a worker that hangs.
@@ -174,14 +174,14 @@ class Pool:
         Returns:
             what its loss means, not to be reported again by :meth:`watch`; None when it is none of this pool's.
         """
-        for place in self._all():
-            if place.identity == identity and place.process is not None:
-                place.given_up = True
-                status = _status(place.process.pid)
-                place.process.kill()
+        for post in self._all():
+            if post.identity == identity and post.process is not None:
+                post.given_up = True
+                status = _status(post.process.pid)
+                post.process.kill()
                 if status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
                     return Loss(Cause.KILLED, "was stopped from outside and killed")
-                at = None if place.logbook is None else place.logbook.lease()
+                at = None if post.logbook is None else post.logbook.lease()
                 if status == psutil.STATUS_DISK_SLEEP:
                     # A network file system whose server is away holds every worker at whatever clip it has.
                     return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at)
@@ -190,7 +190,7 @@ class Pool:
 
     def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
         """Ends every worker: waits for those that were told to stop, then terminates, then kills. All are reaped."""
-        processes = [place.process for place in self._all() if place.process is not None]
+        processes = [post.process for post in self._all() if post.process is not None]
         _wait(processes, join_seconds)
         for process in processes:
             if process.poll() is None:
@@ -200,24 +200,24 @@ class Pool:
             if process.poll() is None:
                 process.kill()
             process.wait()
-        for place in self._all():
-            place.close()
-        self._places, self._leaving = [], []
+        for post in self._all():
+            post.close()
+        self._posts, self._leaving = [], []
 
-    def _all(self) -> list[_Place]:
-        return [*self._places, *self._leaving]
+    def _all(self) -> list[_Post]:
+        return [*self._posts, *self._leaving]
 
-    def _start(self, place: _Place) -> None:
-        place.generation += 1
-        place.given_up = False
-        name = f"{self._label}-{place.number}.{place.generation}"
-        place.identity = name.encode()
-        place.close()
-        place.logbook = Logbook()
-        place.process = subprocess.Popen(
-            [*_command(self._address, self._root, name), "--logbook-fd", str(place.logbook.descriptor)],
+    def _start(self, post: _Post) -> None:
+        post.generation += 1
+        post.given_up = False
+        name = f"{self._label}-{post.number}.{post.generation}"
+        post.identity = name.encode()
+        post.close()
+        post.logbook = Logbook()
+        post.process = subprocess.Popen(
+            [*_command(self._address, self._root, name), "--logbook-fd", str(post.logbook.descriptor)],
             stdin=subprocess.DEVNULL,
-            pass_fds=(place.logbook.descriptor,),
+            pass_fds=(post.logbook.descriptor,),
             env=environment() | _ONE_THREAD,
             process_group=0,
         )

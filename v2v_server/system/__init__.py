@@ -1,0 +1,7 @@
+"""What we ask of the operating system, and of libraries that ask it for us.
+
+process         memory that stays, cores, long turns, children that die with their parent
+isolate         a function applied to many items in processes of their own, where a crash costs one item
+compile_cache   where numba keeps compiled kernels
+opencv          OpenCV, loaded when it is first used
+"""

@@ -93,7 +93,7 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
         if not 0 < slot.number <= name.slots:
             return None
         places, total = _places(tuple(layout.items()), name.slots)
-        with closing(_Arena(name, total)) as arena:
+        with closing(_OpenArena(name, total)) as arena:
             return {
                 array: arena.map(offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
                 for array, dtype, shape, size, offset in places
@@ -117,7 +117,7 @@ def _places(layout: tuple[tuple[str, tuple[str, tuple[int, ...]]], ...], slots: 
     return places, total
 
 
-class _Arena:
+class _OpenArena:
     """An open arena.
 
     Raises:

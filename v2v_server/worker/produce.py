@@ -18,7 +18,8 @@ import numpy.typing as npt
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Layout, Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, new_arrays
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part

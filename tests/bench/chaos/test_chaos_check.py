@@ -14,7 +14,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_bench.chaos.check import StreamOracle, Verdict, check, main
 from v2v_bench.chaos.consumer import PROFILES, Profile, log_path
 from v2v_bench.chaos.log import BatchLine, LifeLine, Line, LogWriter, Sighting, read_log, sighting
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 
@@ -139,7 +139,7 @@ def test_a_substitute_is_made_again_from_its_own_candidate(catalogue: Catalogue,
     oracle = StreamOracle(catalogue, ASKED)
     first = honest[1]
     assert isinstance(first, BatchLine)
-    blamed = Refusal(0, first.samples[0].video, None, "a worker was ended by SIGSEGV over it")
+    blamed = Refusal(first.samples[0].video, None, "a worker was ended by SIGSEGV over it")
     place = _place(oracle, first.samples[0].index)
     seen = oracle.again(0, Sighting(first.samples[0].index, "", *place, 1, (blamed,), 1))
     assert (seen.video, seen.start_frame, seen.candidate, seen.refusals, seen.quarantine) == (*place, 1, (blamed,), 1)

@@ -23,7 +23,7 @@ from v2v_bench.chaos.log import (
     recovery_seconds,
 )
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import Refusal
+from v2v_protocol.refusal import Refusal
 
 SEQUENCES, BATCH_SIZE = 11, 3
 PER_EPOCH = 3
@@ -156,7 +156,7 @@ def test_other_bytes_of_the_same_sample_contradict() -> None:
     assert seen.contradictions == 1
     seen.add("b", dataclasses.replace(batch(0), samples=(flipped,)))
     assert seen.contradictions == 1, "another stream has other bytes"
-    moved = dataclasses.replace(flipped, candidate=1, refusals=(Refusal(0, "v.mp4", None, "crash"),))
+    moved = dataclasses.replace(flipped, candidate=1, refusals=(Refusal("v.mp4", None, "crash"),))
     seen.add("a", dataclasses.replace(batch(0), samples=(moved,)))
     assert seen.contradictions == 1, "another candidate has other bytes"
 
@@ -178,7 +178,7 @@ def test_lines_come_back_as_they_were(
     path = tmp_path_factory.mktemp("log") / "log.jsonl"
     lines = log(*lives)
     if refusals:
-        moved = Sighting(1, "d", "w.mp4", 20, 1, (Refusal(0, "v.mp4", 3, "no frame"),), 2)
+        moved = Sighting(1, "d", "w.mp4", 20, 1, (Refusal("v.mp4", 3, "no frame"),), 2)
         lines.append(BatchLine(99, 1, 0.5, 0.25, (moved,)))
     write(path, lines)
     assert list(read_log(path)) == lines

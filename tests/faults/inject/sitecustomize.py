@@ -37,8 +37,8 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
-    from v2v_server.worker import conversation as worker
     from v2v_server.worker import decode_cache as clips
+    from v2v_server.worker import process as worker
     from v2v_server.worker import produce
 
     at = {"video": ""}

@@ -41,7 +41,7 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import GiveUp, Record, ToConsumer
+from v2v_server.broker.actions import Condemn, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
@@ -464,7 +464,9 @@ def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
     first = at.fail(reason="no frame", frame=17)
     (second,) = at.leases[b"w"]
     assert (second.candidate, second.indices) == (1, (3,))
-    assert second.refusals == {"refusals": [{"candidate": 0, "video": first.video, "frame": 17, "reason": "no frame"}]}
+    assert second.refusals == {
+        "refusals": [{"video": first.video, "frame": 17, "reason": "no frame", "kind": "failed"}]
+    }
     at.fail(reason="nor here", frame=None)
     (third,) = at.leases[b"w"]
     assert [refusal["reason"] for refusal in third.refusals["refusals"]] == ["no frame", "nor here"]
@@ -937,7 +939,7 @@ def test_any_conversation_leaves_it_serving(said: list[tuple[bool, bytes, list[A
     for by_worker, identity, frames, seconds in said:
         speak = at.dispatcher.from_worker if by_worker else at.dispatcher.from_consumer
         for instruction in speak(identity, [*frames, b"payload"] if by_worker else frames, at.now):
-            assert not isinstance(instruction, Record)
+            assert not isinstance(instruction, Condemn)
             assert instruction.identity in (b"c", b"d", b"w", b"")
         at.tick(seconds)
     for identity in (b"c", b"d", b"w", b""):

@@ -82,7 +82,7 @@ def test_a_folder(corpus: Path, opener: Opener) -> None:
     (corpus / "broken.mp4").symlink_to(corpus / "nowhere.mp4")
     catalogue = opener(corpus)
     assert ids(catalogue) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
-    assert [problem.id for problem in catalogue.problems] == ["broken.mp4"]
+    assert [refusal.video for refusal in catalogue.refusals] == ["broken.mp4"]
     video = catalogue.videos[0]
     assert (video.frames, video.width_px, video.height_px, video.codec) == (30, 64, 48, "h264")
     assert video.frames_per_second == pytest.approx(25)
@@ -96,7 +96,7 @@ def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> N
     (corpus / "circle.mp4").symlink_to(corpus / "circle.mp4")
     catalogue = opener(corpus)
     assert len(ids(catalogue)) == 3
-    assert [(problem.id, problem.reason) for problem in catalogue.problems] == [
+    assert [(refusal.video, refusal.reason) for refusal in catalogue.refusals] == [
         ("circle.mp4", "cannot be looked at: Too many levels of symbolic links")
     ]
 
@@ -128,7 +128,7 @@ def test_an_index_keeps_what_cannot_be_looked_at_today(
         patch.setattr(os, "stat", denied)
         locked = opener(corpus)
     assert ids(locked) == ["a.mp4"]
-    assert [problem.id for problem in locked.problems] == ["sub"]
+    assert [refusal.video for refusal in locked.refusals] == ["sub"]
     assert locked.notes == ()
     again = opener(corpus)
     assert again.digest == first.digest
@@ -165,7 +165,7 @@ def test_storage_that_fails_at_one_start_is_asked_again_at_the_next(
     whole = opener(corpus, cache_dir=corpus.parent / "other").digest
     left = failing_opens(monkeypatch, a=2)
     first = opener(corpus)
-    assert [(problem.id, problem.reason) for problem in first.problems] == [
+    assert [(refusal.video, refusal.reason) for refusal in first.refusals] == [
         ("a.mp4", "cannot be opened: Input/output error")
     ]
     assert left == {"a": 0}
@@ -234,7 +234,7 @@ def test_what_a_list_names_is_not_opened_unless_it_is_a_file(corpus: Path, opene
     listed.write_text("pipe.mp4\nendless.mp4\nfolder.mp4\na.mp4\ngone.mp4\n")
     catalogue = opener(listed)
     assert ids(catalogue) == ["a.mp4"]
-    reasons = {problem.id: problem.reason for problem in catalogue.problems}
+    reasons = {refusal.video: refusal.reason for refusal in catalogue.refusals}
     assert reasons.pop("gone.mp4").startswith("cannot be read: No such file")
     assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is no regular file")
     listed.write_text("pipe.mp4\n")
@@ -249,7 +249,7 @@ def test_lists(corpus: Path, opener: Opener) -> None:
     assert by_source.digest == by_option.digest
     assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
     assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
-    assert [problem.id for problem in by_source.problems] == ["gone.mp4"]
+    assert [refusal.video for refusal in by_source.refusals] == ["gone.mp4"]
     assert by_source.notes == ("1 videos are shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
     # The part that the list leaves out stays in the index.
     opener(corpus)
@@ -277,7 +277,7 @@ def test_files_that_do_not_open(corpus: Path, opener: Opener, sample: Path) -> N
     truncated(sample, corpus / "no_moov.mp4", 0.5)
     catalogue = opener(corpus)
     assert len(catalogue.videos) == 3
-    reasons = {problem.id: problem.reason for problem in catalogue.problems}
+    reasons = {refusal.video: refusal.reason for refusal in catalogue.refusals}
     assert set(reasons) == {"empty.mp4", "noise.avi", "no_moov.mp4"}
     assert all("Invalid data" in reason for reason in reasons.values())
     opener(corpus)

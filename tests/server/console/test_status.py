@@ -10,9 +10,10 @@ import pytest
 
 from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from tests.server.peers import peers
+from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.counters import Counters
-from v2v_server.catalogue.catalogue import Catalogue, Problem, VideoEntry
+from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
 from v2v_server.console.status import Rate, StatusLine, summary
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
@@ -36,7 +37,7 @@ def test_a_corpus_without_trouble_is_one_line() -> None:
     ]
 
 
-def test_rejections_name_reason_and_remedy() -> None:
+def test_refusals_name_reason_and_remedy() -> None:
     said = lines(corpus(video("a.mp4"), video("short.mp4", frames=4), video("small.mp4", height_px=5)))
     assert said[0].startswith("3 videos in /corpus: 1 give 10 sequences")
     assert said[1:] == [
@@ -48,7 +49,7 @@ def test_rejections_name_reason_and_remedy() -> None:
     ]
 
 
-def test_many_rejections_are_counted_and_a_length_of_clip_named_that_admits_them() -> None:
+def test_many_refusals_are_counted_and_a_length_of_clip_named_that_admits_them() -> None:
     lengths = (15, 11, 11, 8, 8, 8, 6)  # SMALL spends two bins of one frame on a voxel grid
     shorts: list[VideoEntry] = [video(f"s{number}.mp4", frames) for number, frames in enumerate(lengths)]
     spec = replace(SMALL_SPEC, recipe=replace(SMALL, voxels_per_clip=10))
@@ -61,7 +62,7 @@ def test_many_rejections_are_counted_and_a_length_of_clip_named_that_admits_them
 
 
 def test_files_that_cannot_be_used_are_named() -> None:
-    problems = tuple(Problem(f"p{number}.mp4", "has no video track") for number in range(7))
+    problems = tuple(Refusal(f"p{number}.mp4", None, "has no video track") for number in range(7))
     named = NamedCorpus((video("a.mp4"),), Rows(), problems, Path("/elsewhere"))
     said = lines(named)  # type: ignore[arg-type]
     assert said[0].startswith("1 videos in /elsewhere: 1 give 10 sequences")

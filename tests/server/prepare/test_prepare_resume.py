@@ -73,7 +73,7 @@ def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     assert "3 prepared videos are set aside" in served.notes[0]
     assert "3 others that were prepared earlier are set aside" in summary(part, H264, 0.0)[1]
     (tmp_path / "other.txt").write_text("0.mp4\n1.mp4\n")
-    assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").problems[0].reason
+    assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").refusals[0].reason
     (source / "sub").rename(tmp_path / "away")
     away = run(source, out)
     assert (away.kept, away.aside) == (4, 1)
@@ -222,7 +222,7 @@ def test_a_look_that_fails_costs_no_prepared_file(
     monkeypatch.setattr("v2v_server.prepare.prepare.look_again", refuse)
     report = run(source, out, scene=True)
     assert report.videos == first.videos == tuple(video for _, video in sorted(read_manifest(out).videos.items()))
-    assert [problem.reason for problem in report.not_looked_at] == ["frame 3: is damaged"] * 5
+    assert [refusal.reason for refusal in report.not_looked_at] == ["frame 3: is damaged"] * 5
     assert not report.complete
 
 

@@ -139,7 +139,11 @@ def test_lists_of_the_source_hold(pair: tuple[Path, Path], tmp_path: Path) -> No
         ("a.mp4", 0.5, 0.5), ("sub/d.avi", 0.2, 0.3),
     ]  # fmt: skip
     assert sequences(after) == sequences(before)
-    assert [problem.id for problem in after.problems] == [problem.id for problem in before.problems] == ["missing.mp4"]
+    assert (
+        [refusal.video for refusal in after.refusals]
+        == [refusal.video for refusal in before.refusals]
+        == ["missing.mp4"]
+    )
 
 
 def test_a_missing_or_changed_file_keeps_its_place(copied: Path) -> None:

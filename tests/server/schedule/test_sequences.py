@@ -1,4 +1,4 @@
-"""Sequences of videos, lookup by rank, rejections with a remedy that works, and the schedule's candidates."""
+"""Sequences of videos, lookup by rank, refusals with a remedy that works, and the schedule's candidates."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: i
     assert listed(found) == expected
     assert found.count == len(expected)
     assert found.videos == len({name for name, _ in expected})
-    assert found.videos + len(found.rejections) == len(videos)
+    assert found.videos + len(found.refusals) == len(videos)
     for name, start in expected:
         entry = next(entry for entry in videos if entry.id == name)
         assert start + recipe.frames_needed <= entry.frames
@@ -105,10 +105,10 @@ def test_a_rank_outside_is_refused(rank: int) -> None:
 
 def test_an_empty_corpus_has_no_sequence() -> None:
     found = table()
-    assert (found.count, found.videos, found.rejections) == (0, 0, ())
+    assert (found.count, found.videos, found.refusals) == (0, 0, ())
 
 
-# --- rejections -------------------------------------------------------------------------------------------------------
+# --- refusals -------------------------------------------------------------------------------------------------------
 
 
 @given(
@@ -121,42 +121,42 @@ def test_an_empty_corpus_has_no_sequence() -> None:
 def test_the_remedy_for_a_short_video_admits_it(frames: int, voxels: int, bins: int, per_bin: int, lead: int) -> None:
     changes: dict[str, Any] = {"voxels_per_clip": voxels, "bins": bins, "frames_per_bin": per_bin, "lead_voxels": lead}
     recipe = SMALL.replace(**changes)
-    rejections = table(video("short", frames), spec=StreamSpec(recipe=recipe)).rejections
-    assert bool(rejections) == (frames < recipe.frames_needed)
-    if not rejections:
+    refusals = table(video("short", frames), spec=StreamSpec(recipe=recipe)).refusals
+    assert bool(refusals) == (frames < recipe.frames_needed)
+    if not refusals:
         return
-    assert rejections[0].video == "short"
-    assert rejections[0].reason == f"{frames} frames, the recipe needs {recipe.frames_needed}"
-    if match := re.fullmatch(r"voxels_per_clip at most (\d+)", rejections[0].remedy):
+    assert refusals[0].video == "short"
+    assert refusals[0].reason == f"{frames} frames, the recipe needs {recipe.frames_needed}"
+    if match := re.fullmatch(r"voxels_per_clip at most (\d+)", refusals[0].remedy):
         most = int(match[1])
         assert 1 <= most < voxels
         assert table(video("short", frames), spec=StreamSpec(recipe=recipe.replace(voxels_per_clip=most))).count == 1
         more = recipe.replace(voxels_per_clip=most + 1)
         assert table(video("short", frames), spec=StreamSpec(recipe=more)).count == 0
     else:
-        assert rejections[0].remedy == "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+        assert refusals[0].remedy == "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
         least = recipe.replace(voxels_per_clip=1, bins=1, frames_per_bin=1, lead_voxels=0)
         assert table(video("short", frames), spec=StreamSpec(recipe=least)).count >= 1
 
 
 def test_one_frame_has_no_remedy() -> None:
-    (rejection,) = table(video("still", 1)).rejections
-    assert rejection.remedy == "none: a voxel grid needs two frames"
+    (refusal,) = table(video("still", 1)).refusals
+    assert refusal.remedy == "none: a voxel grid needs two frames"
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 300), st.integers(1, 300))
 def test_the_remedy_for_a_small_picture_admits_it(height: int, width: int, crop_height: int, crop_width: int) -> None:
     recipe = SMALL.replace(crop_height_px=crop_height, crop_width_px=crop_width)
     small = video("small", 100, height, width)
-    rejections = table(small, spec=StreamSpec(recipe=recipe)).rejections
-    assert bool(rejections) == (height < crop_height or width < crop_width)
-    if not rejections:
+    refusals = table(small, spec=StreamSpec(recipe=recipe)).refusals
+    assert bool(refusals) == (height < crop_height or width < crop_width)
+    if not refusals:
         return
-    assert rejections[0].reason == (f"picture {width}x{height} after rows full, the crop is {crop_width}x{crop_height}")
-    match = re.fullmatch(r"resize_scale up to ([\d.]+), or a smaller crop", rejections[0].remedy)
+    assert refusals[0].reason == (f"picture {width}x{height} after rows full, the crop is {crop_width}x{crop_height}")
+    match = re.fullmatch(r"resize_scale up to ([\d.]+), or a smaller crop", refusals[0].remedy)
     if match is None:
         # No scale that a recipe may have is large enough.
-        assert rejections[0].remedy == "a smaller crop"
+        assert refusals[0].remedy == "a smaller crop"
         assert max(crop_height / height, crop_width / width) > 100
         return
     scale = float(match[1])
@@ -167,18 +167,18 @@ def test_the_remedy_for_a_small_picture_admits_it(height: int, width: int, crop_
 def test_rows_count() -> None:
     """WebVid: the top 54 % of 336 rows, which the paper's crop of 128 fits."""
     assert table(video("a", 201, 336, 596), rows=Rows.parse("top:0.54"), spec=StreamSpec()).count == 1
-    (rejection,) = table(video("a", 201, 336, 596), rows=Rows.parse("top:0.3"), spec=StreamSpec()).rejections
-    assert rejection.reason == "picture 596x100 after rows top:0.3, the crop is 128x128"
+    (refusal,) = table(video("a", 201, 336, 596), rows=Rows.parse("top:0.3"), spec=StreamSpec()).refusals
+    assert refusal.reason == "picture 596x100 after rows top:0.3, the crop is 128x128"
 
 
 def test_rows_that_one_picture_does_not_have_reject_only_that_video() -> None:
     found = table(video("low", 100, height_px=10), video("tall", 5, height_px=20), rows=Rows.parse("top:12px"))
     assert listed(found) == [("tall", 0)]
-    (rejection,) = found.rejections
-    assert rejection.video == "low"
-    assert "the picture has 10 rows only" in rejection.reason
-    (rejection,) = table(video("flat", 100, height_px=1), rows=Rows.parse("0.1:0.6")).rejections
-    assert "no row is left" in rejection.reason
+    (refusal,) = found.refusals
+    assert refusal.video == "low"
+    assert "the picture has 10 rows only" in refusal.reason
+    (refusal,) = table(video("flat", 100, height_px=1), rows=Rows.parse("0.1:0.6")).refusals
+    assert "no row is left" in refusal.reason
 
 
 # --- the schedule -----------------------------------------------------------------------------------------------------

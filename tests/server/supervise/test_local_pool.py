@@ -342,17 +342,17 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
     pool = Pool(Path("/corpus"), "label")
     pool.scale(1000)
-    for place in pool._places[:1]:
-        place.start_at = 0.0
-    for place in pool._places[1:]:
-        place.start_at = float("inf")
+    for post in pool._posts[:1]:
+        post.start_at = 0.0
+    for post in pool._posts[1:]:
+        post.start_at = float("inf")
     pool._deaths_in_a_row = pool.crash_budget - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
-    pool._places[0].process, pool._places[0].identity = dead, b"label-0.1"
+    pool._posts[0].process, pool._posts[0].identity = dead, b"label-0.1"
     (death,) = pool.watch(100.0, 0)
     assert death.identity == b"label-0.1"
-    assert pool._places[0].start_at == 110.0
+    assert pool._posts[0].start_at == 110.0
 
 
 def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:

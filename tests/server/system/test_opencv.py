@@ -29,7 +29,7 @@ def test_presets_have_opencvs_numbers() -> None:
 @pytest.mark.parametrize(
     ("code", "is_loaded"),
     [
-        ("import v2v_server.worker.conversation", False),
+        ("import v2v_server.worker.process", False),
         (
             "import numpy as np; from v2v_server.flow.methods import choose; choose(*np.zeros((2, 32, 32), np.uint8))",
             True,

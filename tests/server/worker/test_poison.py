@@ -11,14 +11,14 @@ from tests.server.corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
 from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Lease
-from v2v_protocol.sample import Refusal, Sample
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import ALONE_AFTER, Cause
 from v2v_server.broker.quarantine import Quarantine, Verdict, clearing
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake
-from v2v_server.schedule.epoch import MOST_CANDIDATES
 
 TIME = "2024-02-29T12:00:00+00:00"
 BLAMING = (Cause.CRASHED, Cause.HUNG)
@@ -83,7 +83,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
     assert (second.indices, second.candidate, second.quarantine) == ((1,), 0, 1)
     reason = "sequence in quarantine snapshot 1: a worker died over it"
     assert first.refusals == {
-        "refusals": [{"candidate": 0, "video": lease.video, "frame": None, "reason": reason}],
+        "refusals": [{"video": lease.video, "frame": None, "reason": reason, "kind": "quarantined"}],
     }
     assert first.video != lease.video
     assert second.refusals == {"refusals": []}
@@ -344,7 +344,7 @@ def test_when_it_cannot_be_written_there_is_no_snapshot_and_the_sample_says_what
     at.join()
     (second,) = at.leases[b"w"]
     assert (second.candidate, second.quarantine) == (1, 0)
-    refusal = Refusal(0, lease.video, None, "a worker died over it")
+    refusal = Refusal(lease.video, None, "a worker died over it")
     assert Refusal(**second.refusals["refusals"][0]) == refusal
     assert at.passed_over == [refusal]
     at.work_off()
@@ -380,7 +380,7 @@ def test_what_is_in_quarantine_is_passed_over_without_a_lease() -> None:
     assert (lease.candidate, lease.quarantine) == (1, 1)
     (refusal,) = lease.refusals["refusals"]
     assert refusal == {
-        "candidate": 0,
+        "kind": "quarantined",
         "video": verdict.path,
         "frame": None,
         "reason": "sequence in quarantine snapshot 1: a worker died over it",
@@ -547,7 +547,7 @@ def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: 
     poisoned(at, Cause.CRASHED)
     at.join()
     (message,) = at.unavailable()
-    assert message.text.count("sequence in quarantine snapshot 1: a worker died over it") == MOST_CANDIDATES
+    assert message.text.count("sequence in quarantine snapshot 1: a worker died over it") == 1
     only = corpus(video("bad.mp4", frames=5))
     with pytest.raises(SampleUnavailable) as raised:
         remade(monkeypatch, at.quarantine, 1, 0, catalogue=only)

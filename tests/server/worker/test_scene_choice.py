@@ -156,8 +156,9 @@ def test_sequences_are_moved_past_cuts_or_left_out() -> None:
     )  # fmt: skip
     table = SequenceTable(videos, Rows(), AUTO)
     assert starts(table) == [("a", 0), ("a", 20), ("a", 40), ("b", 0), ("b", 30), ("e", 10), ("e", 30), ("e", 60)]
-    assert [(item.video, item.voxels_per_clip) for item in table.rejections] == [("c", 3), ("d", 3)]
-    assert table.rejections[0].remedy == "voxels_per_clip at most 3, or scene off"
+    assert [item.video for item in table.refusals] == ["c", "d"]
+    assert table.longest_clips == (3, 3)
+    assert table.refusals[0].remedy == "voxels_per_clip at most 3, or scene off"
     # Of b two are not where they were, of c and d three each, of e (0, 20, 40, 60) three.
     assert table.spoilt == 11
     assert starts(SequenceTable(videos, Rows(), OFF))[3:6] == [("b", 0), ("b", 20), ("b", 40)]

@@ -1,0 +1,368 @@
+"""Server, workers' conversations and consumers over plain queues: the loop, the dispatcher and the supervisor's seam as
+they are, and no socket, process or clock. The promise holds for any interleaving of the three."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import tempfile
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
+
+from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.peers import DEADLINE, answer_to
+from tests.server.queues import Queues, ToySupervisor
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import VideoError
+from v2v_protocol.messages import (
+    Denied,
+    ErrorCode,
+    Hello,
+    Lease,
+    SampleHeader,
+    Unavailable,
+    Want,
+    Welcome,
+    WorkerHello,
+)
+from v2v_server.broker.blame import Cause
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.quarantine import read_quarantine
+from v2v_server.broker.transport import FromWorker
+from v2v_server.config import ServeConfig
+from v2v_server.serve import Server
+from v2v_server.worker.conversation import CREDIT, Action, Conversation, Leave, Listen, Load, Make, Send, Tools
+
+WORKERS = 2
+FAILING = "v1.mp4"
+
+
+@dataclass
+class Consumer:
+    """Asks, and asks again when the server has forgotten it.
+
+    Attributes:
+        owed: asked and not answered.
+        samples: answered with a sample, and how often.
+        greets: it waits for a welcome.
+    """
+
+    identity: bytes
+    queues: Queues
+    credit: int = 0
+    owed: set[int] = field(default_factory=set)
+    samples: Counter[int] = field(default_factory=Counter)
+    greets: bool = False
+
+    def say_hello(self) -> None:
+        self.greets = True
+        self.queues.consumer_says(self.identity, Hello({}, ("voxels",), 4, 7))
+
+    def ask(self, indices: set[int]) -> None:
+        self.owed |= indices
+        if not self.greets:  # all that is owed is asked for once it is welcome
+            self.queues.consumer_says(self.identity, Want(0, tuple(sorted(indices))))
+
+    def listen(self) -> None:
+        for message in self.queues.take(self.identity):
+            match message:
+                case Welcome():
+                    self.credit, self.greets = message.credit, False
+                    self.ask(self.owed)
+                case Denied(ErrorCode.UNKNOWN_SESSION):
+                    if not self.greets:
+                        self.say_hello()
+                case SampleHeader():
+                    self.owed.remove(message.index)  # nothing comes that is not waited for
+                    self.samples[message.index] += 1
+                case Unavailable():
+                    self.owed.remove(message.index)
+                case _:
+                    raise AssertionError(message)
+
+
+class Worker:
+    """A conversation whose steps are taken one at a time."""
+
+    def __init__(self, name: bytes, world: World) -> None:
+        self.name, self.world = name, world
+        self.kernels = False
+        tools = Tools(
+            is_ready=lambda lease: self.kernels or lease.indices[0] % 5 != 0,
+            is_compiled=lambda lease: lease.indices[0] % 2 == 0,
+            is_decoded=lambda lease: lease.indices[0] % 3 == 0,
+        )
+        hello = WorkerHello(name.decode(), "host", 1, NUMERICS_VERSION, CREDIT)
+        self.conversation = Conversation(hello, "queue://workers", tools, is_watched=True)
+        self.step: Action = Leave()
+        world.queues.connect(name)
+        self._take(self.conversation.start(world.now))
+
+    def _take(self, actions: list[Action]) -> None:
+        *said, self.step = actions
+        for action in said:
+            if isinstance(action, Send):
+                self.world.queues.worker_says(self.name, action.frames)
+        if isinstance(self.step, Leave):
+            self.world.end(self.name)
+
+    def go_on(self) -> None:
+        """Takes the next step."""
+        match self.step:
+            case Listen():
+                inbox = self.world.queues.sent[self.name]
+                messages = [frames[0] for frames in inbox]
+                inbox.clear()
+                self._take(self.conversation.heard(messages, self.world.now))
+            case Load():
+                self.kernels = True
+                self._take(self.conversation.loaded(self.world.now))
+            case Make(lease):
+                if lease.video == FAILING:
+                    error = VideoError(lease.video, 3, "cut short")
+                    self._take(self.conversation.failed(error, self.world.now))
+                else:
+                    self._take(self.conversation.made(self.frames(lease), self.world.now))
+
+    @staticmethod
+    def frames(lease: Lease) -> list[Any]:
+        return list(answer_to(lease))
+
+
+class World:
+    """A server and everybody who talks to it, under one clock."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.now = 1000.0
+        self.queues = Queues()
+        self.workers: dict[bytes, Worker] = {}
+        self.consumers = {name: Consumer(name, self.queues) for name in (b"c", b"d")}
+        self.started = 0
+        self.start()
+
+    def start(self) -> None:
+        """A new server in the place of the last. What workers had said waits for it; all else is lost."""
+        videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
+        file = self.folder / "quarantine.jsonl"
+        quarantine = read_quarantine(file)
+        self.dispatcher = Dispatcher(
+            videos,
+            SMALL_SPEC,
+            lease_deadline_seconds=DEADLINE,
+            session_idle_seconds=600.0,
+            max_credit_bytes=2 << 30,
+            quarantine=quarantine,
+            wall_clock=lambda: "2024-02-29T12:00:00+00:00",
+        )
+        self.supervisor = ToySupervisor(lambda name, address: self._begin(name))
+        self.supervisor.workers = list(self.workers)  # they find the new server at the same address
+        self.server = Server(
+            ServeConfig(videos="videos", workers=WORKERS),
+            cast(Any, SimpleNamespace()),
+            self.dispatcher,
+            self.queues,
+            self.supervisor,
+            quarantine,
+            file,
+            clock=lambda: self.now,
+        )
+        self.supervisor.start(self.queues.worker_address)
+        self.supervisor.scale(WORKERS)
+        self.queues.arrived = deque(one for one in self.queues.arrived if isinstance(one, FromWorker))
+        for inbox in self.queues.sent.values():
+            inbox.clear()
+        for consumer in self.consumers.values():
+            self.queues.connect(consumer.identity)
+            consumer.say_hello()
+
+    def _begin(self, name: bytes) -> None:
+        self.started += 1
+        name = f"{name.decode()}.{self.started}".encode()
+        self.supervisor.workers[-1] = name
+        self.workers[name] = Worker(name, self)
+
+    def end(self, name: bytes) -> None:
+        """That worker is gone, and its supervisor starts another."""
+        self.workers.pop(name, None)
+        self.queues.sent.pop(name, None)
+        if name in self.supervisor.workers:
+            self.supervisor.workers.remove(name)
+
+    def turn(self) -> None:
+        self.server.turn(0.0)
+        for name in set(self.workers) - set(self.supervisor.workers):
+            self.end(name)  # its supervisor gave it up
+
+    def settle(self) -> None:
+        """Everybody goes on until nobody waits for anything."""
+        for _ in range(20_000):
+            self.turn()
+            for worker in list(self.workers.values()):
+                worker.go_on()
+            for consumer in self.consumers.values():
+                consumer.listen()
+            if not any(consumer.owed for consumer in self.consumers.values()):
+                return
+            self.now += 0.05
+        raise AssertionError({name: consumer.owed for name, consumer in self.consumers.items()})
+
+
+def test_a_stream_from_want_to_sample_over_queues(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    consumer = world.consumers[b"c"]
+    for first in range(0, 40, 4):
+        consumer.ask(set(range(first, first + 4)))
+        world.settle()
+    assert consumer.samples == Counter(range(40))
+    assert len(world.workers) == WORKERS
+    assert world.dispatcher.counters.samples == 40
+    assert world.dispatcher.counters.refused_candidates > 0  # one of the videos fails
+    world.server.close()
+    assert world.supervisor.running == 0
+
+
+def test_workers_come_and_go_as_the_supervisor_is_told(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.consumers[b"c"].ask(set(range(8)))
+    world.settle()
+    for count in (5, 1, 3):
+        world.supervisor.scale(count)
+        world.now += 1.0
+        world.consumers[b"c"].ask({10 + count})
+        world.settle()
+        assert len(world.workers) == count
+    assert world.consumers[b"c"].samples == Counter([*range(8), 11, 13, 15])
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Messages are taken and steps are made in any order; workers die, hang and leave; the server is started anew."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp())
+        self.world = World(self.folder)
+        self.hung: set[bytes] = set()
+
+    def _worker(self, which: int) -> Worker | None:
+        names = sorted(set(self.world.workers) - self.hung)
+        return self.world.workers[names[which % len(names)]] if names else None
+
+    @rule(turns=st.integers(1, 6))
+    def server_turns(self, turns: int) -> None:
+        for _ in range(turns):
+            self.world.turn()
+            self.world.now += 0.03
+
+    @rule(which=st.integers(0, 3), steps=st.integers(1, 5))
+    def worker_goes_on(self, which: int, steps: int) -> None:
+        for _ in range(steps):
+            if (worker := self._worker(which)) is not None:
+                worker.go_on()
+
+    @rule(identity=st.sampled_from((b"c", b"d")))
+    def consumer_listens(self, identity: bytes) -> None:
+        self.world.consumers[identity].listen()
+
+    @rule(identity=st.sampled_from((b"c", b"d")), first=st.integers(0, 40), count=st.integers(1, 4))
+    def consumer_asks(self, identity: bytes, first: int, count: int) -> None:
+        consumer = self.world.consumers[identity]
+        indices = set(range(first, first + count)) - set(consumer.samples) - consumer.owed
+        if indices and len(consumer.owed | indices) <= consumer.credit:
+            consumer.ask(indices)
+
+    @rule(which=st.integers(0, 3), cause=st.sampled_from(list(Cause)))
+    def worker_dies(self, which: int, cause: Cause) -> None:
+        if (worker := self._worker(which)) is not None and worker.name in self.world.supervisor.workers:
+            self.world.supervisor.kill(worker.name, cause)
+            self.world.end(worker.name)
+
+    @rule(which=st.integers(0, 3))
+    def worker_hangs(self, which: int) -> None:
+        if (worker := self._worker(which)) is not None:
+            self.hung.add(worker.name)
+
+    @rule(which=st.integers(0, 3))
+    def worker_is_told_to_leave(self, which: int) -> None:
+        if (worker := self._worker(which)) is not None:
+            worker.conversation.stop()
+
+    @rule(seconds=st.sampled_from((1.0, 10.0, DEADLINE + 1)))
+    def time_passes(self, seconds: float) -> None:
+        self.world.now += seconds
+
+    @precondition(lambda self: self.world.dispatcher.counters.samples)
+    @rule()
+    def server_is_started_anew(self) -> None:
+        assert self.world.dispatcher.counters.malformed == 0
+        self.world.start()
+
+    def teardown(self) -> None:
+        for name in self.hung & set(self.world.workers):
+            if name in self.world.supervisor.workers:
+                self.world.supervisor.kill(name, Cause.KILLED)
+            self.world.end(name)
+        self.world.settle()
+        for consumer in self.world.consumers.values():
+            assert all(times == 1 for times in consumer.samples.values())
+        assert self.world.dispatcher.waiting == 0
+        assert self.world.dispatcher.counters.malformed == 0  # nothing that a conversation says is nonsense
+        shutil.rmtree(self.folder)
+
+
+TestAnyOrder = AnyOrder.TestCase
+TestAnyOrder.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+
+
+def walk(seed: int) -> Counter[str]:
+    """The same rules in a drawn order that keeps everybody at work.
+
+    Returns:
+        how often the states came about that the rules are there for.
+    """
+    draw = random.Random(seed)
+    model = AnyOrder()
+    moves: dict[str, tuple[float, Callable[[], object]]] = {
+        "turn": (30, lambda: model.server_turns(draw.randrange(1, 7))),
+        "step": (40, lambda: model.worker_goes_on(draw.randrange(4), draw.randrange(1, 6))),
+        "listen": (10, lambda: model.consumer_listens(draw.choice((b"c", b"d")))),
+        "ask": (10, lambda: model.consumer_asks(draw.choice((b"c", b"d")), draw.randrange(40), 4)),
+        "die": (2, lambda: model.worker_dies(draw.randrange(4), draw.choice(list(Cause)))),
+        "hang": (0.5, lambda: model.worker_hangs(draw.randrange(4))),
+        "leave": (1, lambda: model.worker_is_told_to_leave(draw.randrange(4))),
+        "time": (2, lambda: model.time_passes(draw.choice((1.0, 10.0, DEADLINE + 1)))),
+        "anew": (2, model.server_is_started_anew),
+    }
+    weights = [weight for weight, _ in moves.values()]
+    seen: Counter[str] = Counter()
+    for name in draw.choices(list(moves), weights, k=300):
+        if name == "anew":
+            at_work = any(isinstance(worker.step, Make) for worker in model.world.workers.values())
+            seen["started anew while samples are made"] += at_work
+            counters = model.world.dispatcher.counters
+            seen["refused"] += counters.refused_candidates
+            seen["lost"] += counters.workers_lost
+        moves[name][1]()
+    model.teardown()
+    seen["samples"] = sum(len(consumer.samples) for consumer in model.world.consumers.values())
+    return seen
+
+
+def test_long_walks_keep_the_promise_and_reach_what_is_rare() -> None:
+    seen = sum(map(walk, range(40)), Counter())
+    least = {"started anew while samples are made": 15, "refused": 100, "lost": 100, "samples": 800}
+    assert {name: seen[name] for name in least if seen[name] < least[name]} == {}
+
+
+@pytest.fixture(autouse=True)
+def _quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    """What the server tells its operator is not for the log of the tests."""

@@ -1,0 +1,320 @@
+"""What a worker says, event by event. No socket, no process, no clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgpack
+import pytest
+
+from tests.protocol.wire_messages import example
+from v2v_protocol import PROTOCOL_VERSION
+from v2v_protocol.errors import RemoteError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.messages import (
+    Begun,
+    Denied,
+    ErrorCode,
+    Goodbye,
+    Lease,
+    LeaseFailed,
+    Message,
+    Ping,
+    Pong,
+    Result,
+    Stop,
+    WorkerHello,
+)
+from v2v_protocol.wire import Frames, decode, encode
+from v2v_server.worker.conversation import (
+    Action,
+    Conversation,
+    Leave,
+    Listen,
+    Load,
+    Make,
+    Say,
+    Send,
+    Tools,
+)
+
+LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
+HELLO = WorkerHello("w", "host", 1, 1, 2)
+IN_SLOT: Frames = [b"header"]
+IN_MESSAGE: Frames = [b"header", b"array"]
+UNKNOWN = Denied(ErrorCode.UNKNOWN_SESSION, "who are you?")
+FAILURE = VideoError("a.mp4", 7, "cut short")
+
+
+def lease(number: int) -> Lease:
+    return replace(LEASE, lease=number)
+
+
+class Talk:
+    """A conversation, and what it says.
+
+    Attributes:
+        now: what its clock says.
+        heard: what it said since the last look.
+        told: what it told people.
+        step: what it wants to do next.
+        unready: leases whose kernels are not loaded.
+        compiled: whether they are compiled.
+        decoded: leases that need no decoding.
+    """
+
+    def __init__(self, *, is_watched: bool = True) -> None:
+        self.now = 1000.0
+        self._said: list[Message] = []
+        self.told: list[str] = []
+        self.unready: set[int] = set()
+        self.compiled = True
+        self.decoded: set[int] = set()
+        tools = Tools(
+            is_ready=lambda one: one.lease not in self.unready,
+            is_compiled=lambda one: self.compiled,
+            is_decoded=lambda one: one.lease in self.decoded,
+        )
+        self.conversation = Conversation(HELLO, "tcp://there", tools, is_watched=is_watched)
+        self.step: Action = Leave()
+        self._take(self.conversation.start(self.now))
+        assert self.said() == [HELLO]
+
+    def _take(self, actions: list[Action]) -> None:
+        *before, self.step = actions
+        assert isinstance(self.step, Listen | Load | Make | Leave)
+        for action in before:
+            if isinstance(action, Send):
+                self._said.append(decode(action.frames[0]))
+            else:
+                assert isinstance(action, Say)
+                self.told.append(action.text)
+
+    def said(self) -> list[Message]:
+        """What it said since the last call."""
+        said, self._said = self._said, []
+        return said
+
+    def hears(self, *messages: Message) -> list[Message]:
+        assert isinstance(self.step, Listen)
+        self._take(self.conversation.heard([encode(message)[0] for message in messages], self.now))
+        return self.said()
+
+    def makes(self, number: int, frames: Frames = IN_SLOT, seconds: float = 0.0) -> list[Message]:
+        """It makes that lease's sample."""
+        assert self.step == Make(lease(number))
+        self.now += seconds
+        self._take(self.conversation.made(frames, self.now))
+        return self.said()
+
+    def fails(self, number: int, error: VideoError = FAILURE) -> list[Message]:
+        assert self.step == Make(lease(number))
+        self._take(self.conversation.failed(error, self.now))
+        return self.said()
+
+    def loads(self) -> list[Message]:
+        assert isinstance(self.step, Load)
+        self.unready.clear()
+        self._take(self.conversation.loaded(self.now))
+        return self.said()
+
+
+def at_work(*numbers: int, is_watched: bool = True) -> Talk:
+    """A worker that makes the first of these leases."""
+    talk = Talk(is_watched=is_watched)
+    assert talk.hears(*map(lease, numbers)) == [Begun(numbers[0])]
+    return talk
+
+
+def test_the_lease_begun_next_is_named_with_what_is_done() -> None:
+    talk = at_work(1)
+    for number in (1, 2):
+        assert talk.makes(number) == []
+        assert talk.hears(lease(number + 1)) == [Result(number, begins=number + 1)]
+    assert talk.makes(3) == []
+    assert talk.hears() == [Result(3, begins=0)]
+    assert talk.hears(lease(4)) == [Begun(4)]
+
+
+def test_after_a_failure_the_next_lease_is_begun_by_itself() -> None:
+    talk = at_work(1)
+    assert talk.fails(1) == [LeaseFailed(1, 7, "cut short")]
+    assert talk.hears(lease(2)) == [Begun(2)]
+
+
+@pytest.mark.parametrize("kind", [VideoChanged, VideoUnreadable])
+def test_what_its_host_lacks_is_not_called_the_videos_fault(kind: type[VideoError]) -> None:
+    failed = at_work(1).fails(1, kind("a.mp4", None, "cannot be read"))
+    assert failed == [LeaseFailed(1, None, "cannot be read", here=True)]
+
+
+def test_a_worker_told_to_stop_begins_nothing_more() -> None:
+    talk = at_work(1, 2)
+    talk.makes(1)
+    assert talk.hears(Stop()) == [Result(1, begins=0), Goodbye()]
+    assert talk.step == Leave()
+
+
+def test_a_worker_stopped_by_a_signal_begins_nothing_of_what_it_holds() -> None:
+    talk = at_work(1, 2)
+    talk.conversation.stop()
+    talk.makes(1)
+    assert talk.hears() == [Result(1, begins=0), Goodbye()]
+    assert talk.step == Leave()
+
+
+def test_a_sample_for_a_server_that_was_restarted_is_dropped() -> None:
+    """Its lease is unknown there, or is somebody else's."""
+    talk = at_work(1, 2)
+    talk.makes(1)
+    assert talk.hears(UNKNOWN) == [HELLO]
+    assert talk.step == Listen(5.0)
+    assert talk.hears(lease(1)) == [Begun(1)]
+
+
+def test_a_server_that_knows_us_no_more_is_greeted_once_whatever_it_denies() -> None:
+    """It denies all that it was sent while it was away, and a second hello takes back what the first one brought."""
+    talk = at_work(1)
+    talk.makes(1)
+    assert talk.hears(*[UNKNOWN] * 9) == [HELLO]
+    assert talk.hears(UNKNOWN) == []
+    assert talk.hears(Pong()) == []
+    assert talk.hears(UNKNOWN) == [HELLO]
+    assert talk.hears(lease(1)) == [Begun(1)]
+    talk.makes(1)
+    assert talk.hears(UNKNOWN) == [HELLO]
+
+
+def test_a_hello_that_may_be_lost_is_said_again() -> None:
+    talk = Talk()
+    talk.now += 5.0
+    assert talk.hears() == [Ping()]
+    assert talk.hears(UNKNOWN) == [HELLO]
+
+
+@pytest.mark.parametrize("is_watched", [True, False])
+def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(is_watched: bool) -> None:
+    talk = Talk(is_watched=is_watched)
+    begun, pings = talk.now, []
+    while talk.now < begun + 2000.0:
+        assert isinstance(talk.step, Listen)
+        assert 0.0 < talk.step.seconds <= 5.0
+        talk.now += talk.step.seconds
+        if talk.hears() == [Ping()]:
+            pings.append(talk.now - begun)
+    assert pings == [5.0, 15.0, 35.0, 75.0, 155.0, 315.0, 635.0, 955.0, 1275.0, 1595.0, 1915.0]
+    assert talk.told == ([] if is_watched else ["tcp://there has not answered for 20 s; waiting"])
+
+
+def test_the_time_that_a_sample_takes_is_no_silence() -> None:
+    talk = at_work(1, is_watched=False)
+    talk.makes(1, seconds=1000.0)
+    assert talk.hears() == [Result(1, begins=0)]
+    assert talk.hears() == []
+    assert talk.told == []
+
+
+def test_what_is_no_message_is_told_and_nothing_more() -> None:
+    talk = at_work(1)
+    talk.makes(1)
+    actions = talk.conversation.heard([b"nonsense", encode(lease(2))[0]], talk.now)
+    assert [type(action) for action in actions] == [Say, Send, Make]
+
+
+def test_a_server_of_another_version_ends_the_worker() -> None:
+    """It says so in its own version, which is no message to ours; to ask it again every five seconds is no use."""
+    denial = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "denied", "code": "version", "text": "", "more": 0})
+    with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
+        Talk().conversation.heard([denial], 0.0)
+
+
+def test_a_server_that_does_not_want_this_worker_ends_it() -> None:
+    with pytest.raises(RemoteError, match="another numerics version"):
+        Talk().hears(Denied(ErrorCode.VERSION, "another numerics version"))
+
+
+class TestKernels:
+    """From lease 2 on a kernel is needed that the worker has not."""
+
+    def test_are_there_before_a_sample_is_begun(self) -> None:
+        """What is begun is timed, and blamed if it takes too long."""
+        talk = at_work(1)
+        talk.unready = {2, 3}
+        talk.makes(1)
+        assert talk.hears(lease(2)) == [Result(1, begins=0)]
+        assert talk.step == Load(lease(2))
+        assert talk.loads() == [Begun(2)]
+        assert talk.step == Make(lease(2))
+
+    def test_are_compiled_while_its_leases_are_for_others(self) -> None:
+        talk = at_work(1)
+        talk.unready, talk.compiled = {2}, False
+        talk.makes(1)
+        assert talk.hears(lease(2)) == [Result(1, begins=0), Goodbye()]
+        assert talk.loads() == []
+        assert talk.hears(lease(9)) == [HELLO]  # 9 was on its way when the server heard the goodbye
+        assert talk.hears(lease(3)) == [Begun(3)]
+
+
+class TestSiblings:
+    """The worker decodes for lease 1 and holds 2 and 3, whose samples are made of the same clip."""
+
+    @staticmethod
+    def at_first(*, is_watched: bool = True) -> Talk:
+        talk = at_work(1, 2, 3, is_watched=is_watched)
+        talk.decoded = {2, 3}
+        return talk
+
+    def test_are_announced_together(self) -> None:
+        talk = self.at_first()
+        assert talk.makes(1) + talk.makes(2) + talk.makes(3) == []
+        assert talk.hears() == [Result(1, begins=2), Result(2, begins=3), Result(3, begins=0)]
+
+    def test_wait_for_each_other(self) -> None:
+        """Seen where they are not announced at all, for a server that has forgotten them."""
+        talk = self.at_first()
+        for number in (1, 2, 3):
+            talk.makes(number)
+        assert talk.hears(UNKNOWN) == [HELLO]
+        assert talk.hears(lease(1)) == [Begun(1)]
+
+    def test_do_not_wait_for_another_clip(self) -> None:
+        talk = self.at_first()
+        talk.decoded = {2}
+        assert talk.makes(1) + talk.makes(2) == []
+        assert talk.hears() == [Result(1, begins=2), Result(2, begins=3)]
+        assert talk.step == Make(lease(3))
+
+    @pytest.mark.parametrize("seconds", [0.06, 1.0])
+    def test_do_not_wait_long(self, seconds: float) -> None:
+        """The server would see two of them take the time that it allows for one."""
+        talk = self.at_first()
+        talk.makes(1, seconds=seconds)
+        done = [Result(1, begins=2)]
+        if seconds < 0.1:
+            talk.makes(2, seconds=seconds)
+            done.append(Result(2, begins=3))
+        assert talk.hears() == done
+
+    def test_do_not_wait_with_arrays_that_travel(self) -> None:
+        talk = self.at_first()
+        talk.makes(1, IN_MESSAGE)
+        assert talk.hears() == [Result(1, begins=2)]
+
+    def test_do_not_wait_where_the_server_cannot_see_which_one_is_in_work(self) -> None:
+        talk = self.at_first(is_watched=False)
+        talk.makes(1)
+        assert talk.hears() == [Result(1, begins=2)]
+
+    def test_that_are_done_are_announced_when_the_next_fails(self) -> None:
+        talk = self.at_first()
+        talk.makes(1)
+        assert talk.fails(2) == [LeaseFailed(2, 7, "cut short")]
+        assert talk.hears() == [Result(1, begins=3)]
+
+    def test_that_are_done_are_announced_by_a_worker_that_leaves(self) -> None:
+        """Told to while it makes the second."""
+        talk = self.at_first()
+        talk.makes(1)
+        talk.conversation.stop()
+        talk.makes(2)
+        assert talk.hears() == [Result(1, begins=2), Result(2, begins=0), Goodbye()]

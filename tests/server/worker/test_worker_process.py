@@ -1,0 +1,156 @@
+"""The worker's process does what its conversation says. What it makes is nothing."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zmq
+
+from tests.protocol.wire_messages import example
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Result, Stop, WorkerHello
+from v2v_protocol.sample import Layout, new_arrays
+from v2v_protocol.wire import decode, encode
+from v2v_server.commands.worker import main as worker_command
+from v2v_server.simulation.variants import Variant
+from v2v_server.worker import process as worker_module
+from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.handover import Room
+from v2v_server.worker.process import Worker, run_worker
+
+WAIT_MS = 20_000
+LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
+LAYOUT: Layout = {"voxels": ("int8", (2, 2))}
+VARIANT = Variant("int16", True, "float32")
+
+
+class Server:
+    """The socket that a worker in a thread talks to, and what that worker's process did, in order."""
+
+    def __init__(self, router: zmq.Socket[bytes]) -> None:
+        self._router = router
+        self.did: list[str] = []
+
+    def heard(self) -> Message:
+        """The next message of the worker."""
+        assert self._router.poll(WAIT_MS), "the worker says nothing"
+        _, header, *_ = self._router.recv_multipart()
+        return decode(header)
+
+    def says(self, *messages: Message) -> None:
+        for message in messages:
+            self._router.send_multipart([b"w", *encode(message)])
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
+    """Samples in slots. Lease 2 needs no decoding, lease 3 fails, lease 4 needs a kernel that is not loaded."""
+
+    def make(lease: Lease, *_: object) -> Any:
+        at.did.append(f"make {lease.lease}")
+        if lease.lease == 3:
+            raise VideoError("a.mp4", 7, "cut short")
+        return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
+
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router, (tmp_path / "logbook").open("wb") as logbook:
+        router.setsockopt(zmq.LINGER, 0)
+        at = Server(router)
+        port = router.bind_to_random_port("tcp://127.0.0.1")
+        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{port}", logbook.fileno())
+        monkeypatch.setattr(worker_module, "make_sample", make)
+        monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
+        monkeypatch.setattr(worker_module, "room_for", lambda lease, layout: Room(new_arrays(layout), in_slot=True))
+        monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset({VARIANT} if lease.lease > 3 else ()))
+        monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)
+        monkeypatch.setattr(worker_module, "load_in_turn", lambda variant: at.did.append("load"))
+        monkeypatch.setattr(worker_module, "give_way", lambda: at.did.append("give way"))
+        monkeypatch.setattr(worker_module, "note", lambda _, lease: at.did.append(f"note {lease}"))
+        monkeypatch.setattr(Clips, "take", lambda self, lease: (None, False))
+        monkeypatch.setattr(Clips, "has", lambda self, lease: lease.lease == 2)
+        thread = threading.Thread(target=worker.run)
+        thread.start()
+        try:
+            assert isinstance(at.heard(), WorkerHello)
+            yield at
+        finally:
+            at.says(Stop())
+            thread.join(WAIT_MS / 1000)
+            assert not thread.is_alive()
+
+
+def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> None:
+    """Siblings are made in one turn on the core."""
+    server.says(*(replace(LEASE, lease=number) for number in range(1, 5)))
+    said = [server.heard()]
+    while not isinstance(said[-1], Result) or said[-1].lease != 4:
+        said.append(server.heard())
+    assert said[0] == Begun(1)
+    assert LeaseFailed(3, 7, "cut short") in said
+    assert sorted(one.lease for one in said if isinstance(one, Result)) == [1, 2, 4]
+    assert server.did == [
+        *("give way", "note 1", "make 1", "note 0"),
+        *("note 2", "make 2", "note 0"),
+        *("give way", "note 3", "make 3", "note 0"),
+        "load",
+        *("give way", "note 4", "make 4", "note 0"),
+    ]
+    server.says(Stop())
+    assert server.heard() == Goodbye()
+
+
+def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--connect nowhere: .*; write tcp://HOST:PORT"):
+        Worker("w", tmp_path, "nowhere")
+
+
+def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert worker_command(["--connect", "tcp://127.0.0.1:1", "--videos", "x" * 300]) == 2
+    assert "cannot be looked at: File name too long" in capsys.readouterr().err
+
+
+def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each is process 1 there, as here. Of two of one name the server hears one, and the other waits for ever."""
+    names: list[str] = []
+
+    class Named(Worker):
+        def __init__(self, name: str, root: Path, address: str, logbook: int | None) -> None:
+            names.append(name)
+
+        def run(self) -> None:
+            pass
+
+    monkeypatch.setattr(worker_module, "Worker", Named)
+    for asks_the_system in ("keep_freed_memory", "warm_up_in_turn", "take_long_turns"):
+        monkeypatch.setattr(worker_module, asks_the_system, lambda: None)
+    monkeypatch.setattr(worker_module, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
+    monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
+    monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
+    for name in (None, None, "mine"):
+        run_worker("tcp://127.0.0.1:5556", tmp_path, name, None)
+    assert len(set(names)) == 3
+    assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
+    assert names[2] == "mine"
+
+
+def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A batch system starts all of them with the same command."""
+    names: list[str] = []
+    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda address, root, name, *more: names.append(name))
+    command = ["--connect", "tcp://127.0.0.1:5556", "--videos", str(tmp_path), "--name", "node7"]
+    for more in ([], [], ["--logbook-fd", "3"]):
+        worker_command([*command, *more])
+    assert len(set(names)) == 3
+    assert [name[:6] for name in names] == ["node7-", "node7-", "node7"]
+
+
+def test_a_name_that_no_connection_can_have_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert worker_command(["--connect", "tcp://127.0.0.1:5556", "--videos", "videos", "--name", "n" * 300]) == 2
+    assert "--name has 300 bytes: give at most 200" in capsys.readouterr().err

@@ -1,0 +1,221 @@
+"""The server worker's process: it does what its conversation says, one step after another.
+
+Sending happens in ZeroMQ's own thread while the next sample is made. The process may be killed at any moment, and does
+nothing that would have to be undone.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import secrets
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+import zmq
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.messages import Lease, WorkerHello
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
+from v2v_server.simulation.variants import USUAL
+from v2v_server.system.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
+from v2v_server.worker.conversation import CREDIT, Action, Conversation, Listen, Load, Make, Say, Send, Tools
+from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.handover import room_for, sample_message
+from v2v_server.worker.logbook import IDLE, note
+from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
+
+MOST_NAME_BYTES = 200
+"""What an operator may call a worker; a routing identity has 255 at most."""
+_MORE = int(zmq.SNDMORE)
+"""A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
+
+
+class Worker:
+    """One worker: a socket, kernels and clips, and the conversation that says what to do with them.
+
+    Only a VideoError is reported as the video's failure. Anything else ends the process with its trace: the sample is
+    given to another worker, and an installation that is broken ends in the server's crash budget instead of a stream
+    that quietly lacks samples.
+
+    Args:
+        name: unique name, also its routing identity.
+        root: the corpus folder on this host.
+        address: where the server listens for workers.
+        logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
+
+    Raises:
+        UsageError: the address cannot be connected to.
+    """
+
+    def __init__(self, name: str, root: Path, address: str, logbook: int | None = None) -> None:
+        self._name = name
+        self._logbook = logbook
+        self._clips = Clips(root)
+        self._kernels = set(USUAL)  # that are loaded
+        self._conversation = Conversation(
+            WorkerHello(name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT),
+            address,
+            Tools(
+                is_ready=lambda lease: kernels_of(lease) <= self._kernels,
+                is_compiled=lambda lease: all(map(is_compiled, kernels_of(lease) - self._kernels)),
+                is_decoded=self._clips.has,
+            ),
+            is_watched=logbook is not None,
+        )
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        self._socket.setsockopt(zmq.LINGER, 5000)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
+        # Leases bound what is queued: at most CREDIT samples in either direction.
+        self._socket.setsockopt(zmq.SNDHWM, 0)
+        self._socket.setsockopt(zmq.RCVHWM, 0)
+        self._socket.setsockopt(zmq.IPV6, int("[" in address))
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+
+    def stop(self) -> None:
+        """Finishes the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
+        self._conversation.stop()
+
+    def run(self) -> None:
+        """Works until told to stop.
+
+        Raises:
+            RemoteError: the server does not want this worker (another numerics version).
+            VersionMismatch: the server speaks another version of the protocol.
+        """
+        try:
+            actions = self._conversation.start(time.monotonic())
+            while actions:
+                *said, step = actions
+                for action in said:
+                    self._do(action)
+                actions = self._take(step)
+        finally:
+            self._context.destroy()
+
+    def _do(self, action: Action) -> None:
+        if isinstance(action, Send):
+            *first, last = action.frames
+            for frame in first:
+                self._socket.send(frame, _MORE, copy=False)
+            self._socket.send(last, copy=False)
+        elif isinstance(action, Say):
+            print(f"{self._name}: {action.text}", file=sys.stderr)
+
+    def _take(self, step: Action) -> list[Action]:
+        """Takes the next step; returns what the conversation says to what came of it."""
+        conversation = self._conversation
+        match step:
+            case Listen(seconds):
+                messages = self._messages(seconds)
+                return conversation.heard(messages, time.monotonic())
+            case Load(lease):
+                for variant in kernels_of(lease) - self._kernels:
+                    load_in_turn(variant)
+                    self._kernels.add(variant)
+                return conversation.loaded(time.monotonic())
+            case Make(lease):
+                if not self._clips.has(lease):
+                    give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
+                note(self._logbook, lease.lease)
+                try:
+                    made: Frames | VideoError = self._made(lease)
+                except VideoError as error:
+                    made = error
+                note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
+                now = time.monotonic()
+                return conversation.failed(made, now) if isinstance(made, VideoError) else conversation.made(made, now)
+            case _:
+                return []  # Leave
+
+    def _messages(self, wait_seconds: float) -> list[bytes]:
+        """The first frames of all messages that are there."""
+        messages: list[bytes] = []
+        timeout_ms = math.ceil(wait_seconds * 1000)
+        while self._poller.poll(0 if messages else timeout_ms):
+            first, *_ = self._socket.recv_multipart()
+            messages.append(first)
+        return messages
+
+    def _made(self, lease: Lease) -> Frames:
+        """The message of a lease's sample.
+
+        Raises:
+            VideoError: its video cannot give it.
+        """
+        room = room_for(lease, sample_layout(lease))
+        started = time.process_time()
+        clip, decoded = self._clips.take(lease)
+        if decoded:
+            # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
+            # Python's collector, which waits for many, but each holds pictures.
+            gc.collect()
+        sample = make_sample(lease, clip, room.arrays)
+        return sample_message(
+            lease,
+            room,
+            provenance=sample.provenance.to_dict(),
+            worker=self._name,
+            cpu_seconds=time.process_time() - started,
+            decoded=decoded,
+        )
+
+
+def unshared_name(beginning: str | None) -> str:
+    """A name that no other worker has: of two of one name the server would hear one, and the other wait for ever.
+
+    Args:
+        beginning: what its operator calls it, and perhaps others too; None: host and process id, which in containers
+            may be the same for all.
+
+    Raises:
+        UsageError: it is too long to be a routing identity with what is added to it.
+    """
+    if beginning is not None and len(beginning.encode()) > MOST_NAME_BYTES:
+        raise UsageError(f"--name has {len(beginning.encode())} bytes: give at most {MOST_NAME_BYTES}")
+    return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
+
+
+def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:
+    """Runs one worker in this process until the server stops it.
+
+    Args:
+        address: where the server listens for workers.
+        root: the corpus folder on this host.
+        name: unique name; by default host, process id and something random.
+        parent_pid: the server, when this is one of its own processes: we die with it.
+        logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
+
+    Raises:
+        UsageError: the address cannot be connected to.
+        RemoteError, VersionMismatch: the server refuses this worker.
+    """
+    if parent_pid is not None:
+        die_with_parent(parent_pid)
+    keep_freed_memory()
+    # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
+    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
+    # Compile or load the kernels first: a worker that has said hello can work at full speed.
+    warm_up_in_turn()
+    # What is there by now stays: without it a collection takes a fraction of a millisecond.
+    gc.collect()
+    gc.freeze()
+    worker = Worker(name or unshared_name(None), root, address, logbook)
+    signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
+    # Now that ZeroMQ's threads are there, which had better come at once.
+    take_long_turns()
+    worker.run()
