@@ -36,6 +36,7 @@ BENCHMARKS = {
     "physics": "accuracy.physics",
     "extremes": "accuracy.extremes",
     "scene": "accuracy.scene",
+    "learn": "accuracy.learn",
     "chaos": "chaos.chaos",
     "chaos_check": "chaos.check",
     "soak": "chaos.soak",

@@ -1,0 +1,88 @@
+"""The judgement of networks on clips they never saw: against what it must be by definition, and one run for real."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.clips import panned_luma, write_clip
+from trainer.models import NETWORKS
+from v2v_bench import cli
+from v2v_bench.accuracy import learn
+from v2v_protocol.errors import UsageError
+
+
+def clip() -> tuple[torch.Tensor, torch.Tensor]:
+    """Voxels that spell out the frames, 5 samples of 4 steps."""
+    frames = torch.rand(5, 4, 1, 8, 8)
+    return frames.repeat(1, 1, 5, 1, 1), frames
+
+
+def test_a_network_that_sees_is_without_fault() -> None:
+    found = learn.score(lambda voxels: voxels[:, :, :1], *clip(), None)
+    assert found == pytest.approx({"correlation": 1.0, "mean_absolute_error": 0.0}, abs=1e-5)
+
+
+def test_only_the_later_half_counts() -> None:
+    voxels, frames = clip()
+    voxels[:, :2] = 1 - voxels[:, :2]
+    found = learn.score(lambda voxels: voxels[:, :, :1], voxels, frames, None)
+    assert found == pytest.approx({"correlation": 1.0, "mean_absolute_error": 0.0}, abs=1e-5)
+
+
+def test_pictures_are_clamped_first() -> None:
+    voxels, _ = clip()
+    found = learn.score(lambda voxels: voxels[:, :, :1] + 7, voxels, torch.ones(5, 4, 1, 8, 8), None)
+    assert found["mean_absolute_error"] == 0.0
+
+
+def test_constant_grey_is_the_mean_of_what_is_judged() -> None:
+    voxels, frames = clip()
+    frames[:, 2:, :, :4], frames[:, 2:, :, 4:] = 0.25, 0.75
+    found = learn.score(learn._grey(frames), voxels, frames, None)
+    assert found == pytest.approx({"correlation": 0.0, "mean_absolute_error": 0.25}, abs=1e-3)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    torch.save(NETWORKS["firenet"](base_channels=2).state_dict(), tmp_path / "weights.pth")
+    return tmp_path / "weights.pth"
+
+
+def asked(weights: tuple[str, ...] = (), normalized: tuple[str, ...] = ()) -> argparse.Namespace:
+    return argparse.Namespace(weights=weights, ema_weights=(), normalized_weights=normalized)
+
+
+def test_the_same_file_can_be_judged_with_and_without_normalisation(weights: Path) -> None:
+    found = learn.networks(asked((f"plain={weights}",), (f"normal={weights}",)))
+    assert {name: network.normalizes for name, network in found.items()} == {"plain": False, "normal": True}
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [((), "no network to judge"), (("x",), "'x': write NAME=FILE"), (("x={}", "x={}"), "two networks are called 'x'")],
+)
+def test_what_cannot_be_judged_is_said(weights: Path, entries: tuple[str, ...], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        learn.networks(asked(tuple(entry.format(weights) for entry in entries)))
+
+
+@pytest.mark.slow
+def test_a_network_and_grey_on_a_real_stream(weights: Path, tmp_path: Path) -> None:
+    """An untrained network is judged under both sorts of cameras, on the same samples as the constant."""
+    (tmp_path / "clips").mkdir()
+    write_clip(tmp_path / "clips" / "one.mp4", panned_luma(101, 128, 144, step=(1, 2)), gop=25)
+    file = tmp_path / "out.json"
+    flags = ["--held-out", str(tmp_path / "clips"), "--weights", f"new={weights}", "--samples", "2"]
+    assert cli.main(["learn", *flags, "--json", str(file)]) == 0
+    records = json.loads(file.read_text())
+    assert [(record["network"], record["cameras"]) for record in records] == [
+        (name, cameras) for cameras in ("ordinary", "paper") for name in ("constant grey", "new")
+    ]
+    assert all(record["samples"] == 2 and record["mean_absolute_error"] > 0 for record in records)
+    assert records[0]["correlation"] == pytest.approx(0.0, abs=1e-3)
