@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import inspect
 import math
 from collections.abc import Iterable, Mapping
@@ -16,7 +17,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from trainer.config import OptimizerConfig, RunConfig, TrainConfig, setting_of
 from trainer.models import NETWORKS, VoxelNetwork
-from trainer.run.checkpoint import Checkpoint, capture_rng, restore_rng
+from trainer.run.checkpoint import Checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import TASKS, Task
 from trainer.tasks.task import Work
@@ -36,6 +37,7 @@ class Learner:
         average: the averaged network, or None.
         config: of the run.
         device: where all of this computes.
+        rank: of this process; dropout differs between ranks.
     """
 
     network: VoxelNetwork
@@ -45,6 +47,7 @@ class Learner:
     average: AveragedNetwork | None
     config: TrainConfig
     device: torch.device
+    rank: int
 
     @property
     def trained(self) -> VoxelNetwork:
@@ -64,6 +67,7 @@ class Learner:
         """
         config = self.config.compute
         pieces = work.pieces(config.pieces)
+        torch.manual_seed(_seed(config.seed, self.rank, step))
         losses: dict[str, Tensor] = {}
         self.optimizer.zero_grad()
         for number, piece in enumerate(pieces, start=1):
@@ -97,7 +101,6 @@ class Learner:
             model=self.network.state_dict(),
             optimizer=self.optimizer.state_dict(),
             ema=None if self.average is None else dict(self.average.network.state_dict()),
-            rng=capture_rng(self.device),
             stream=stream,
             config=self.config.to_dict(),
         )
@@ -108,7 +111,6 @@ class Learner:
         _restore_optimizer(self.optimizer, checkpoint.optimizer)
         if self.average is not None and checkpoint.ema is not None:
             self.average.network.load_state_dict(checkpoint.ema)
-        restore_rng(checkpoint.rng, self.device)
 
 
 def build(config: TrainConfig, ranks: Ranks) -> Learner:
@@ -136,11 +138,9 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     if ranks.world_size > 1:
         devices = [ranks.device] if ranks.device.type == "cuda" else None
         model = DistributedDataParallel(network, device_ids=devices)
-        # Equal first weights everywhere, but not equal dropout.
-        torch.manual_seed(compute.seed + ranks.rank)
     if compute.compile:
         model = torch.compile(model)  # type: ignore[assignment]
-    return Learner(network, model, task, optimizer, average, config, ranks.device)
+    return Learner(network, model, task, optimizer, average, config, ranks.device, ranks.rank)
 
 
 def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int) -> float:
@@ -197,6 +197,11 @@ class AveragedNetwork:
         for mine, theirs in pairs:
             if not mine.is_floating_point():
                 mine.copy_(theirs)  # a counter has no average
+
+
+def _seed(seed: int, rank: int, step: int) -> int:
+    """Of the random numbers of one step on one rank (dropout): so a resumed run has those of the uninterrupted one."""
+    return int.from_bytes(hashlib.blake2b(f"{seed} {rank} {step}".encode(), digest_size=8).digest(), "little")
 
 
 def _set_numerics(precision: str) -> None:

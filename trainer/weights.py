@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from trainer.models import NETWORKS, VoxelNetwork
@@ -42,11 +43,13 @@ class WeightFile:
         """Names in a network of this kind by name in the file.
 
         Raises:
-            UsageError: two keys become one.
+            UsageError: two keys become one, and their tensors differ (modules that are registered twice do not).
         """
         names = {name: kind.own_name(name.replace("_orig_mod.", "").removeprefix("module.")) for name in self.state}
-        if len(set(names.values())) < len(names):
-            raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
+        first: dict[str, str] = {}
+        for name, own in names.items():
+            if not torch.equal(self.state[first.setdefault(own, name)], self.state[name]):
+                raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
         return names
 
     def recognised(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:
@@ -67,7 +70,10 @@ class WeightFile:
         kind, told = NETWORKS[name], {}
         if self._of(kind):
             state = {new: self.state[old] for old, new in self.named_for(kind).items()}
-            told = kind.from_state(state, self.settings)
+            try:
+                told = kind.from_state(state, self.settings)
+            except KeyError as error:
+                raise UsageError(f"{self.path}: weights of {name} with {error} missing") from error
         return name, told | (dict(self.trained_as.get("options", {})) if name == trained else {})
 
     def _of(self, kind: type[VoxelNetwork]) -> bool:

@@ -1,10 +1,31 @@
 """The networks, one a file. Every one takes [B, T, bins, H, W] voxel grids and gives a sequence of pictures or flow."""
 
 from trainer.models.e2vid import E2VID
+from trainer.models.eraft import ERAFT
+from trainer.models.etnet import ETNet
+from trainer.models.evflownet import EVFlowNet
 from trainer.models.firenet import FireNet
+from trainer.models.hypere2vid import HyperE2VID
 from trainer.models.sequence import VoxelNetwork, normalize_voxels
 
-NETWORKS: dict[str, type[VoxelNetwork]] = {"e2vid": E2VID, "firenet": FireNet}
+NETWORKS: dict[str, type[VoxelNetwork]] = {
+    "e2vid": E2VID,
+    "hypere2vid": HyperE2VID,
+    "etnet": ETNet,
+    "firenet": FireNet,
+    "evflownet": EVFlowNet,
+    "eraft": ERAFT,
+}
 """Networks by the name that a configuration file gives them."""
 
-__all__ = ["E2VID", "NETWORKS", "FireNet", "VoxelNetwork", "normalize_voxels"]
+__all__ = [
+    "E2VID",
+    "ERAFT",
+    "NETWORKS",
+    "ETNet",
+    "EVFlowNet",
+    "FireNet",
+    "HyperE2VID",
+    "VoxelNetwork",
+    "normalize_voxels",
+]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -107,7 +107,10 @@ class E2VID(VoxelNetwork):
         UsageError: a setting that is none of these.
     """
 
-    signature = ("unetrecurrent.decoders.0.conv2d.weight", "unetrecurrent.decoders.0.transposed_conv2d.weight")
+    signature: ClassVar[tuple[str, ...]] = (
+        "unetrecurrent.decoders.0.conv2d.weight",
+        "unetrecurrent.decoders.0.transposed_conv2d.weight",
+    )
 
     def __init__(
         self,

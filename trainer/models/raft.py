@@ -13,7 +13,7 @@ authors' repository are renamed by :func:`torchvision_names`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -91,12 +91,12 @@ class _Block(nn.Module):
 
 
 class _Encoder(nn.Module):
-    """[N, 3, H, W] -> [N, outputs, H / 8, W / 8]."""
+    """[N, inputs, H, W] -> [N, outputs, H / 8, W / 8]."""
 
-    def __init__(self, size: Size, outputs: int, norm: str) -> None:
+    def __init__(self, size: Size, inputs: int, outputs: int, norm: str) -> None:
         super().__init__()
         first, *rest, _ = size.features
-        self.convnormrelu = _convolution(3, first, 7, 2, norm)
+        self.convnormrelu = _convolution(inputs, first, 7, 2, norm)
         for number, (inputs, width, stride) in enumerate(zip(size.features, rest, (1, 2, 2), strict=False), start=1):
             blocks = nn.Sequential(
                 _Block(inputs, width, stride, norm, size.bottleneck), _Block(width, width, 1, norm, size.bottleneck)
@@ -193,13 +193,14 @@ class RAFT(nn.Module):
 
     Args:
         size: "small" (990,162 parameters) or "large" (5,257,536).
+        inputs: channels of a picture.
     """
 
-    def __init__(self, size: str) -> None:
+    def __init__(self, size: str, inputs: int = 3) -> None:
         super().__init__()
         self.size = SIZES[size]
-        self.feature_encoder = _Encoder(self.size, self.size.features[-1], "instance")
-        self.context_encoder = _Encoder(self.size, self.size.context, "batch" if size == "large" else "")
+        self.feature_encoder = _Encoder(self.size, inputs, self.size.features[-1], "instance")
+        self.context_encoder = _Encoder(self.size, inputs, self.size.context, "batch" if size == "large" else "")
         self.update_block = _UpdateBlock(self.size)
         self.mask_predictor = _MaskPredictor(self.size.hidden) if self.size.learned_upsampling else None
 
@@ -207,26 +208,54 @@ class RAFT(nn.Module):
         """Flow from ``first`` to ``second``.
 
         Args:
-            first, second: [N, 3, H, W] in -1 .. 1; H and W multiples of 8, at least 128.
+            first, second: [N, inputs, H, W], pictures in -1 .. 1; H and W multiples of 8, at least 128.
             updates: corrections of the flow.
 
         Returns:
             [N, 2, H, W] float32, (x, y), px: after the last correction.
         """
-        features = self.feature_encoder(torch.cat([first, second])).float()
-        pyramid = correlation_pyramid(*features.chunk(2))
-        hidden, context = self.context_encoder(first).split([self.size.hidden, self.size.context - self.size.hidden], 1)
-        hidden, context = torch.tanh(hidden), functional.relu(context)
-        start = _grid(len(first), features.shape[2], features.shape[3], features.device)
-        flow = torch.zeros_like(start)
+        features = self.features(torch.cat([first, second])).chunk(2)
+        *_, (flow, hidden) = self.refine(correlation_pyramid(*features), *self.context(first), updates)
+        return self.upsampled(flow, hidden)
+
+    def features(self, pictures: Tensor) -> Tensor:
+        """What is compared: [N, inputs, H, W] -> [N, C, H / 8, W / 8], float32 or wider."""
+        found: Tensor = self.feature_encoder(pictures)
+        return found.to(torch.promote_types(found.dtype, torch.float32))
+
+    def context(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """The first hidden state, and what the recurrent unit is told each time, both [N, C, H / 8, W / 8]."""
+        split = [self.size.hidden, self.size.context - self.size.hidden]
+        hidden, context = self.context_encoder(picture).split(split, dim=1)
+        return torch.tanh(hidden), functional.relu(context)
+
+    def refine(
+        self, pyramid: list[Tensor], hidden: Tensor, context: Tensor, updates: int, flow: Tensor | None = None
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Flow at an eighth of the size, with the hidden state, after each correction.
+
+        Args:
+            pyramid: of :func:`correlation_pyramid`.
+            hidden, context: of :meth:`context`.
+            updates: corrections.
+            flow: to start from, [N, 2, H / 8, W / 8]; None: none.
+        """
+        count, _, height, width = hidden.shape
+        grid = _grid(height, width, pyramid[0]).expand(count, 2, height, width)
+        flow = torch.zeros_like(grid) if flow is None else flow
         for _ in range(updates):
-            correlation = look_up(pyramid, start + flow, self.size.radius)
+            flow = flow.detach()  # each correction is trained by itself
+            correlation = look_up(pyramid, grid + flow, self.size.radius)
             hidden, correction = self.update_block(hidden, context, correlation, flow)
-            flow = flow + correction.float()
+            flow = flow + correction.to(flow.dtype)
+            yield flow, hidden
+
+    def upsampled(self, flow: Tensor, hidden: Tensor) -> Tensor:
+        """Flow of :meth:`refine` at full size."""
         if self.mask_predictor is None:
             shape = [DOWNSCALE * side for side in flow.shape[2:]]
             return DOWNSCALE * functional.interpolate(flow, shape, mode="bilinear", align_corners=True)
-        return _convex_upsampling(flow, self.mask_predictor(hidden).float())
+        return convex_upsampling(flow, self.mask_predictor(hidden).to(flow.dtype))
 
 
 def correlation_pyramid(first: Tensor, second: Tensor) -> list[Tensor]:
@@ -265,18 +294,43 @@ def look_up(pyramid: list[Tensor], centre: Tensor, radius: int) -> Tensor:
     centre = centre.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2)
     found = []
     for level, plane in enumerate(pyramid):
-        extent = centre.new_tensor([plane.shape[-1] - 1, plane.shape[-2] - 1])
-        where = 2 * (centre / 2**level + offsets) / extent - 1
-        found.append(functional.grid_sample(plane, where, align_corners=True).reshape(count, height, width, -1))
+        # In the convention in which -1 and 1 are the outer edges of the plane: it may then be one pixel wide.
+        x, y = (centre / 2**level + offsets).unbind(-1)
+        where = torch.stack([(2 * x + 1) / plane.shape[-1] - 1, (2 * y + 1) / plane.shape[-2] - 1], dim=-1)
+        found.append(functional.grid_sample(plane, where, align_corners=False).reshape(count, height, width, -1))
     return torch.cat(found, dim=-1).permute(0, 3, 1, 2).contiguous()
 
 
-def _grid(count: int, height: int, width: int, device: torch.device) -> Tensor:
-    y, x = torch.meshgrid(torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij")
-    return torch.stack([x, y]).float().expand(count, 2, height, width)
+def _grid(height: int, width: int, like: Tensor) -> Tensor:
+    """(x, y) of every pixel, [2, height, width]."""
+    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([x, y])
 
 
-def _convex_upsampling(flow: Tensor, weights: Tensor) -> Tensor:
+def forward_splat(flow: Tensor) -> Tensor:
+    """Flow carried along by itself: what the flow of the next step probably is, if everything goes on as it does.
+
+    Every vector is laid down where it points to, on the four pixels around, by bilinear weights; a pixel takes the
+    weighted mean of what lands on it, and 0 where nothing does.
+
+    Args:
+        flow: [N, 2, H, W] (x, y), px.
+    """
+    count, _, height, width = flow.shape
+    x, y = (_grid(height, width, flow) + flow).unbind(1)
+    left, top = x.floor(), y.floor()
+    sums = flow.new_zeros(count, 3, height * width)
+    for column, row in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        weight = torch.where(inside, (1 - (x - column).abs()) * (1 - (y - row).abs()), 0.0)
+        place = row.clamp(0, height - 1).long() * width + column.clamp(0, width - 1).long()
+        laid = torch.cat([flow * weight[:, None], weight[:, None]], dim=1).flatten(2)
+        sums.scatter_add_(2, place.flatten(1)[:, None].expand(-1, 3, -1), laid)
+    return (sums[:, :2] / sums[:, 2:].clamp_min(1e-15)).unflatten(2, (height, width))  # type: ignore[no-any-return, no-untyped-call]
+
+
+def convex_upsampling(flow: Tensor, weights: Tensor) -> Tensor:
     """Each fine pixel's flow is a convex combination of its 3 x 3 coarse neighbours (section 3.3 of the paper)."""
     count, _, height, width = flow.shape
     share = weights.view(count, 1, 9, DOWNSCALE, DOWNSCALE, height, width).softmax(dim=2)
@@ -304,18 +358,13 @@ _RENAMED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 )
 
 
-def torchvision_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Weights of the authors' repository (princeton-vl/RAFT) under torchvision's names; those pass unchanged.
+def torchvision_name(name: str, *, bottleneck: bool = False) -> str:
+    """The name that torchvision gives to a tensor of the authors' repository (princeton-vl/RAFT); its own pass.
 
     The authors' blocks register the norm of their shortcut twice, as ``norm3`` (``norm4`` in bottlenecks) and as
-    ``downsample.1``: where both are there, the first is left out.
+    ``downsample.1``: both have the same name here.
     """
-    renamed = {}
-    for name, value in weights.items():
-        block = re.sub(r"\.norm[34]\.", ".downsample.1.", name)
-        if block != name and block in weights:
-            continue
-        for pattern, replacement in _RENAMED:
-            name = re.sub(pattern, replacement, name)
-        renamed[name] = value
-    return renamed
+    name = re.sub(rf"\.norm{4 if bottleneck else 3}\.", ".downsample.1.", name)
+    for pattern, replacement in _RENAMED:
+        name = re.sub(pattern, replacement, name)
+    return name

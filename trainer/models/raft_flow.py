@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from trainer.models.raft import DOWNSCALE, RAFT, SMALLEST_SIDE_PX, torchvision_names
+from trainer.models.raft import DOWNSCALE, RAFT, SMALLEST_SIDE_PX, torchvision_name
 from trainer.weights import read_tensors
 from v2v_protocol.errors import UsageError
 
@@ -36,7 +36,9 @@ class RaftFlow:
         weights: file in torchvision's or the authors' layout. Nothing is downloaded.
         device: where to compute.
         bfloat16: run the convolutions in bfloat16; correlation, positions and flow stay float32.
-        pairs_at_once: bounds memory, which the correlation takes: about 1.33 * 4 * (H W / 64)^2 bytes a pair.
+        pairs_at_once: bounds memory: a pair takes about 1.33 * 4 * (H W / 64)^2 bytes for the correlation (350 kB at
+            128 x 128), and some 10 kB a pixel in the encoders of the large network. Many small batches keep a GPU
+            waiting for the processor: 64 pairs at a time made four times as many kernels as 240.
 
     Raises:
         UsageError: an unknown size; a file that is missing, unreadable or of another network.
@@ -49,14 +51,16 @@ class RaftFlow:
         device: torch.device | str = "cpu",
         *,
         bfloat16: bool = False,
-        pairs_at_once: int = 64,
+        pairs_at_once: int = 480,
     ) -> None:
         if size not in WHERE_TO_GET_WEIGHTS:
             raise UsageError(f"RAFT size {size!r}: choose one of {', '.join(WHERE_TO_GET_WEIGHTS)}")
         if pairs_at_once < 1:
             raise UsageError(f"RAFT pairs at once = {pairs_at_once}: give at least 1")
         network = RAFT(size)
-        state = torchvision_names(_read_weights(Path(weights), size))
+        bottleneck = network.size.bottleneck
+        found = _read_weights(Path(weights), size).items()
+        state = {torchvision_name(name, bottleneck=bottleneck): tensor for name, tensor in found}
         _check_fit(state, network, Path(weights), size)
         network.load_state_dict(state, strict=True)
         self._network = network.to(device).eval().requires_grad_(False)

@@ -1,8 +1,8 @@
 """Checkpoints of a training run: everything that decides its next losses, and nothing that needs code to be read.
 
-A checkpoint holds tensors and plain values only, so it loads with ``weights_only=True``: state dicts of the network,
-the optimiser and the scheduler (never the objects), the state of the random generators, the position in the stream
-after the last batch that was trained on (``Batch.resume_state``), the counters and the configuration.
+A checkpoint holds tensors and plain values only, so it loads with ``weights_only=True``: state dicts of the network and
+the optimiser (never the object), the position in the stream after the last batch that was trained on
+(``Batch.resume_state``), the counters and the configuration.
 
 Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole. Which run a
 checkpoint belongs to, and which folder a run may write to, is decided here as well.
@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from trainer.config import TrainConfig, differences
-from trainer.run.distributed import on_gpu
 from trainer.unpickle import read_torch_file
 from v2v_protocol.errors import UsageError
 
@@ -51,7 +50,6 @@ class Checkpoint:
         model: state dict of the network itself (unwrapped: not of DistributedDataParallel).
         optimizer: its state dict.
         ema: state dict of the averaged network, or None without one.
-        rng: of :func:`capture_rng`.
         stream: ``resume_state`` of the last batch trained on; None before the first.
         config: the run's configuration as plain values.
     """
@@ -61,27 +59,8 @@ class Checkpoint:
     model: Mapping[str, Tensor]
     optimizer: Mapping[str, Any]
     ema: Mapping[str, Tensor] | None
-    rng: Mapping[str, Any]
     stream: Mapping[str, Any] | None
     config: Mapping[str, Any]
-
-
-def capture_rng(device: torch.device) -> dict[str, Any]:
-    """State of PyTorch's generators on the CPU and, where ``device`` is a GPU, on that one: "cuda" lists it."""
-    cuda = [torch.cuda.get_rng_state(device)] if device.type == "cuda" else []
-    return {"torch": torch.get_rng_state(), "cuda": cuda}
-
-
-def restore_rng(state: Mapping[str, Any], device: torch.device) -> None:
-    """Set the generators back to what :func:`capture_rng` saw, as far as ``device`` has them.
-
-    Earlier releases listed all GPUs that the process saw, by their number.
-    """
-    torch.set_rng_state(state["torch"])
-    cuda = state["cuda"]
-    if cuda and device.type == "cuda":
-        index = device.index or 0
-        torch.cuda.set_rng_state(cuda[index if index < len(cuda) else 0], device)
 
 
 def _plain(value: Any, place: str) -> Any:
@@ -191,8 +170,7 @@ def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
             f"--resume: the checkpoint is of another run ({'; '.join(refused)}). Give its settings, or start a new run "
             "from its weights with network.weights"
         )
-    drawn = ["cuda" if gpu else "cpu" for gpu in (checkpoint.rng["cuda"], on_gpu(config.compute.device))]
-    return [*shown.values(), *([f"random generator: {drawn[0]} -> {drawn[1]}"] if drawn[0] != drawn[1] else [])]
+    return list(shown.values())
 
 
 def require_fresh(out: Path) -> None:

@@ -16,6 +16,12 @@ Array = npt.NDArray[np.float64]
 Weights = Mapping[str, Array]
 
 
+def counts(shape: tuple[int, ...], seed: int = 0) -> npt.NDArray[np.int8]:
+    """Signed event counts, mostly 0, as they come from the stream."""
+    rng = np.random.default_rng(seed)
+    return (rng.integers(-3, 4, shape) * (rng.random(shape) < 0.3)).astype(np.int8)
+
+
 def random_weights(network: torch.nn.Module, seed: int) -> dict[str, Array]:
     """Weights of the scale of an initialised network, drawn key by key; put into ``network`` as well, in float64."""
     rng = np.random.default_rng(seed)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.trainer.models.raft_pairs import HEIGHT, SAMPLED, WIDTH, formula_weights, pictures
 from trainer.losses.warp import warp
-from trainer.models.raft import RAFT, SIZES, look_up, torchvision_names
+from trainer.models.raft import RAFT, SIZES, look_up, torchvision_name
 from trainer.models.raft_flow import RaftFlow
 from v2v_protocol.errors import UsageError
 
@@ -90,7 +90,7 @@ def test_published_weights_agree_with_torchvision_and_find_the_motion() -> None:
 @pytest.mark.parametrize("size", sorted(SIZES))
 def test_parameters(size: str) -> None:
     assert sum(value.numel() for value in RAFT(size).parameters()) == PARAMETERS[size]
-    assert set(torchvision_names(RAFT(size).state_dict())) == set(RAFT(size).state_dict())
+    assert set(map(torchvision_name, RAFT(size).state_dict())) == set(RAFT(size).state_dict())
 
 
 def test_batches_are_cut_without_a_trace_and_bytes_are_as_good_as_floats(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""E-RAFT: RAFT between the voxel grids of two windows (Gehrig et al., 3DV 2021).
+
+It is RAFT, large (:mod:`trainer.models.raft`), with three changes: pictures are voxel grids; the context is that of the
+later grid, whose flow it is; and the flow of the window before, carried along by itself, is where the search begins.
+So a sequence of T outputs takes T + 1 grids.
+
+5,270,080 parameters with 5 bins, 5,332,800 with 15.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from trainer.models.raft import RAFT, correlation_pyramid, forward_splat, torchvision_name
+from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork
+from v2v_protocol.errors import UsageError
+
+UPDATES = 12
+SIZE_MULTIPLE_PX = 32
+SMALLEST_SIDE_PX = 64
+"""The coarsest of four correlations has a pixel then."""
+
+
+class ERAFTState(NamedTuple):
+    """Memory: the last voxel grid as the network saw it [B, bins, H, W], and the first flow [B, 2, H / 8, W / 8]."""
+
+    voxel: Tensor
+    start: Tensor | None
+
+
+class ERAFT(VoxelNetwork):
+    """E-RAFT. In training it gives the flow after each of 12 updates, otherwise that after the last one.
+
+    Args:
+        bins: bins of a voxel grid; the published network has 15.
+        warm_start: begin where the window before leads, else with no flow.
+        normalize_voxels: see :class:`VoxelNetwork`; the published network was trained so.
+        padding: see :class:`VoxelNetwork`.
+    """
+
+    task = "flow"
+    signature = ("raft.feature_encoder.convnormrelu.0.weight",)
+    lead_voxels = 1
+
+    def __init__(
+        self,
+        *,
+        bins: int = 5,
+        warm_start: bool = True,
+        normalize_voxels: bool = False,
+        padding: Padding = "top-left",
+    ) -> None:
+        if bins < 1:
+            raise UsageError(f"ERAFT bins = {bins}: give 1 or more")
+        super().__init__(bins=bins, size_multiple=SIZE_MULTIPLE_PX, normalizes=normalize_voxels, padding=padding)
+        self.raft = RAFT("large", inputs=bins)
+        self.warm_start = warm_start
+
+    def unroll(
+        self, x: Tensor, state: ERAFTState | None, steps: int, _guide: Guide | None
+    ) -> tuple[Tensor, ERAFTState]:
+        """See :meth:`VoxelNetwork.unroll`."""
+        start = None if state is None else state.start
+        batch = len(x) // steps
+        voxels = x if state is None else torch.cat([state.voxel, x])
+        # What has no memory runs on all windows at once. Batch norm of the context so counts once a sequence.
+        features = torch.split(self.raft.features(voxels), batch)
+        hidden, context = (torch.split(tensor, batch) for tensor in self.raft.context(voxels[batch:]))
+        outputs = []
+        for step in range(len(features) - 1):
+            pyramid = correlation_pyramid(features[step], features[step + 1])
+            found = list(self.raft.refine(pyramid, hidden[step], context[step], UPDATES, start))
+            if self.warm_start:
+                start = forward_splat(found[-1][0].detach())
+            outputs.append([self.raft.upsampled(*each) for each in (found if self.training else found[-1:])])
+        flow = torch.stack([torch.cat(of_update) for of_update in zip(*outputs, strict=True)])
+        return flow if self.training else flow[0], ERAFTState(voxels[-batch:], start)
+
+    def _edges(self, height: int, width: int) -> tuple[int, int, int, int]:
+        left, right, top, bottom = super()._edges(height, width)
+        return (
+            left + max(0, SMALLEST_SIDE_PX - left - width - right), right,
+            top + max(0, SMALLEST_SIDE_PX - top - height - bottom), bottom,
+        )  # fmt: skip
+
+    @classmethod
+    def own_name(cls, name: str) -> str:
+        """The authors use the names of RAFT's authors."""
+        return name if name.startswith("raft.") else f"raft.{torchvision_name(name)}"
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
+        """Bins from the tensors."""
+        bins = state["raft.feature_encoder.convnormrelu.0.weight"].shape[1]
+        return {"bins": bins, "normalize_voxels": bool(settings.get("normalize", bins == 15))}
