@@ -49,12 +49,33 @@ def test_the_papers_e2vid():
     [
         ("e2vid-fixed-thresholds", {"stream.recipe"}),
         ("e2vid-contrast", {"stream.recipe"}),
-        ("e2vid-webvid100", {"stream.videos"}),
-        ("e2vid-webvid1k", {"stream.videos"}),
+        ("e2vid-webvid100", {"stream.videos", "run.epochs"}),
+        ("e2vid-webvid1k", {"stream.videos", "run.epochs"}),
+        ("e2vid-filtered", {"stream.list"}),
     ],
 )
 def test_an_ablation_differs_in_one_thing(name, changed):
     assert differences(load_config("e2vid").to_dict(), load_config(name).to_dict()).keys() == changed
+
+
+def test_the_other_recipes_are_those_of_the_code_and_the_paper():
+    assert [load_config(f"e2vid-webvid{size}").run.epochs for size in ("100", "1k")] == [8000, 800]
+    alex = load_config("e2vid-alex-tc").loss
+    assert (alex.l1_weight, alex.lpips_network, alex.temporal_first_step, alex.temporal_rule) == (0, "alex", 1, "half")
+    published = {
+        "hypere2vid": ("adam", 1e-3, 0, 1, 12, 80),
+        "etnet": ("adamw", 2e-4, 0.01, 0.94, 6, 100),
+        "evflownet": ("adam", 1e-4, 0, 1, 10, 50),
+        "eraft": ("adam", 1e-4, 0, 1, 10, 50),
+    }
+    for name, expected in published.items():
+        config = load_config(name)
+        rates = (config.optimizer.learning_rate, config.optimizer.weight_decay, config.optimizer.learning_rate_decay)
+        assert (config.optimizer.name, *rates, config.stream.batch_size, config.run.epochs) == expected, name
+        assert (config.network.name, config.optimizer.amsgrad) == (name, True)
+    assert load_config("hypere2vid").loss.guide_epochs == 16
+    assert [load_config(name).loss.gamma for name in ("eraft", "eraft-as-published", "evflownet")] == [0.8, 0, 0]
+    assert {load_config(name).loss.raft_size for name in ("eraft", "evflownet")} == {"large"}
 
 
 def test_settings_win_over_the_file_and_the_file_over_what_it_extends(tmp_path):
@@ -89,7 +110,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("optimizer.ema_decay=1", r"optimizer\.ema_decay = 1: give a number from 0 to 0\.999999"),
         ("optimizer.amsgrad=1", r"optimizer\.amsgrad = 1: give true or false"),
         ("optimizer.name=sgd", r"optimizer\.name = 'sgd': choose one of adam, adamw"),
-        ("network.name=unet", r"network\.name = 'unet': choose one of e2vid, firenet"),
+        ("network.name=unet", r"network\.name = 'unet': choose one of e2vid, .*firenet"),
         ("network.options.bins=4", r"network\.options\.bins: set stream\.recipe\.bins"),
         ("stream.batch_size=0", r"stream\.batch_size = 0: give a whole number from 1"),
         ("stream.batch_size=2.5", r"stream\.batch_size = 2\.5: give a whole number"),

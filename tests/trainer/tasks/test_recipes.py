@@ -1,0 +1,141 @@
+"""Every shipped configuration, at reduced size, on a stream: it builds, trains, and minimises what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.client.fake_server import FakeServer
+from tests.trainer.models import numpy_networks as oracle
+from trainer.config import TrainConfig
+from trainer.config_file import load_config, shipped
+from trainer.feed import Feed, stream
+from trainer.learner import Learner, build
+from trainer.losses.backbones import BACKBONES
+from trainer.losses.lpips import LPIPS
+from trainer.models.raft import RAFT
+from trainer.run.distributed import Ranks
+from trainer.tasks import Work
+
+ALONE = Ranks(0, 1, torch.device("cpu"))
+NETWORKS: dict[str, dict[str, Any]] = {
+    "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
+    "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
+}  # fmt: skip
+SIDE_PX = 33
+"""The least that AlexNet takes, and divides by nothing."""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[FakeServer]:
+    with FakeServer(sequences=23) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files of random numbers under the names of the published ones."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(5)
+    for net, backbone in BACKBONES.items():
+        metric = LPIPS(net)
+        torch.save({f"features.{key}": value for key, value in metric.features.state_dict().items()}, folder / net)
+        heads = {f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1) / c for i, c in enumerate(backbone.channels)}
+        torch.save(heads, folder / f"{net}-heads")
+    for size in ("small", "large"):
+        state = RAFT(size).state_dict()
+        torch.save(state, folder / f"raft-{size}")
+    return folder
+
+
+def reduced(name: str, weights: Path) -> TrainConfig:
+    """The configuration with a small network, few small voxel grids, and files that are there."""
+    config = load_config(name)
+    recipe = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": SIDE_PX, "crop_width_px": SIDE_PX}
+    preset = config.stream.recipe["preset"] if isinstance(config.stream.recipe, Mapping) else config.stream.recipe
+    settings = {
+        "stream.recipe": {"preset": preset, **recipe}, "stream.batch_size": 2, "stream.loader_workers": 0,
+        "network.options": NETWORKS[config.network.name], "compute.device": "cpu",
+    }  # fmt: skip
+    loss = config.loss
+    if getattr(loss, "lpips_weight", 0):
+        settings["loss.lpips_backbone"] = str(weights / loss.lpips_network)
+        settings["loss.lpips_heads"] = str(weights / f"{loss.lpips_network}-heads")
+    if getattr(loss, "raft_weights", ""):
+        settings["loss.raft_weights"] = str(weights / f"raft-{loss.raft_size}")
+    if getattr(loss, "temporal_weight", 0):
+        settings["loss.temporal_first_step"] = min(2, loss.temporal_first_step)
+    return load_config(name, [f"{key}={value!r}" for key, value in settings.items()])
+
+
+def float64(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().double().numpy()
+
+
+def reconstruction_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
+    """Sum over the terms of means over samples and steps, pair by pair."""
+    loss, p, target = learner.config.loss, float64(prediction)[:, :, 0], float64(work.truth["frames"])[:, :, 0]
+    total = loss.l1_weight * np.abs(p - target).mean()
+    batch, steps = p.shape[:2]
+    if loss.lpips_weight:
+        metric = learner.task._loss.lpips  # type: ignore[attr-defined]
+        backbone = {key: float64(value) for key, value in metric.features.state_dict().items()}
+        heads = [float64(metric.get_buffer(f"head{i}")) for i in range(len(metric.backbone.channels))]
+        pairs = [(p[b, t][None], target[b, t][None]) for b in range(batch) for t in range(steps)]
+        total += np.mean([oracle.lpips(metric.net, *pair, backbone, heads) for pair in pairs])
+    if loss.temporal_weight:
+        flow, first = float64(work.truth["flow"]), loss.temporal_first_step
+        sign = -1 if loss.temporal_as_published else 1
+        terms = [
+            oracle.temporal_step(
+                (p[b, t - 1], p[b, t]), (target[b, t - 1], target[b, t]), sign * flow[b, t - first],
+                as_published=loss.temporal_as_published,
+            )
+            for b in range(batch) for t in range(first, steps)
+        ]  # fmt: skip
+        total += np.sum(terms) / batch / (steps if loss.temporal_rule == "half" else steps - first)
+    return float(total)
+
+
+def flow_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
+    """The last update, or all of them, each 0.8 of the next."""
+    p, truth, gamma = float64(prediction), float64(work.truth["flow"]), learner.config.loss.gamma
+    if p.ndim == 5:
+        return float(np.abs(p - truth).mean())
+    errors = [np.abs(each - truth).mean() for each in p]
+    return float(sum(gamma ** (len(p) - 1 - i) * error for i, error in enumerate(errors)) if gamma else errors[-1])
+
+
+# RAFT and E-RAFT have no reduced size.
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name else []) for name in shipped()],
+)
+def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
+    server: FakeServer, weights: Path, name: str
+) -> None:
+    config = reduced(name, weights)
+    learner = build(config, ALONE)
+    expect = flow_loss if learner.network.task == "flow" else reconstruction_loss
+    before = [parameter.detach().clone() for parameter in learner.network.parameters()]
+    dataset = stream(config, learner.task.asked, server.address)
+    batches = iter(Feed(dataset, ALONE.device).epochs(0, 1))
+    for step in range(2):
+        work = learner.task.prepare(next(batches), 0)
+        assert work.voxels.shape == (2, 3 + learner.network.lead_voxels, 2, SIDE_PX, SIDE_PX)
+        learner.network.train()
+        torch.manual_seed(0)
+        with torch.no_grad():
+            prediction = learner.model(work.voxels, None, work.guide)[0]
+            found = float(learner.task.losses(prediction, work)["total"])
+        assert found == pytest.approx(expect(learner, prediction, work), rel=2e-4)
+        assert np.isfinite(float(learner.step(work, step, 0)["total"]))
+    changed = [not torch.equal(a, b) for a, b in zip(before, learner.network.parameters(), strict=True)]
+    assert sum(changed) > 0.9 * len(changed)
+    assert (work.guide is not None) == (name == "hypere2vid")
