@@ -52,8 +52,8 @@ def shrink(videos: Iterable[Path], folder: Path, clips: int) -> None:
                 side = min(grey.shape)
                 top, left = ((length - side) // 2 for length in grey.shape)
                 square = np.ascontiguousarray(grey[top : top + side, left : left + side])
-                small = cv2.resize(square, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
-                written.mux(stream.encode(av.VideoFrame.from_ndarray(small, format="gray")))
+                small = cv2.resize(square.astype(np.uint8), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
+                written.mux(stream.encode(av.VideoFrame.from_ndarray(small.astype(np.uint8), format="gray")))
             written.mux(stream.encode())
 
 

@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
-from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set
+from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
+from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
 from trainer.evaluation.metrics import METRICS, make_metrics
 from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table
@@ -41,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> Parser:
     parser = Parser(
         "v2v-eval", "[CONFIG] --weights FILE --data DIR [flags]",
-        "Reconstruct recordings of event cameras, and score that against the cameras' pictures.",
+        "Reconstruct recordings of event cameras, or find the flow in them, and score that.",
         [
             "v2v-eval paper-discrete --weights runs/e2vid/last.pt --data recordings/",
             "v2v-eval --weights runs/e2vid/last.pt --data own.h5 --out pictures/ --video",
@@ -94,6 +95,8 @@ def _run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--json {arguments.json}: cannot be written: no folder {Path(arguments.json).parent}")
     config = folder_config(data) if arguments.config is None else read_config(arguments.config)
     run, model = _prepare(arguments, config)
+    if run.network.task == "flow":
+        return _run_flow(arguments, config, run, model)
     for data_set in config.data_sets:
         check_data_set(run, data, data_set)
     scores: dict[str, list[SequenceScore]] = {}
@@ -117,6 +120,28 @@ def _run(arguments: argparse.Namespace) -> int:
             "reconstruction_hz": run.fps,
         }
         write_json(arguments.json, records(scores, settings))
+    return 0
+
+
+def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run, model: str) -> int:
+    data = Path(arguments.data)
+    flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder)
+    settings = {"model": model, "weights": str(arguments.weights), "as_published": run.as_published}
+    written: list[dict[str, object]] = []
+    console = Console() if Console().is_terminal else Console(width=LEAST_WIDTH)
+    for data_set in config.data_sets:
+        found = find_recordings(data, data_set)
+        with _progress() as advance:
+            scores = {
+                sequence: evaluate_flow(flow_run, path, data_set.cuts[sequence] if run.use_cuts else None, advance)
+                for sequence, path in found.items()
+            }
+        console.print(flow_table(data_set.name, scores, config.paper))
+        written += flow_records(data_set.name, scores, settings)
+    if not written:
+        raise UsageError(f"--data {data} holds no sequence of {', '.join(each.name for each in config.data_sets)}")
+    if arguments.json is not None:
+        write_json(arguments.json, written)
     return 0
 
 

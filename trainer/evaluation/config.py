@@ -41,7 +41,7 @@ class EvaluationConfig:
         model_options: its arguments, where the weights do not tell them.
         voxels: how windows become voxel grids; None means discrete with as many bins as the network takes.
         metrics: names of ``trainer.evaluation.metrics.METRICS``.
-        paper: methods of ``trainer.evaluation.paper.RESULTS`` to show beside.
+        paper: methods of ``trainer.evaluation.paper.RESULTS``, or of ``FLOW``, to show beside.
     """
 
     data_sets: tuple[DataSet, ...]
@@ -95,7 +95,7 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
         model_options=_options(model.get("options"), f"{where}: model: options"),
         voxels=VoxelSettings(**voxels) if voxels else None,
         metrics=_known(top.get("metrics", ["mse", "ssim_range2", "ssim"]), METRICS, f"{where}: metrics"),
-        paper=_known(top.get("paper", []), tuple(paper.RESULTS), f"{where}: paper"),
+        paper=_known(top.get("paper", []), (*paper.RESULTS, *paper.FLOW), f"{where}: paper"),
     )
 
 

@@ -9,6 +9,8 @@
 | ... attribute ``event_idx`` | integer | the first event at the time of the picture or later |
 | ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
 | ... attribute ``event_idx_published`` | integer, optional | what the published conversion writes as ``event_idx`` |
+| ``flow/<key>`` | float32 [2, H, W], optional | flow (x, y), px, until the next field; NaN: not known |
+| ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
 | root attribute ``sensor_resolution`` | 2 integers | height, width |
 """
 

@@ -47,3 +47,29 @@ RESULTS: dict[str, dict[str, dict[str, float]]] = {
     for method, triples in _TABLE.items()
 }
 """``RESULTS[method][data set][metric]``."""
+
+FLOW_SEQUENCES = ("indoor_flying1", "indoor_flying2", "indoor_flying3", "outdoor_day1", "outdoor_day2")
+
+_FLOW_TABLE: dict[str, tuple[tuple[float, float, float, float], ...]] = {
+    "Zeros": (
+        (1.772, 2.041, 14.5, 20.2), (2.705, 3.463, 36.1, 52.5), (2.412, 2.772, 30.2, 38.6), (3.985, 3.585, 57.1, 54.5),
+        (2.793, 2.562, 32.9, 31.7),
+    ),
+    "EvFlow+": (
+        (0.967, 0.752, 2.7, 0.8), (1.154, 0.990, 5.4, 2.4), (1.184, 0.833, 7.0, 1.6), (2.903, 1.445, 36.1, 12.1),
+        (1.983, 1.580, 19.8, 14.4),
+    ),
+    "EVFlowNet WebVid10K": (
+        (0.732, 0.745, 0.5, 0.5), (0.870, 0.990, 1.3, 2.3), (0.741, 0.758, 0.4, 0.6), (2.114, 1.191, 23.6, 8.4),
+        (1.627, 1.365, 15.0, 11.2),
+    ),
+}  # fmt: skip
+
+FLOW: dict[str, dict[str, dict[str, float]]] = {
+    method: {
+        sequence: dict(zip(("aee_dense", "aee_sparse", "3pe_dense", "3pe_sparse"), values, strict=True))
+        for sequence, values in zip(FLOW_SEQUENCES, rows, strict=True)
+    }
+    for method, rows in _FLOW_TABLE.items()
+}
+"""``FLOW[method][sequence][metric]``, in the published convention: see :mod:`trainer.evaluation.flow`."""

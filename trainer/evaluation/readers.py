@@ -253,6 +253,46 @@ class Recording:
             for one, other in itertools.pairwise(images)
         ]
 
+    def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[Window]:
+        """Windows between the times of consecutive flow fields; the target is the field of the window.
+
+        Args:
+            cut: first and last second, counted from the first picture of the recording, else its first field.
+            one_later: pair each window with the field at its end, as V2V's released code does, not that at its start.
+
+        Raises:
+            UsageError: fewer than two fields in the cut.
+        """
+        with _reading(self.path):
+            group = self._file.get("flow", {})
+            fields = [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
+        if cut is not None and fields:
+            zero = self.images[0].time if self.images else fields[0].time
+            fields = [each for each in fields if cut[0] <= each.time - zero <= cut[1]]
+        if len(fields) < 2:
+            raise UsageError(
+                f"{self.path} has {len(fields)} flow fields{f' in the cut {cut}' if cut else ''}; two or more make a "
+                "window. v2v-convert takes MVSEC's from *_gt.hdf5 beside *_data.hdf5"
+            )
+        made = []
+        for one, other in itertools.pairwise(fields):
+            start, stop = (bisect.bisect_left(self._times, each.time) for each in (one, other))
+            made.append(Window(start, max(start, stop), one.time, other.time, other if one_later else one))
+        return made
+
+    def flow(self, window: Window) -> npt.NDArray[np.float32]:
+        """The field of a window of :meth:`flow_windows`, [2, H, W] (x, y) px; NaN or 0 where it is not known.
+
+        Raises:
+            UsageError: it cannot be read, or is of another size.
+        """
+        assert window.target is not None
+        with _reading(self.path):
+            field: npt.NDArray[np.float32] = self._file[window.target.key][:].astype(np.float32)
+        if field.shape != (2, *self.size):
+            raise UsageError(f"{self.path}: {window.target.key} is {list(field.shape)}, not {[2, *self.size]}")
+        return field
+
     def regular_windows(self, fps: float) -> list[Window]:
         """Windows of equal length from the first event to the last; without targets.
 

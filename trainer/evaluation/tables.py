@@ -45,7 +45,7 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     whole = "" if len(scores) == len(data_set.cuts) else f" of {len(scores)} of {len(data_set.cuts)}"
     made.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
     for method in compared:
-        published = paper.RESULTS[method].get(data_set.name)
+        published = paper.RESULTS.get(method, {}).get(data_set.name)
         if published is not None:
             made.add_row(f"paper: {method}", "", *(_number(published, name) for name in names), style="dim")
     return made

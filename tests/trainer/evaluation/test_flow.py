@@ -1,0 +1,124 @@
+"""Flow of recordings with known flow: the analytic errors, in both conventions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from tests.trainer.evaluation.h5_file import write_h5
+from trainer.evaluation import paper
+from trainer.evaluation.cli import main
+from trainer.evaluation.flow import HOOD_ROW, FlowRun, evaluate_flow
+from trainer.evaluation.voxelise import VoxelSettings
+from trainer.models import ERAFT, EVFlowNet
+from v2v_protocol.errors import UsageError
+
+HEIGHT, WIDTH = 200, 24
+LENGTHS = (1.0, 4.0, 2.0, 8.0)
+"""Of the flow of each field, px: one more than there are windows."""
+
+
+def recording(path: Path, *, empty: int | None = None) -> Path:
+    """Flow (0.6, 0.8) LENGTHS[i] in field i, unknown in its left half; below row 190 ten times as large. Events in the
+    column WIDTH - 1 only. ``empty``: a field that is nowhere known.
+    """
+    times = 5.0 + 0.05 * np.arange(len(LENGTHS))
+    rows = np.tile(np.arange(HEIGHT), 3)
+    t = np.repeat(times[:-1] + 0.01, HEIGHT)
+    write_h5(path, t, np.full(len(t), WIDTH - 1), rows, np.ones(len(t)), [], sensor_resolution=(HEIGHT, WIDTH))
+    with h5py.File(path, "a") as file:
+        for index, (time, length) in enumerate(zip(times, LENGTHS, strict=True)):
+            field = np.empty((2, HEIGHT, WIDTH), np.float32)
+            field[:] = np.array([0.6, 0.8])[:, None, None] * length
+            field[:, HOOD_ROW:] *= 10
+            field[:, :, : WIDTH // 4], field[:, :, WIDTH // 4 : WIDTH // 2] = np.nan, 0
+            if index == empty:
+                field[:] = np.nan
+            file[f"flow/flow{index:09d}"] = field
+            file[f"flow/flow{index:09d}"].attrs.update(timestamp=time, event_idx=0, image_idx=0)
+    return path
+
+
+def constant(x: float, y: float) -> EVFlowNet:
+    network = EVFlowNet(base_channels=2)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        network.unet.pred.conv2d.bias.copy_(torch.tensor([x, y]))  # type: ignore[union-attr]
+    return network
+
+
+def run(network: EVFlowNet | ERAFT, *, as_published: bool) -> FlowRun:
+    return FlowRun(network, VoxelSettings(bins=network.bins), as_published=as_published)
+
+
+def test_the_field_at_the_start_of_a_window_is_its_flow(tmp_path: Path) -> None:
+    """Indoors nothing is cut off: a twentieth of the rows has ten times the flow."""
+    found = evaluate_flow(run(constant(0.6, 0.8), as_published=False), recording(tmp_path / "indoor.h5"), None)
+    share = 1 - HOOD_ROW / HEIGHT
+    expected = {
+        "network": (LENGTHS[:3], lambda length: (length - 1) * (1 - share) + (10 * length - 1) * share),
+        "zeros": (LENGTHS[:3], lambda length: length * (1 - share) + 10 * length * share),
+    }
+    for who, (lengths, of) in expected.items():
+        for kind in ("dense", "sparse"):
+            assert found[who].means[f"aee_{kind}"] == pytest.approx(
+                np.mean([of(length) for length in lengths]), rel=1e-5
+            )
+    # Errors of the network: 0, 3 and 1 px above, 9, 39 and 19 px below; 3 is not more than 3.
+    assert found["network"].means["3pe_dense"] == pytest.approx(100 * share, rel=1e-4)
+    assert found["zeros"].means["3pe_dense"] == pytest.approx(100 * (2 * share + 1) / 3, rel=1e-5)
+
+
+def test_outdoors_the_hood_does_not_count_unless_as_published(tmp_path: Path) -> None:
+    path = recording(tmp_path / "outdoor_day1.h5")
+    right = evaluate_flow(run(constant(0, 0), as_published=False), path, None)
+    assert right["network"].means == pytest.approx(right["zeros"].means)
+    assert right["zeros"].means["aee_dense"] == pytest.approx(np.mean(LENGTHS[:3]), rel=1e-5)
+    assert right["zeros"].means["3pe_sparse"] == pytest.approx(100 / 3)
+    published = evaluate_flow(run(constant(0, 0), as_published=True), path, None)
+    share = 1 - HOOD_ROW / HEIGHT
+    later = np.mean([length * (1 + 9 * share) for length in LENGTHS[1:]])
+    assert published["zeros"].means["aee_dense"] == pytest.approx(later, rel=1e-5)
+
+
+def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path) -> None:
+    path = recording(tmp_path / "outdoor_day2.h5", empty=1)
+    right = evaluate_flow(run(constant(0, 0), as_published=False), path, None)["zeros"]
+    assert (right.windows, right.means["aee_sparse"]) == (3, pytest.approx((1 + 2) / 2, rel=1e-5))
+    published = evaluate_flow(run(constant(0, 0), as_published=True), path, None)["zeros"]
+    assert published.means["aee_dense"] == pytest.approx((0 + 2 + 8) / 3 * (1 + 9 * 0.05), rel=1e-5)
+
+
+def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
+    path = recording(tmp_path / "a.h5")
+    assert evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.11))["zeros"].windows == 1
+    with pytest.raises(UsageError, match=r"1 flow fields in the cut .*v2v-convert takes MVSEC's"):
+        evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.06))
+
+
+@pytest.mark.slow
+def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(tmp_path: Path) -> None:
+    path = recording(tmp_path / "a.h5")
+    found = evaluate_flow(run(ERAFT(), as_published=False), path, None)
+    assert found["network"].windows == 3
+
+
+def test_the_command_shows_the_paper_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "data" / "mvsec").mkdir(parents=True)
+    recording(tmp_path / "data" / "mvsec" / "indoor_flying1.h5")
+    torch.save(constant(0, 0).state_dict(), tmp_path / "a.pth")
+    arguments = ["--weights", str(tmp_path / "a.pth"), "--data", str(tmp_path / "data"), "--cuts", "none"]
+    main(["mvsec-flow", *arguments, "--out", str(tmp_path / "out"), "--json", str(tmp_path / "a.json")])
+    shown = capsys.readouterr().out
+    stated = paper.FLOW["Zeros"]["indoor_flying1"]
+    assert f"{stated['aee_dense']:.3f}" in shown
+    records = json.loads((tmp_path / "a.json").read_text())
+    assert [record["predictor"] for record in records] == ["network", "zeros"]
+    assert records[0]["aee_dense"] == records[1]["aee_dense"]
+    assert (tmp_path / "out" / "indoor_flying1.png").is_file()

@@ -1,0 +1,180 @@
+"""How well a network finds optical flow on recordings whose flow is known (MVSEC), beside a prediction of no motion.
+
+EE is the length of the error of one pixel, px over one window. Of each window the mean (AEE) and the share of pixels
+with EE above 3 (3PE) are taken, then the mean over the windows of a sequence. *Dense*: over all pixels with known flow.
+*Sparse*: of these, only those with events in the window's voxel grid. "zeros" is what predicting no motion scores: it
+needs no network, so it checks files, windows and masks.
+
+Two conventions differ, and both are known by what they call the published one:
+
+| | right (default) | as published |
+|---|---|---|
+| flow field i | is of the window that begins at its time, as EV-FlowNet and E-RAFT define it | of the one before |
+| the car's hood | rows from 190 on do not count in sequences ``outdoor*`` (EV-FlowNet) | counts |
+| a window in which nothing counts | is left out | scores 0 |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from rich.markup import escape
+from rich.table import Table
+
+from trainer import pictures
+from trainer.evaluation import paper
+from trainer.evaluation.readers import Recording, Window
+from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.models import VoxelNetwork
+from v2v_protocol.errors import UsageError
+
+FlowImage = npt.NDArray[np.float32]
+
+HOOD_ROW = 190
+LARGE_PX = 3.0
+TITLES = {"aee_dense": "AEE", "aee_sparse": "AEE sparse", "3pe_dense": "3PE %", "3pe_sparse": "3PE % sparse"}
+
+
+@dataclass
+class FlowScore:
+    """Means over the windows of a sequence, by the names of :data:`TITLES`; 3PE in per cent."""
+
+    as_published: bool
+    windows: int = 0
+    _values: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, prediction: FlowImage, truth: FlowImage, events: npt.NDArray[np.bool_], rows: int) -> None:
+        """
+        Args:
+            prediction: [2, H, W] (x, y), px.
+            truth: the same; NaN, or 0 in both components, where it is not known.
+            events: [H, W], whether there are any.
+            rows: how many rows from the top count.
+        """
+        self.windows += 1
+        known = np.isfinite(truth).all(axis=0) & (truth != 0).any(axis=0)
+        known[rows:] = False
+        error = np.hypot(*np.where(known, prediction - truth, 0))
+        for kind, counted in (("dense", known), ("sparse", known & events)):
+            if counted.any():
+                aee, large = float(error[counted].mean()), float((error[counted] > LARGE_PX).mean())
+            elif self.as_published:
+                aee = large = 0.0
+            else:
+                continue
+            self._values.setdefault(f"aee_{kind}", []).append(aee)
+            self._values.setdefault(f"3pe_{kind}", []).append(100 * large)
+
+    @property
+    def means(self) -> dict[str, float]:
+        """By name; without those of which no window had anything to count."""
+        return {name: float(np.mean(self._values[name])) for name in TITLES if name in self._values}
+
+
+@dataclass(frozen=True)
+class FlowRun:
+    """How to evaluate.
+
+    Attributes:
+        network: of task "flow".
+        voxels: as it wants them.
+        device: of PyTorch.
+        as_published: see the module.
+        out: folder for a picture of each sequence, or None.
+    """
+
+    network: VoxelNetwork
+    voxels: VoxelSettings
+    device: str = "cpu"
+    as_published: bool = False
+    out: Path | None = None
+
+
+def evaluate_flow(
+    run: FlowRun,
+    path: Path,
+    cut: tuple[float, float] | None,
+    advance: Callable[[str, int, int], None] = lambda _name, _done, _total: None,
+) -> dict[str, FlowScore]:
+    """Scores of the network, and of "zeros", on one recording.
+
+    Raises:
+        UsageError: see :class:`Recording`; no flow in it; or the output is not finite.
+    """
+    scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
+    with Recording(path, as_published=run.as_published) as recording:
+        windows = recording.flow_windows(cut, one_later=run.as_published)
+        hood = recording.name.startswith("outdoor") and not run.as_published
+        rows = HOOD_ROW if hood else recording.size[0]
+        for number, (window, grid, prediction) in enumerate(_estimate(run, recording, windows), start=1):
+            truth = recording.flow(window)
+            events = (grid != 0).any(axis=0)
+            scores["network"].add(prediction, truth, events, rows)
+            scores["zeros"].add(np.zeros_like(truth), truth, events, rows)
+            if run.out is not None and number == max(1, len(windows) // 2):
+                _draw(run.out / f"{recording.name}.png", grid, truth, prediction)
+            advance(recording.name, number, len(windows))
+    return scores
+
+
+def _estimate(
+    run: FlowRun, recording: Recording, windows: Sequence[Window]
+) -> Iterator[tuple[Window, npt.NDArray[np.float32], FlowImage]]:
+    """Window, voxel grid and prediction [2, H, W], in order; memory is carried from the first to the last."""
+    network, state = run.network.to(run.device).eval(), None
+    # A network that looks at the window before as well sees nothing in front of the first.
+    before = [np.zeros((run.voxels.bins, *recording.size), np.float32)] * network.lead_voxels
+    for window in windows:
+        events = recording.events(window)
+        grid = voxel_grid(events, recording.size, run.voxels, (window.begin, window.end))
+        piece = torch.from_numpy(np.stack([*before, grid]))[None].to(run.device)
+        with torch.inference_mode():
+            outputs, state = network(piece, state)
+        before, prediction = [], outputs[0, -1].float().cpu().numpy()
+        if not np.isfinite(prediction).all():
+            raise UsageError(f"{recording.path}: the network gives values that are not finite at {window.begin:.3f} s")
+        yield window, grid, prediction
+
+
+def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, prediction: FlowImage) -> None:
+    known = np.nan_to_num(truth)
+    scale = pictures.flow_scale(known)
+    panels = [pictures.draw_events(grid), *(pictures.draw_flow(flow, scale) for flow in (known, prediction))]
+    pictures.write_png(path, pictures.side_by_side([panel[None] for panel in panels])[0])
+
+
+def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:
+    """One block of rows a sequence: network, zeros, and what the paper states."""
+    made = Table(title=escape(name), title_justify="left")
+    for column in ("sequence", "windows", *TITLES.values()):
+        made.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
+    for sequence, found in scores.items():
+        for who, score in found.items():
+            label = escape(sequence) if who == "network" else f"  {who}"
+            made.add_row(label, str(score.windows), *_numbers(score.means))
+        for method in compared:
+            stated = paper.FLOW[method].get(sequence)
+            if stated is not None:
+                made.add_row(f"  paper: {method}", "", *_numbers(stated), style="dim")
+    return made
+
+
+def _numbers(values: Mapping[str, float]) -> list[str]:
+    return [f"{values[name]:.3f}" if math.isfinite(values.get(name, math.nan)) else "-" for name in TITLES]
+
+
+def flow_records(
+    name: str, scores: Mapping[str, Mapping[str, FlowScore]], settings: Mapping[str, object]
+) -> list[dict[str, object]]:
+    """One flat record a sequence and predictor."""
+    return [
+        {"data_set": name, "sequence": sequence, "predictor": who, "windows": score.windows, **score.means, **settings}
+        for sequence, found in scores.items()
+        for who, score in found.items()
+    ]
