@@ -21,6 +21,7 @@ from trainer.evaluation.config import EvaluationConfig, folder_config, read_conf
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
 from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
 from trainer.evaluation.metrics import METRICS, make_metrics
+from trainer.evaluation.reconstruct import Stretch
 from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
@@ -73,6 +74,11 @@ def _parser() -> Parser:
         "--lpips", nargs=3, action="append", default=[], metavar=("NET", "BACKBONE", "HEADS"),
         help="weights of LPIPS for alex, squeeze or vgg; may be given several times",
     )  # fmt: skip
+    how.add_argument(
+        "--stretch", choices=get_args(Stretch), default="none",
+        help="values of each reconstruction to 0 .. 1 before it is scored: from its least to its greatest, or from its "
+        "1st to its 99th percentile (default: as they are)",
+    )  # fmt: skip
     what.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
     how.add_argument(
         "--as-published", action="store_true",
@@ -118,6 +124,7 @@ def _run(arguments: argparse.Namespace) -> int:
             "as_published": run.as_published,
             "cuts": arguments.cuts,
             "reconstruction_hz": run.fps,
+            "stretch": run.stretch,
         }
         write_json(arguments.json, records(scores, settings))
     return 0
@@ -179,6 +186,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         as_published=arguments.as_published,
         use_cuts=arguments.cuts == "paper",
         fps=arguments.fps,
+        stretch=arguments.stretch,
         drawing=Drawing(None if arguments.out is None else Path(arguments.out), arguments.rows, arguments.video),
     )
     return run, model

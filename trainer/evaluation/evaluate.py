@@ -15,7 +15,7 @@ from trainer.evaluation.cuts import Cut, DataSet
 from trainer.evaluation.metrics import Metric
 from trainer.evaluation.pictures import chosen_steps, draw_step
 from trainer.evaluation.readers import Recording, Window
-from trainer.evaluation.reconstruct import reconstruct
+from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models import VoxelNetwork
@@ -59,6 +59,7 @@ class Run:
         use_cuts: False scores all of each recording.
         fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
         drawing: pictures and videos.
+        stretch: see :func:`reconstruct`.
     """
 
     network: VoxelNetwork
@@ -69,6 +70,7 @@ class Run:
     use_cuts: bool = True
     fps: float | None = None
     drawing: Drawing = field(default_factory=Drawing)
+    stretch: Stretch = "none"
 
 
 def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
@@ -126,7 +128,7 @@ def evaluate_sequence(
         rows = []
         shown = chosen_steps(len(windows), run.drawing.rows)
         with _video(run.drawing, data_set, recording.name, windows) as video:
-            steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device)
+            steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device, stretch=run.stretch)
             for number, step in enumerate(steps):
                 scorer.add(step)
                 if video is not None or (run.drawing.folder is not None and number in shown):

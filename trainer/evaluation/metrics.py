@@ -5,6 +5,7 @@
 | ``mse`` | mean squared difference, grey values in 0 .. 1 |
 | ``ssim_range2`` | SSIM as the paper computes it: 7x7 uniform window, sample covariance, data range 2 |
 | ``ssim`` | the same with data range 1, which is the range of the values; lower |
+| ``correlation`` | Pearson's: 1 where only brightness and contrast differ, 0 for a blank picture |
 | ``lpips_alex``, ``lpips_squeeze``, ``lpips_vgg`` | LPIPS v0.1 |
 
 Reconstructions are clamped to 0 .. 1 first, not rounded to 8 bits. The paper's tables hold ``mse``, ``ssim_range2`` and
@@ -36,12 +37,19 @@ Metric = Callable[[GreyImage, GreyImage], float]
 
 SSIM_WINDOW_PX = 7
 LPIPS_METRICS = {f"lpips_{net}": net for net in BACKBONES}
-METRICS = ("mse", "ssim_range2", "ssim", *LPIPS_METRICS)
+METRICS = ("mse", "ssim_range2", "ssim", "correlation", *LPIPS_METRICS)
 
 
 def mse(prediction: GreyImage, target: GreyImage) -> float:
     """Mean squared difference."""
     return float(np.mean((prediction - target) ** 2))
+
+
+def correlation(prediction: GreyImage, target: GreyImage) -> float:
+    """Pearson's; 0 where either picture is blank."""
+    ours, truth = prediction - prediction.mean(), target - target.mean()
+    scale = float(np.sqrt((ours**2).sum() * (truth**2).sum()))
+    return float((ours * truth).sum()) / scale if scale > 1e-12 else 0.0
 
 
 def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> float:
@@ -87,8 +95,8 @@ def make_metrics(
     for name in names:
         if name not in METRICS:
             raise UsageError(f"metric {name!r}: give some of {', '.join(METRICS)}")
-        if name == "mse":
-            made[name] = mse
+        if name in ("mse", "correlation"):
+            made[name] = mse if name == "mse" else correlation
         elif name in LPIPS_METRICS:
             net = LPIPS_METRICS[name]
             if net not in lpips_files:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
 
+Stretch = Literal["none", "min-max", "robust"]
 WINDOWS_PER_CALL = 8
 """Bounds the memory of activations; the result does not depend on it."""
 
@@ -52,8 +54,12 @@ def reconstruct(
     settings: VoxelSettings,
     *,
     device: str = "cpu",
+    stretch: Stretch = "none",
 ) -> Iterator[Step]:
     """One step for each window, in order.
+
+    Events tell nothing of absolute brightness, so some stretch the values of each picture to 0 .. 1 before they score
+    it: ``stretch`` "min-max" from its least to its greatest, "robust" from its 1st to its 99th percentile.
 
     Raises:
         UsageError: the network has another number of bins, events lie outside the sensor, or the output is not finite.
@@ -77,7 +83,7 @@ def reconstruct(
                 f"{recording.path}: the network gives values that are not finite in windows {first} to "
                 f"{first + len(piece) - 1}; are these its weights, and is its input normalised as in training?"
             )
-        for window, count, grid, prediction in zip(piece, counts, grids, predictions.clip(0, 1), strict=True):
+        for window, count, grid, prediction in zip(piece, counts, grids, _stretched(predictions, stretch), strict=True):
             shown = window.target or _latest(recording.images, window.end)
             yield Step(
                 window,
@@ -87,6 +93,15 @@ def reconstruct(
                 None if shown is None else recording.image(shown),
                 None if shown is None else shown.time,
             )
+
+
+def _stretched(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
+    """[N, H, W], each stretched by itself, then clamped to 0 .. 1."""
+    if stretch != "none":
+        ends = (0, 100) if stretch == "min-max" else (1, 99)
+        low, high = np.percentile(pictures, ends, axis=(1, 2), keepdims=True)
+        pictures = ((pictures - low) / np.maximum(high - low, 1e-6)).astype(np.float32)
+    return pictures.clip(0, 1)
 
 
 def _latest(images: Sequence[Image], time: float) -> Image | None:

@@ -22,6 +22,7 @@ class SequenceScore:
         empty_windows: windows without an event.
         repaired_images: time stamps that were mended.
         means: mean over the frames by metric; empty where there was nothing to compare with.
+        blank: the same of a blank in the mean grey of each target, the best that one without any picture could score.
     """
 
     data_set: str
@@ -31,6 +32,7 @@ class SequenceScore:
     empty_windows: int
     repaired_images: int
     means: Mapping[str, float]
+    blank: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -39,6 +41,7 @@ class SequenceScorer:
 
     metrics: Mapping[str, Metric]
     values: dict[str, list[float]] = field(default_factory=dict)
+    blank: dict[str, list[float]] = field(default_factory=dict)
     frames: int = 0
     events: int = 0
     empty_windows: int = 0
@@ -53,14 +56,19 @@ class SequenceScorer:
         prediction, target = step.prediction.astype(np.float64), step.camera / 255.0
         for name, metric in self.metrics.items():
             self.values.setdefault(name, []).append(metric(prediction, target))
+            self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
 
     def score(self, data_set: str, sequence: str, repaired_images: int) -> SequenceScore:
         """The means."""
-        means = {name: float(np.mean(values)) for name, values in self.values.items()}
-        return SequenceScore(data_set, sequence, self.frames, self.events, self.empty_windows, repaired_images, means)
+        means, blank = (
+            {name: float(np.mean(each)) for name, each in kind.items()} for kind in (self.values, self.blank)
+        )
+        counts = (self.frames, self.events, self.empty_windows, repaired_images)
+        return SequenceScore(data_set, sequence, *counts, means, blank)
 
 
-def mean_over_sequences(scores: Sequence[SequenceScore]) -> dict[str, float]:
-    """Unweighted mean by metric, of the metrics that every sequence has."""
-    names = [name for name in scores[0].means if all(name in score.means for score in scores)] if scores else []
-    return {name: float(np.mean([score.means[name] for score in scores])) for name in names}
+def mean_over_sequences(scores: Sequence[SequenceScore], *, blank: bool = False) -> dict[str, float]:
+    """Unweighted mean by metric, of the metrics that every sequence has; with ``blank``, of the blank pictures."""
+    found = [score.blank if blank else score.means for score in scores]
+    names = [name for name in found[0] if all(name in means for means in found)] if found else []
+    return {name: float(np.mean([means[name] for means in found])) for name in names}

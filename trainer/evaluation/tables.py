@@ -16,6 +16,7 @@ TITLES = {
     "mse": "MSE",
     "ssim_range2": "SSIM (range 2)",
     "ssim": "SSIM",
+    "correlation": "correlation",
     "lpips_alex": "LPIPS alex",
     "lpips_squeeze": "LPIPS squeeze",
     "lpips_vgg": "LPIPS vgg",
@@ -44,6 +45,7 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     made.add_section()
     whole = "" if len(scores) == len(data_set.cuts) else f" of {len(scores)} of {len(data_set.cuts)}"
     made.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
+    made.add_row("constant grey", "", *(_number(mean_over_sequences(scores, blank=True), name) for name in names))
     for method in compared:
         published = paper.RESULTS.get(method, {}).get(data_set.name)
         if published is not None:
@@ -75,6 +77,7 @@ def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapp
                     "empty_windows": score.empty_windows,
                     "repaired_images": score.repaired_images,
                     **score.means,
+                    **{f"constant_grey_{name}": value for name, value in score.blank.items()},
                     **settings,
                 }
             )

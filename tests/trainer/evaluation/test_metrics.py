@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from tests.trainer.losses.test_lpips import heads_file, random_metric, torchvision_like
 from tests.trainer.models import numpy_networks
 from trainer.evaluation.metrics import METRICS, make_metrics, mse, ssim
-from trainer.evaluation.score import SequenceScore, mean_over_sequences
+from trainer.evaluation.readers import Image, Window
+from trainer.evaluation.reconstruct import Step
+from trainer.evaluation.score import SequenceScore, SequenceScorer, mean_over_sequences
 from v2v_protocol.errors import UsageError
 
 
@@ -94,3 +96,23 @@ def test_means_over_sequences_have_no_weights() -> None:
 
     assert mean_over_sequences([score(1, mse=0.2, ssim=0.1), score(1000, mse=0.4)]) == {"mse": pytest.approx(0.3)}
     assert mean_over_sequences([]) == {}
+
+
+def test_correlation_knows_no_brightness_or_contrast_and_a_blank_has_none() -> None:
+    rng = np.random.default_rng(0)
+    picture, other = rng.random((2, 9, 11))
+    (metric,) = make_metrics(["correlation"], {}).values()
+    assert metric(0.2 * picture + 0.4, picture) == pytest.approx(1)
+    assert metric(1 - picture, picture) == pytest.approx(-1)
+    assert metric(other, picture) == pytest.approx(np.corrcoef(other.ravel(), picture.ravel())[0, 1])
+    assert metric(np.full_like(picture, 0.5), picture) == 0
+
+
+def test_a_blank_is_scored_beside_every_network() -> None:
+    target = np.random.default_rng(1).integers(0, 256, (9, 11), dtype=np.uint8)
+    scorer = SequenceScorer(make_metrics(["mse", "correlation"], {}))
+    window = Window(0, 0, 0.0, 1.0, Image("a", 1.0, 0))
+    scorer.add(Step(window, 0, np.zeros((5, 9, 11), np.float32), (target / 255).astype(np.float32), target, 1.0))
+    score = scorer.score("set", "one", 0)
+    assert score.means == pytest.approx({"mse": 0, "correlation": 1}, abs=1e-6)
+    assert score.blank == pytest.approx({"mse": np.var(target / 255), "correlation": 0})

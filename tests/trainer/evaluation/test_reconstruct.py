@@ -10,7 +10,7 @@ import torch
 
 from tests.trainer.evaluation.h5_file import random_recording
 from trainer.evaluation.readers import Recording
-from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, reconstruct
+from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, _stretched, reconstruct
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import E2VID, FireNet, VoxelNetwork
 from trainer.run.checkpoint import Checkpoint, save_checkpoint
@@ -78,6 +78,23 @@ def test_what_the_network_cannot_take_or_gives_is_refused(tmp_path: Path) -> Non
             network.net.pred.conv2d.bias.fill_(float("nan"))  # type: ignore[union-attr]
         with pytest.raises(UsageError, match="not finite in windows 0 to 4"):
             next(reconstruct(recording, recording.windows(), network, VoxelSettings()))
+
+
+def test_stretching_maps_each_picture_to_the_whole_range() -> None:
+    rng = np.random.default_rng(0)
+    pictures = rng.normal(0.3, 0.05, (2, 20, 30)).astype(np.float32)
+    pictures[1] += 3
+    plain, whole, robust = (_stretched(pictures, stretch) for stretch in ("none", "min-max", "robust"))
+    np.testing.assert_array_equal(plain, pictures.clip(0, 1))
+    assert whole.min(axis=(1, 2)).tolist() == [0, 0]
+    assert whole.max(axis=(1, 2)).tolist() == [1, 1]
+    for before, after in zip(pictures, robust, strict=True):
+        low, high = np.sort(before.ravel())[[6, -7]]  # 600 pixels: about one in a hundred beyond either end
+        assert np.isclose(
+            after.ravel()[before.ravel().argsort()[300]], (np.median(before) - low) / (high - low), atol=0.02
+        )
+        assert ((after == 0).sum(), (after == 1).sum()) == (6, 6)
+    assert np.isfinite(_stretched(np.ones((1, 4, 4), np.float32), "min-max")).all()
 
 
 def test_networks_are_recognised(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.client.fake_server import FakeServer
 from tests.trainer.models import numpy_networks as oracle
@@ -21,6 +23,7 @@ from trainer.losses.backbones import BACKBONES
 from trainer.losses.lpips import LPIPS
 from trainer.models.raft import RAFT
 from trainer.run.distributed import Ranks
+from trainer.run.reporting import Meter
 from trainer.tasks import Work
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -28,6 +31,10 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
 }  # fmt: skip
+SHIPPED = [
+    pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name else []) for name in shipped()
+]
+"""RAFT and E-RAFT have no reduced size."""
 SIDE_PX = 33
 """The least that AlexNet takes, and divides by nothing."""
 
@@ -61,6 +68,7 @@ def reduced(name: str, weights: Path) -> TrainConfig:
     preset = config.stream.recipe["preset"] if isinstance(config.stream.recipe, Mapping) else config.stream.recipe
     settings = {
         "stream.recipe": {"preset": preset, **recipe}, "stream.batch_size": 2, "stream.loader_workers": 0,
+        "stream.spec": {},
         "network.options": NETWORKS[config.network.name], "compute.device": "cpu",
     }  # fmt: skip
     loss = config.loss
@@ -112,11 +120,7 @@ def flow_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
     return float(sum(gamma ** (len(p) - 1 - i) * error for i, error in enumerate(errors)) if gamma else errors[-1])
 
 
-# RAFT and E-RAFT have no reduced size.
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name else []) for name in shipped()],
-)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
     server: FakeServer, weights: Path, name: str
 ) -> None:
@@ -139,3 +143,49 @@ def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
     changed = [not torch.equal(a, b) for a, b in zip(before, learner.network.parameters(), strict=True)]
     assert sum(changed) > 0.9 * len(changed)
     assert (work.guide is not None) == (name == "hypere2vid")
+
+
+class Waits(TorchDispatchMode):
+    """Notes what would make a processor wait for the device: values that are read, and copies to it or from it.
+
+    The device is "meta", which has shapes and no values.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+        self.operators = 0
+
+    def __torch_dispatch__(self, function: Any, _types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = function(*args, **(kwargs or {}))
+        name = function.name()
+        self.operators += 1
+        if name in ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select") and args[0].is_meta:
+            self.seen.append(name)
+        if name in ("aten::_to_copy", "aten::copy_"):
+            source = args[0] if name == "aten::_to_copy" else args[1]
+            if source.device != out.device:
+                self.seen.append(f"{name} {source.device} -> {out.device} {list(out.shape)}")
+        return out
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_step_neither_waits_for_the_device_nor_copies_to_it(
+    server: FakeServer, weights: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the batch on the device to the reading of the meter."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # it does not know this device
+    config = reduced(name, weights)
+    learner = build(config, Ranks(0, 1, torch.device("meta")))
+    batch = next(iter(stream(config, learner.task.asked, server.address)))
+    on_device = batch.to("meta")
+    learner.step(learner.task.prepare(on_device, 0), 0, 0)  # the optimiser makes its moments
+    meter = Meter(ALONE)
+    with Waits() as waits:
+        for step in (1, 2):
+            meter.add(learner.step(learner.task.prepare(on_device, 0), step, 0))
+    assert waits.operators > 500
+    assert waits.seen == []
+    with Waits() as waits:
+        torch.zeros(3, device="meta").copy_(torch.zeros(3))
+    assert waits.seen == ["aten::copy_ cpu -> meta [3]"], "nothing is noticed"
