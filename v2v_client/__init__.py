@@ -9,7 +9,7 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.in_process import V2VDataset
-from v2v_client.memory.buffers import keep_freed_memory
+from v2v_protocol.allocator import keep_freed_memory
 from v2v_protocol.errors import (
     NoWorkers,
     ProtocolError,

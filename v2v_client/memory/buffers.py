@@ -9,7 +9,6 @@ would know: such an arena is not used again.
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections import deque
 from collections.abc import Mapping
@@ -22,9 +21,6 @@ from v2v_client.memory.arena import Arena, Bytes, batch_arrays, batch_bytes, len
 from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Layout
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-"""Parameters of mallopt(3), from glibc's malloc.h."""
-_NEVER_BYTES = (1 << 31) - 1
 
 
 class BatchMemory:
@@ -155,21 +151,3 @@ def _note_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_note_fork)
-
-
-def keep_freed_memory(_loader_worker: int = 0) -> bool:
-    """Makes this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
-
-    Every sample is received into fresh memory, and fresh memory from the kernel is cleared and mapped page by page.
-    Kept memory costs nothing of that. The price: the process stays as large as it ever was. It is a decision about the
-    whole process, so nothing calls this by itself: call it before the first iteration, and with loader workers give
-    it to them, ``DataLoader(dataset, batch_size=None, num_workers=2, worker_init_fn=keep_freed_memory)``.
-
-    Returns:
-        whether the C library understood; only glibc does.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:
-        return False
-    # Both: a large block is otherwise mapped by itself and unmapped when freed, or trimmed off the end of the heap.
-    return bool(mallopt(_M_MMAP_THRESHOLD, 1 << 30)) and bool(mallopt(_M_TRIM_THRESHOLD, _NEVER_BYTES))

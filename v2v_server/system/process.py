@@ -12,9 +12,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-_M_TRIM_THRESHOLD = -1
-_M_MMAP_THRESHOLD = -3
-_LARGEST_THRESHOLD_BYTES = 32 << 20  # glibc refuses more (HEAP_MAX_SIZE / 2)
+from v2v_protocol import allocator
+
 _PR_SET_PDEATHSIG = 1
 _TURN_SECONDS = 0.1  # the longest that Linux grants
 _MOST_FILES = 1 << 16  # a connection of each consumer and worker that a server takes, and a logbook of each worker
@@ -22,22 +21,9 @@ _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of 
 
 
 def keep_freed_memory() -> bool:
-    """Lets glibc serve and keep blocks of a few megabytes from its heap instead of mapping each anew.
-
-    A sample is 1 to 4 MB. By default every one of them is mapped, faulted in page by page and unmapped again, which
-    doubles the processor time of sending it.
-
-    Returns:
-        False where the C library is not glibc: nothing was changed, everything works, only slower.
-    """
-    if not sys.platform.startswith("linux"):
-        return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:
-        return False
-    return bool(mallopt(_M_MMAP_THRESHOLD, _LARGEST_THRESHOLD_BYTES)) and bool(
-        mallopt(_M_TRIM_THRESHOLD, _LARGEST_THRESHOLD_BYTES)
-    )
+    """:func:`v2v_protocol.allocator.keep_freed_memory` for blocks of the size of a sample: what is free beyond that, a
+    server or worker gives back."""
+    return allocator.keep_freed_memory(most_bytes=allocator.LARGEST_SAMPLE_BYTES)
 
 
 class _SchedAttr(ctypes.Structure):
