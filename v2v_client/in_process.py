@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch.utils.data import Dataset
@@ -19,7 +19,8 @@ from v2v_client.batch import Batch
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.settings import require_whole
+from v2v_protocol.spec import SpecOptions, StreamSpec
 
 
 class V2VDataset(Dataset[Sample]):
@@ -41,7 +42,7 @@ class V2VDataset(Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None: the user's cache.
-        **spec: other fields of :class:`v2v_protocol.spec.StreamSpec`.
+        options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
     Raises:
         UsageError: an argument outside its range, or the extra ``server`` is not installed.
@@ -58,12 +59,11 @@ class V2VDataset(Dataset[Sample]):
         rows: str = "full",
         list_file: str | None = None,
         cache_dir: str | None = None,
-        **spec: Any,
+        **options: Unpack[SpecOptions],
     ) -> None:
-        if not 0 <= seed <= LARGEST_SEED or not 0 <= epoch <= LARGEST_EPOCH:
-            raise UsageError(f"seed = {seed}, epoch = {epoch}: give 0 to {LARGEST_SEED} and 0 to {LARGEST_EPOCH}")
-        self.seed, self.epoch = seed, epoch
-        self.spec = StreamSpec.from_dict({**spec, "recipe": recipe})
+        self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
+        self.epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
+        self.spec = StreamSpec.from_dict({**options, "recipe": recipe})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._source = (os.fspath(videos), rows, list_file, cache_dir)
         self._maker: Any = None
