@@ -22,7 +22,6 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.sample import Layout
 
 
-
 class BatchMemory:
     """The rows of one batch that is being filled.
 
