@@ -10,7 +10,7 @@
     worker/       from a lease to its sample
     schedule/     which sequence each index is made from
     catalogue/    which videos there are
-    store/        prepared folders
+    store/        prepared clips, without loss
     flow/         optical flow
     simulation/   the virtual camera
     video/        from a file to luma

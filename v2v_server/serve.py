@@ -20,7 +20,7 @@ from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
-from v2v_server.broker.transport import FromConsumer, FromWorker, Sockets, Transport
+from v2v_server.broker.transport import FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
@@ -140,7 +140,7 @@ class Server:
         config: ServeConfig,
         catalogue: Catalogue,
         dispatcher: Dispatcher,
-        transport: Transport,
+        transport: ServerTransport,
         supervisor: Supervisor,
         quarantine: Quarantine,
         quarantine_file: Path,

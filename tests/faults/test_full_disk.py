@@ -25,11 +25,11 @@ from v2v_client import Batch
 from v2v_client.local_server import LocalServer
 from v2v_server.broker.quarantine import read_quarantine
 from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.prepare.encode import Encoding
+from v2v_server.catalogue.manifest import read_manifest
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.simulation.clip import warm_up
-from v2v_server.store.manifest import read_manifest
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import fingerprint
 
 INJECT = Path(__file__).parent / "inject"

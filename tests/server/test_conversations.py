@@ -40,7 +40,7 @@ from v2v_server.broker.quarantine import read_quarantine
 from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
 from v2v_server.serve import Server
-from v2v_server.worker.conversation import CREDIT, Action, Conversation, Leave, Listen, Load, Make, Send, Tools
+from v2v_server.worker.conversation import CREDIT, Action, Leave, Listen, Load, Make, Send, Tools, WorkerConversation
 
 WORKERS = 2
 FAILING = "v1.mp4"
@@ -102,7 +102,7 @@ class Worker:
             is_decoded=lambda lease: lease.indices[0] % 3 == 0,
         )
         hello = WorkerHello(name.decode(), "host", 1, NUMERICS_VERSION, CREDIT)
-        self.conversation = Conversation(hello, "queue://workers", tools, is_watched=True)
+        self.conversation = WorkerConversation(hello, "queue://workers", tools, is_watched=True)
         self.step: Action = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))

@@ -42,10 +42,11 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.look import look
 from v2v_server.flow import FlowSettings, flow_for, view_part
 from v2v_server.flow.methods import one_thread
-from v2v_server.prepare.encode import Encoding, encode_luma
+from v2v_server.prepare.encode import encode_luma
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation.clip import simulate_clip, warm_up
 from v2v_server.simulation.view import apply_view
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import stream_luma
 from v2v_server.worker.produce import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX

@@ -18,9 +18,10 @@ from v2v_bench.corpus import webvid_like
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.prepare.encode import Encoding, encode_luma
+from v2v_server.prepare.encode import encode_luma
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.rows import Rows
 

@@ -1,6 +1,6 @@
 """The way in and out: who sent what, and what goes to whom.
 
-The loop (:mod:`v2v_server.serve`) knows only the :class:`Transport`. The server's is :class:`Sockets`, two ZeroMQ
+The loop (:mod:`v2v_server.serve`) knows only the :class:`ServerTransport`. The server's is :class:`Sockets`, two ZeroMQ
 sockets; tests have one of plain queues.
 
 Samples pass through as the very frames that arrived; only the small header before them is read.
@@ -48,7 +48,7 @@ class FromWorker:
 Arrival: TypeAlias = FromConsumer | FromWorker
 
 
-class Transport(Protocol):
+class ServerTransport(Protocol):
     """Carries messages between the server and its peers."""
 
     @property
@@ -120,7 +120,7 @@ class Sockets:
         return router
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """See :class:`Transport`."""
+        """See :class:`ServerTransport`."""
         ready = dict(self._poller.poll(int(seconds * 1000)))
         arrivals: list[Arrival] = []
         if self._workers in ready and (message := _receive(self._workers)) is not None:
@@ -130,7 +130,7 @@ class Sockets:
         return arrivals
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
-        """See :class:`Transport`."""
+        """See :class:`ServerTransport`."""
         router = self._consumers if isinstance(action, ToConsumer) else self._workers
         try:
             router.send(action.identity, _NOBLOCK_MORE)

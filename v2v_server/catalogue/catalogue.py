@@ -22,11 +22,11 @@ from v2v_server.catalogue.files import (
 )
 from v2v_server.catalogue.index_file import Record, Store
 from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.catalogue.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.store.clips import STORE_FORMAT
-from v2v_server.store.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 

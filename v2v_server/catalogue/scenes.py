@@ -18,10 +18,10 @@ from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.store.clips import pictures_of
-from v2v_server.store.manifest import Manifest
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window

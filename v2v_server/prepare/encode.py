@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import av
@@ -25,69 +24,12 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 
-from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store.packing import SIZES
+from v2v_protocol.errors import VideoError
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.source import reason
 
-LOSSLESS, H264 = "lossless", "h264"
-DEFAULT_QUALITY, DEFAULT_GOP, DEFAULT_SIZE = 18, 25, "dense"
 _NOMINAL_RATE = 25
-_LOWEST_QUALITY = 51
-_LONGEST_GOP = 600
 _OPTIONS = {"preset": "medium", "tune": "fastdecode", "x264-params": "no-psy=1:scenecut=0"}
-
-
-@dataclass(frozen=True, slots=True)
-class Encoding:
-    """How a prepared corpus holds its pictures.
-
-    Attributes:
-        codec: "lossless", files of the store, or "h264".
-        size: lossless: a key of :data:`v2v_server.store.packing.SIZES`; else empty.
-        quality: h264: x264's rate factor, lower is better and larger; else 0.
-        gop: h264: distance of keyframes in frames; decoding a random range begins up to so many frames early. Else 0.
-
-    Raises:
-        UsageError: an unknown codec, or a setting that it does not have or that is outside its limits.
-    """
-
-    codec: str = LOSSLESS
-    size: str = ""
-    quality: int = 0
-    gop: int = 0
-
-    def __post_init__(self) -> None:
-        if self.codec == LOSSLESS:
-            if self.size not in SIZES or self.quality or self.gop:
-                raise UsageError(f"{self}: lossless has a size, one of {', '.join(SIZES)}, and no quality or gop")
-        elif self.codec == H264:
-            if self.size or not 1 <= self.quality <= _LOWEST_QUALITY:
-                raise UsageError(f"{self}: h264 has no size, and a quality (rate factor) of 1 .. {_LOWEST_QUALITY}")
-            if not 1 <= self.gop <= _LONGEST_GOP:
-                raise UsageError(f"gop {self.gop}: give 1 .. {_LONGEST_GOP} frames")
-        else:
-            raise UsageError(f"codec {self.codec!r}: choose {LOSSLESS} or {H264}")
-
-    @classmethod
-    def of(cls, codec: str, size: str | None = None, quality: int | None = None, gop: int | None = None) -> Encoding:
-        """The settings that were asked for, and the defaults of the others that the codec has.
-
-        Raises:
-            UsageError: see the class.
-        """
-        if codec == LOSSLESS:
-            return cls(codec, DEFAULT_SIZE if size is None else size, quality or 0, gop or 0)
-        return cls(
-            codec, size or "", DEFAULT_QUALITY if quality is None else quality, DEFAULT_GOP if gop is None else gop
-        )
-
-    @property
-    def is_lossless(self) -> bool:
-        """Whether the files give the very pixels of their sources."""
-        return self.codec == LOSSLESS
-
-    def __str__(self) -> str:
-        return f"lossless {self.size}" if self.is_lossless else f"{self.codec} quality {self.quality} gop {self.gop}"
 
 
 def encode_luma(

@@ -6,7 +6,7 @@ their sources, or MP4; whatever their names end in.
 
 Whatever happens, the folder stays sound: a file gets its name only when whole and verified, and its line in the
 manifest after that. A second run keeps what the manifest lists, if file and source are still those, and does the rest.
-No run forgets what it was not asked for: those records are set aside (see :mod:`v2v_server.store.manifest`).
+No run forgets what it was not asked for: those records are set aside (see :mod:`v2v_server.catalogue.manifest`).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
 from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.catalogue.manifest import Header, PreparedVideo
+from v2v_server.catalogue.manifest_writer import ManifestWriter
 from v2v_server.catalogue.scene import Scene
-from v2v_server.prepare.encode import Encoding
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
-from v2v_server.store.manifest import Header, PreparedVideo
-from v2v_server.store.manifest_writer import ManifestWriter
+from v2v_server.store.encoding import Encoding
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows

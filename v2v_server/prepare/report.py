@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from v2v_protocol.refusal import Refusal
-from v2v_server.store.manifest import PreparedVideo
+from v2v_server.catalogue.manifest import PreparedVideo
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class Report:
         videos: a record of every video of the source, by id.
         kept: how many of them an earlier run had done.
         looked_at: how many of them an earlier run had done but for the statistics of what they show.
-        aside: how many videos of earlier runs this one was not asked for; see :mod:`v2v_server.store.manifest`.
+        aside: how many videos of earlier runs this one was not asked for; see :mod:`v2v_server.catalogue.manifest`.
         not_looked_at: prepared videos whose statistics could not be taken, and why. What they had stays.
         unusable: files of the source that no server takes in either.
         floor_db: least PSNR of a clip.

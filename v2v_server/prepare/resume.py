@@ -12,8 +12,8 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.catalogue.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
-from v2v_server.store.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
 from v2v_server.video.fingerprint import fingerprint
 
 _LOCK_NAME = ".v2v-prepare.lock"

@@ -23,8 +23,9 @@ import xxhash
 from v2v_protocol.errors import VideoError
 from v2v_server.catalogue.look import Look
 from v2v_server.catalogue.scene import MOST_FRAMES, Scene
-from v2v_server.prepare.encode import Encoding, encode_luma
+from v2v_server.prepare.encode import encode_luma
 from v2v_server.store.clips import stored_pictures
+from v2v_server.store.encoding import Encoding
 from v2v_server.store.format import Head, group_frames_for
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import StoreFile

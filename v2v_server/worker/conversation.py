@@ -112,7 +112,7 @@ class Tools:
     is_decoded: Callable[[Lease], bool]
 
 
-class Conversation:
+class WorkerConversation:
     """What one worker says.
 
     Args:

@@ -24,7 +24,7 @@ from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.simulation.variants import USUAL
 from v2v_server.system.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
-from v2v_server.worker.conversation import CREDIT, Action, Conversation, Listen, Load, Make, Say, Send, Tools
+from v2v_server.worker.conversation import CREDIT, Action, Listen, Load, Make, Say, Send, Tools, WorkerConversation
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.handover import room_for, sample_message
 from v2v_server.worker.logbook import IDLE, note
@@ -59,7 +59,7 @@ class Worker:
         self._logbook = logbook
         self._clips = Clips(root)
         self._kernels = set(USUAL)  # that are loaded
-        self._conversation = Conversation(
+        self._conversation = WorkerConversation(
             WorkerHello(name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT),
             address,
             Tools(

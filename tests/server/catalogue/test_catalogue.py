@@ -21,9 +21,9 @@ from tests.server.video.lethal_reads import always_exits, always_killed, killed_
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.catalogue import catalogue as catalogue_module
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.manifest import MANIFEST_NAME
 from v2v_server.catalogue.refresh import index_path
 from v2v_server.catalogue.survey import Examine, survey
-from v2v_server.store.manifest import MANIFEST_NAME
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
 

@@ -34,8 +34,8 @@ from v2v_server.catalogue.scene import (
     UNKNOWN,
     Scene,
 )  # fmt: skip
-from v2v_server.prepare.encode import Encoding
 from v2v_server.prepare.prepare import prepare
+from v2v_server.store.encoding import Encoding
 from v2v_server.system.isolate import run_isolated
 from v2v_server.video.rows import Rows
 

@@ -20,12 +20,13 @@ import pytest
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.commands.prepare import main as prepare_main
-from v2v_server.prepare.encode import Encoding, encode_luma
+from v2v_server.prepare.encode import encode_luma
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.transcode import HIGHEST_PSNR_DB
-from v2v_server.store.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import probe

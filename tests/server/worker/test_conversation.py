@@ -27,7 +27,6 @@ from v2v_protocol.messages import (
 from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
     Action,
-    Conversation,
     Leave,
     Listen,
     Load,
@@ -35,6 +34,7 @@ from v2v_server.worker.conversation import (
     Say,
     Send,
     Tools,
+    WorkerConversation,
 )
 
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
@@ -74,7 +74,7 @@ class Talk:
             is_compiled=lambda one: self.compiled,
             is_decoded=lambda one: one.lease in self.decoded,
         )
-        self.conversation = Conversation(HELLO, "tcp://there", tools, is_watched=is_watched)
+        self.conversation = WorkerConversation(HELLO, "tcp://there", tools, is_watched=is_watched)
         self.step: Action = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]

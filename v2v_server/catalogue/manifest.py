@@ -23,8 +23,8 @@ from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.catalogue.files import answers
 from v2v_server.catalogue.index_file import Record
 from v2v_server.catalogue.scene import Scene
-from v2v_server.prepare.encode import Encoding
 from v2v_server.store.clips import STORE_FORMAT
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -38,7 +38,7 @@ class Header:
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        codec, size, quality, gop: see :class:`v2v_server.prepare.encode.Encoding`.
+        codec, size, quality, gop: see :class:`v2v_server.store.encoding.Encoding`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
             that are set aside do not count.
         source: name of the source folder, for people.
