@@ -68,7 +68,7 @@ class VideoError(V2VError):
 
 
 class VideoChanged(VideoError):
-    """The file differs from the one that was catalogued (size, or hash of its head and tail)."""
+    """The file differs from the one that was catalogued."""
 
 
 class VideoUnreadable(VideoError):

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
@@ -246,6 +246,9 @@ class Server:
         once in a while: all workers of a host fail alike."""
         try:
             check_file(self._catalogue.path(missing.video), missing.fingerprint)
+        except VideoChanged:
+            self._catalogue.doubt(missing.video)
+            return False
         except (VideoError, CorpusError):
             return False
         now = time.monotonic()

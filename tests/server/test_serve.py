@@ -74,9 +74,11 @@ def served(
     dispatcher: Scripted, folder: Path, supervisor: ToySupervisor | None = None, transport: Queues | None = None
 ) -> Server:
     """A server that has made one turn."""
+    doubted: list[str] = []
+    catalogue = SimpleNamespace(path=lambda video: folder / video, doubted=doubted, doubt=doubted.append)
     server = Server(
         ServeConfig(videos="videos", workers=0),
-        cast(Catalogue, SimpleNamespace(path=lambda video: folder / video)),
+        cast(Catalogue, catalogue),
         cast(Dispatcher, dispatcher),
         transport or Queues(),
         supervisor or ToySupervisor(lambda name, address: None),
@@ -118,8 +120,9 @@ def test_what_is_looked_for_is_reported(
     monkeypatch.setattr(serve_module, "check_file", check)
     missing = LookFor("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
     dispatcher = Scripted([missing, missing])
-    served(dispatcher, tmp_path)
+    server = served(dispatcher, tmp_path)
     assert dispatcher.told == [("looked for", missing, found)] * 2
+    assert cast(Any, server)._catalogue.doubted == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
     assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
 

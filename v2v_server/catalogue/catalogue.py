@@ -6,6 +6,7 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,7 +43,7 @@ class VideoEntry:
 
     Attributes:
         id: relative POSIX path; its name for ever.
-        fingerprint: size and hash of head and tail.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
         frames: how many frames there are to decode.
         width_px, height_px: size of the upright picture, before ``rows``.
         frames_per_second: average rate; NaN where unknown.
@@ -186,6 +187,12 @@ class Catalogue:
                 "server with --scene auto"
             )
         return self.scene_digest
+
+    def doubt(self, id: str) -> None:
+        """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
+        say. Does nothing where the index cannot be written now."""
+        with suppress(sqlite3.Error):
+            self._store.doubt(id)
 
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""

@@ -1,6 +1,7 @@
 """The index of a corpus on disk: what probing each file has found, so that the next start need not do it again.
 
-One SQLite file per corpus. A row is believed as long as the file's size and modification time stay the same. Writes are
+One SQLite file per corpus. A row is believed as long as the file's size and the times of its last modification and
+change of status stay the same: the latter is set by the system whatever a program does to the former. Writes are
 short transactions with a busy timeout, so several servers may share one index; since a row is a function of the file
 alone, it does not matter which of them wrote it.
 """
@@ -13,18 +14,16 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
 
 _BUSY_SECONDS = 30.0
-_COLUMNS = (
-    "id, size_bytes, mtime_ns, fingerprint, frames, width_px, height_px, frames_per_second, codec, interlaced, problem"
-)
 _TABLE = """
 CREATE TABLE video (
     id TEXT PRIMARY KEY,
     size_bytes INTEGER NOT NULL,
     mtime_ns INTEGER NOT NULL,
+    ctime_ns INTEGER NOT NULL,
     fingerprint TEXT NOT NULL,
     frames INTEGER NOT NULL,
     width_px INTEGER NOT NULL,
@@ -53,8 +52,9 @@ class Record:
 
     Attributes:
         id: relative POSIX path.
-        size_bytes, mtime_ns: of the file when it was probed.
-        fingerprint: size and hash of head and tail.
+        size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
+            probed again at the next start.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
         frames, width_px, height_px, frames_per_second, codec, interlaced: see
             :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
         problem: why the file cannot be used; None if it can.
@@ -63,7 +63,8 @@ class Record:
 
     id: str
     size_bytes: int
-    mtime_ns: int
+    mtime_ns: int = 0
+    ctime_ns: int = 0
     fingerprint: str = ""
     frames: int = 0
     width_px: int = 0
@@ -73,6 +74,9 @@ class Record:
     interlaced: bool = False
     problem: str | None = None
     frame_index: bytes | None = None
+
+
+_COLUMNS = ", ".join(name for name in Record.__slots__ if name != "frame_index")
 
 
 class Store:
@@ -166,7 +170,10 @@ class Store:
             sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
         """
         rows = [tuple(getattr(record, name) for name in Record.__slots__) for record in records]
-        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({'?, ' * 11}?)", rows)
+        self._change(
+            f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({', '.join('?' * len(Record.__slots__))})",
+            rows,
+        )
 
     def forget(self, ids: Iterable[str]) -> None:
         """Drop records, in one transaction.
@@ -175,6 +182,18 @@ class Store:
             sqlite3.Error: as for :meth:`put`.
         """
         self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
+
+    def doubt(self, id: str) -> None:
+        """Let the next start probe a file again. Gives up at once where another process is writing.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._database.execute("PRAGMA busy_timeout = 0")
+        try:
+            self._change("UPDATE video SET size_bytes = -1 WHERE id = ?", [(id,)])
+        finally:
+            self._database.execute(f"PRAGMA busy_timeout = {1000 * _BUSY_SECONDS:.0f}")
 
     def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
         if not rows:

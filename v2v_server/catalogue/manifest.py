@@ -25,6 +25,7 @@ from v2v_server.catalogue.index_file import Record
 from v2v_server.catalogue.scene import Scene
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
+from v2v_server.video.fingerprint import is_same_file
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -178,7 +179,7 @@ class Manifest:
         if self.lossless:
             is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
             return record.problem is None and record.frames == video.frames and is_either
-        return (record.fingerprint, record.frames) == (video.fingerprint, video.frames)
+        return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
 
     def as_source(self, record: Record) -> Record:
         """The record of a prepared file, with what has to agree with its source even where there is no sound file:

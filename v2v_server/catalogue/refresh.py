@@ -114,10 +114,11 @@ def _stale(root: Path, ids: Sequence[str], known: Mapping[str, Record], notice: 
         if id not in known:
             return False
         try:
-            status = os.stat(os.path.join(root, id))
+            status, record = os.stat(os.path.join(root, id)), known[id]
         except OSError:
             return False
-        return (status.st_size, status.st_mtime_ns) == (known[id].size_bytes, known[id].mtime_ns)
+        seen = record.size_bytes, record.mtime_ns, record.ctime_ns
+        return (status.st_size, status.st_mtime_ns, status.st_ctime_ns) == seen
 
     stale = []
     for done, (id, unchanged) in enumerate(answers(is_unchanged, ids), 1):

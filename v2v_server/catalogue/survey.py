@@ -33,27 +33,24 @@ def examine(root: str, id: str) -> Record:
     """
     path = Path(root, id)
     try:
-        status = path.stat()
+        before = _state(path)
         mark = fingerprint(path)
-    except OSError as error:
-        return Record(id, -1, 0, problem=f"cannot be read: {error.strerror or error}")
-    except VideoError as error:
-        return Record(id, -1, 0, problem=error.reason)
-    size, mtime = status.st_size, status.st_mtime_ns
-    try:
         facts = _facts(path)
+        if _state(path) != before:
+            return Record(id, -1, problem="changes while it is read; the next start tries again")
+    except OSError as error:
+        return Record(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:
-        return Record(id, -1, 0, problem=error.reason)
+        return Record(id, -1, problem=error.reason)
     except VideoError as error:
         where = "" if error.frame is None else f"frame {error.frame}: "
-        return Record(id, size, mtime, problem=where + error.reason)
+        return Record(id, *before, problem=where + error.reason)
     except Exception as error:  # noqa: BLE001 - one strange file must not end the survey of all others
-        return Record(id, size, mtime, problem=f"probing failed: {type(error).__name__}: {error}")
+        return Record(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
     return Record(
-        id=id,
-        size_bytes=size,
-        mtime_ns=mtime,
-        fingerprint=mark,
+        id,
+        *before,
+        fingerprint=f"{mark}-{facts.content}" if facts.content else mark,
         frames=facts.frames,
         width_px=facts.width_px,
         height_px=facts.height_px,
@@ -62,6 +59,12 @@ def examine(root: str, id: str) -> Record:
         interlaced=facts.interlaced,
         frame_index=facts.index.to_bytes(),
     )
+
+
+def _state(path: Path) -> tuple[int, int, int]:
+    """Size in bytes, and the times of the last modification and change of status."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _facts(path: Path) -> VideoFacts:
@@ -108,7 +111,7 @@ def survey(
     suspects: list[str] = []
     for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
         if isinstance(found, Died) and found.overdue_seconds:
-            yield Record(id, -1, 0, problem=f"cannot be probed: {found.how}; the next start tries again")
+            yield Record(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
         elif isinstance(found, Died):
             suspects.append(id)
         else:
@@ -120,10 +123,9 @@ def survey(
 def _culprit(root: Path, id: str, death: Died) -> Record:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
-        return Record(id, -1, 0, problem=f"{why}; the next start tries again")
+        return Record(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        status = Path(root, id).stat()
+        return Record(id, *_state(Path(root, id)), problem=why)
     except OSError:
-        return Record(id, -1, 0, problem=why)  # gone meanwhile; should it come back, it is looked at again
-    return Record(id, status.st_size, status.st_mtime_ns, problem=why)
+        return Record(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again

@@ -151,7 +151,8 @@ def read_head(path: str, file: int) -> tuple[Head, int]:
 def is_store_file(path: str | os.PathLike[str]) -> bool:
     """Whether a file begins like one of the store. A file that cannot be read does not."""
     try:
-        with open(path, "rb") as file:
+        # An ordinary open of a named pipe would wait for somebody at its other end.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             return file.read(len(MAGIC)) == MAGIC
     except OSError:
         return False

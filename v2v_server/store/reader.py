@@ -35,7 +35,7 @@ class StoreFile:
     def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
         self._path = os.fspath(path)
         try:
-            self._file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+            self._file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # no waiting for a pipe
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         try:

@@ -1,10 +1,16 @@
-"""Telling whether a file is still the one that was catalogued, without reading all of it."""
+"""Which file a video is: what names its bytes, and a part of that name which can be checked without reading them all.
+
+    <size in bytes>-<hash of head and tail>-<hash of every packet>
+
+The whole name is known once the file has been probed, which reads it from end to end anyhow. What is opened later is
+compared by the first two parts: a worker that read everything would read a film for each two seconds of it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from pathlib import Path
+import stat
 
 from v2v_protocol.errors import VideoChanged, VideoUnreadable
 
@@ -15,26 +21,35 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     """Size in bytes and a hash of the first and last 64 KiB: ``"<size>-<32 hexadecimal digits>"``.
 
     Raises:
-        VideoUnreadable: the file cannot be read.
+        VideoUnreadable: the file cannot be read, or is no regular file.
     """
     try:
-        with Path(path).open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+        # An ordinary open of a named pipe would wait for somebody at its other end.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise VideoUnreadable(os.fspath(path), None, "is no regular file")
             digest = hashlib.sha256(b"v2v fingerprint 1\n" + file.read(_BLOCK_BYTES))
-            file.seek(max(0, size - _BLOCK_BYTES))
+            file.seek(max(0, status.st_size - _BLOCK_BYTES))
             digest.update(file.read(_BLOCK_BYTES))
     except OSError as error:
         raise VideoUnreadable(os.fspath(path), None, f"cannot be read: {error.strerror or error}") from error
-    return f"{size}-{digest.hexdigest()[:32]}"
+    return f"{status.st_size}-{digest.hexdigest()[:32]}"
+
+
+def is_same_file(one: str, other: str) -> bool:
+    """Whether two fingerprints can be of one file, as far as both of them say."""
+    parts = list(zip(one.split("-"), other.split("-"), strict=False))
+    return len(parts) > 1 and all(a == b for a, b in parts)
 
 
 def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
-    """Make sure that the file is the one that was catalogued.
+    """Make sure that the file is the one that was catalogued, as far as its size, head and tail tell.
 
     Raises:
         VideoChanged: it is another one now.
-        VideoUnreadable: it cannot be read.
+        VideoUnreadable: it cannot be read, or is no regular file.
     """
     found = fingerprint(path)
-    if found != expected:
+    if not is_same_file(found, expected):
         raise VideoChanged(os.fspath(path), None, f"changed since it was catalogued: {found} instead of {expected}")

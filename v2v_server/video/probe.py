@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from array import array
@@ -40,9 +41,10 @@ class VideoFacts:
         frames_per_second: average rate: from the first and last time stamps, else the container's; NaN if unknown.
         rotation_degrees: of the display matrix, counter-clockwise as FFmpeg reports it (-90 .. 180).
         full_range: whether luma spans 0 .. 255 (see :mod:`v2v_server.video.luma`).
+        index: the frames.
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
             taken at different times.
-        index: the frames.
+        content: 32 hexadecimal digits that name what the track stores: every packet, and when each frame is shown.
     """
 
     frames: int
@@ -53,8 +55,9 @@ class VideoFacts:
     frames_per_second: float
     rotation_degrees: int
     full_range: bool
-    interlaced: bool
     index: FrameIndex
+    interlaced: bool = False
+    content: str = ""
 
 
 def probe(path: str | os.PathLike[str]) -> VideoFacts:
@@ -97,6 +100,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         full_range=LumaFormat.of(head).full_range,
         interlaced=head.interlaced_frame or shown.fields,
         index=index,
+        content=_content(shown, index),
     )
 
 
@@ -108,6 +112,7 @@ class _Shown:
     dts: array[int] = field(default_factory=lambda: array("q"))
     is_keyframe: bytearray = field(default_factory=bytearray)
     fields: bool = False
+    stored: hashlib._Hash = field(default_factory=hashlib.sha256)  # of every packet of the track
 
     def add(self, packet: Packet[VideoStream]) -> None:
         self.pts.append(NO_TIMESTAMP if packet.pts is None else packet.pts)
@@ -127,6 +132,7 @@ def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[Vi
         if head is None:
             head, failure = _first_sound(stream, packet, failure)
         content = memoryview(packet)
+        shown.stored.update(content)
         begins = not is_hidden(codec, content) if fields is None else fields.begins_frame(content)
         if begins and not packet.is_discard:
             shown.add(packet)
@@ -196,6 +202,13 @@ def _index(shown: _Shown, head: VideoFrame, base: tuple[int, int], size: tuple[i
         width_px=size[1],
         seekable=True,
     )
+
+
+def _content(shown: _Shown, index: FrameIndex) -> str:
+    stored = shown.stored.copy()
+    for part in (index.pts, index.keyframes):
+        stored.update(b"%d;" % len(part) + part.astype("<i8").tobytes())
+    return stored.hexdigest()[:32]
 
 
 def _count_by_decoding(name: str) -> int:

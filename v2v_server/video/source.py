@@ -15,7 +15,7 @@ from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from v2v_protocol.errors import VideoError
+from v2v_protocol.errors import VideoError, VideoUnreadable
 
 FORMATS = (
     "mov", "matroska", "avi", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264", "hevc",
@@ -59,12 +59,13 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
 
     Raises:
         VideoError: the file cannot be opened, has no video track, or is of a format or size that is not read.
+        VideoUnreadable: it is no regular file.
     """
     name = os.fspath(path)
     try:
         # To open a named pipe waits for somebody to write into it, and a device may not end.
         if not stat.S_ISREG(os.stat(name).st_mode):
-            raise VideoError(name, None, "is no regular file")
+            raise VideoUnreadable(name, None, "is no regular file")
         # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one.
         container = av.open(os.path.abspath(name), "r", options=_OPTIONS)
     except av.ArgumentError as error:

@@ -20,11 +20,12 @@ from tests.server.catalogue.failing_storage import failing_opens
 from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.catalogue import catalogue as catalogue_module
+from v2v_server.catalogue import survey as survey_module
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.manifest import MANIFEST_NAME
 from v2v_server.catalogue.refresh import index_path
 from v2v_server.catalogue.survey import Examine, survey
-from v2v_server.video.fingerprint import check_fingerprint, fingerprint
+from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.rows import Rows
 
 
@@ -86,7 +87,7 @@ def test_a_folder(corpus: Path, opener: Opener) -> None:
     video = catalogue.videos[0]
     assert (video.frames, video.width_px, video.height_px, video.codec) == (30, 64, 48, "h264")
     assert video.frames_per_second == pytest.approx(25)
-    assert video.fingerprint == fingerprint(corpus / "a.mp4")
+    assert is_same_file(video.fingerprint, fingerprint(corpus / "a.mp4"))
     assert catalogue.path("sub/b.mp4") == (corpus / "sub/b.mp4").resolve()
     np.testing.assert_array_equal(catalogue.frame_index("a.mp4").seconds(0, 30), np.arange(30) / 25)
     assert catalogue.notes == ()
@@ -191,6 +192,89 @@ def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener)
         first.frame_index("a.mp4")
     with pytest.raises(CorpusError, match="no video of this catalogue"):
         moved.frame_index("sub/b.mp4")
+
+
+def test_a_video_replaced_in_its_middle_is_another_one(corpus: Path, opener: Opener) -> None:
+    path = write_clip(corpus / "long.avi", panned_luma(60, 96, 128), codec="rawvideo")
+    first = opener(corpus)
+    content = bytearray(path.read_bytes())
+    assert len(content) > 3 * 65536
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    changed = opener(corpus)
+    assert opener.probed == [4, 1]
+    before, after = (next(v for v in each.videos if v.id == "long.avi").fingerprint for each in (first, changed))
+    assert is_same_file(before, fingerprint(path))  # head and tail are what they were
+    assert not is_same_file(before, after)
+    assert first.digest != changed.digest
+
+
+def test_a_video_replaced_by_one_of_equal_size_and_time_is_probed_again(corpus: Path, opener: Opener) -> None:
+    path = write_clip(corpus / "raw.avi", panned_luma(12), codec="rawvideo")
+    status = path.stat()
+    first = opener(corpus)
+    write_clip(path, panned_luma(12)[::-1], codec="rawvideo")
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (status.st_size, status.st_mtime_ns)
+    assert opener(corpus).digest != first.digest
+    assert opener.probed == [4, 1]
+
+
+def test_a_video_that_is_doubted_is_probed_at_the_next_start_and_served_until_then(
+    corpus: Path, opener: Opener
+) -> None:
+    first = opener(corpus)
+    first.doubt("a.mp4")
+    assert len(first.frame_index("a.mp4")) == 30
+    with closing(sqlite3.connect(next(opener.cache.iterdir()), isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        first.doubt("sub/b.mp4")  # another process writes: neither waited for nor an error
+        other.execute("ROLLBACK")
+    assert opener(corpus).digest == first.digest
+    opener(corpus)
+    assert opener.probed == [3, 1, 0]
+
+
+@pytest.mark.parametrize("step", ["fingerprint", "facts_of"])
+def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path, aside = corpus / "a.mp4", corpus / "aside"
+    work = getattr(survey_module, step)
+
+    def in_that_moment(of: Path) -> object:
+        if of != path:
+            return work(of)
+        path.rename(aside)
+        os.mkfifo(path)
+        try:
+            return work(of)
+        finally:
+            aside.rename(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(survey_module, step, in_that_moment)
+        (problem,) = opener(corpus).refusals
+    assert (problem.video, problem.reason) == ("a.mp4", "is no regular file")
+    assert len(opener(corpus).videos) == 3
+
+
+def test_a_video_that_changes_while_it_is_probed_is_probed_again(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = survey_module.facts_of
+
+    def meanwhile(path: Path) -> object:
+        facts = work(path)
+        if path.name == "a.mp4":
+            write_clip(path, panned_luma(12))
+        return facts
+
+    with monkeypatch.context() as patch:
+        patch.setattr(survey_module, "facts_of", meanwhile)
+        (problem,) = opener(corpus).refusals
+    assert problem.reason == "changes while it is read; the next start tries again"
+    assert [video.frames for video in opener(corpus).videos] == [12, 30, 30]
 
 
 def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: Path) -> None:

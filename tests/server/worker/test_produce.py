@@ -24,7 +24,6 @@ from v2v_server.commands.simulate import main as simulate
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.fingerprint import fingerprint
 from v2v_server.worker import decode_cache as clips
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
 
@@ -134,7 +133,7 @@ def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalog
         return video
 
     first = made()
-    mark = fingerprint(catalogue.root / first)
+    mark = next(video.fingerprint for video in catalogue.videos if video.id == first)
     file = quarantine_path(catalogue.root, cache)
     for frame in (0, 10):  # two verdicts refuse the file
         write_verdict(file, Verdict(0, first, mark, frame, "crash", "t"), read_quarantine(file))
