@@ -72,7 +72,7 @@ def _no_process_left() -> Iterator[None]:
 
 def server_workers(pid: int) -> list[psutil.Process]:
     """The worker processes of a server (it has other helpers, which come and go)."""
-    return [child for child in psutil.Process(pid).children() if " worker " in _command(child)]
+    return [child for child in psutil.Process(pid).children() if "v2v_server.commands.worker" in _command(child)]
 
 
 def _command(process: psutil.Process) -> str:
