@@ -243,6 +243,20 @@ def test_a_network_touches_its_own_file_and_one_line_of_the_registry(
     assert isinstance(load_network(tmp_path / "bare.pth")[0], Toy)
 
 
+def test_flow_is_judged_and_shown_as_well(server: FakeServer, tmp_path: Path) -> None:
+    run = trained(
+        tmp_path, server.address, "run", run__steps=2, run__preview_every=2, run__judge_every=1,
+        network__name="evflownet", network__options={"base_channels": 2},
+        loss__flow="stream", loss__valid="consistent",
+    )  # fmt: skip
+    assert server.hellos[-1].arrays == ("voxels", "flow", "flow_valid")
+    judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
+    assert [record["step"] for record in judged] == [1, 2]
+    assert all(record["held_out_end_point_error_px"] > 0 for record in judged)
+    sheet = cv2.imread(str(run / "previews" / "step-0000002-0.png"))
+    assert sheet.shape == (3 * (8 * 16 + 4), 3 * (8 * 20 + 4), 3)
+
+
 def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> None:
     with FakeServer(sequences=1) as server:
         run = trained(
