@@ -353,7 +353,7 @@ class WithSlots(Interleaving):
         slots = self.slots.setdefault(identity, Slots())
         session = self.at.dispatcher.sessions.get(identity)
         keys = {epoch * 1000 + index: index for index in indices}
-        fresh = {key: index for key, index in keys.items() if slots.of(key) is None}
+        fresh = {key: index for key, index in keys.items() if key not in slots._named}
         if session is None or len(session.unanswered | {(epoch, index) for index in indices}) > session.credit:
             super().want(identity, epoch, indices)  # refused as a whole, which no client of ours lets happen
             return
@@ -362,14 +362,14 @@ class WithSlots(Interleaving):
             arena = self._arena()
             numbers = list(range(1, len(fresh) + 1))
             self.expected[arena] = set(numbers)
-            for key, number in zip(fresh, numbers, strict=True):
-                slots.name(key, Slot(arena, number))
+            slots.offer({key: Slot(arena, number) for key, number in zip(fresh, numbers, strict=True)})
+            slots.want(epoch, list(fresh))
             self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=arena, slots=numbers)
 
     def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         slots = self.slots[identity]
         key = header.epoch * 1000 + header.index
-        slot = slots.of(key)
+        slot = slots._named.get(key)
         answer = slots.answered(key, header.slot, in_message=in_message)
         assert answer is not Answer.NOWHERE
         self.abandoned += answer is Answer.ABANDONED
