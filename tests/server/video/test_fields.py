@@ -37,7 +37,7 @@ def test_a_range_is_decoded_from_its_keyframe(tmp_path: Path, monkeypatch: pytes
     path = write_field_coded(tmp_path / "clip.ts", LUMA)
     index = probe(path).index
     np.testing.assert_array_equal(index.keyframes, [0, 6, 12, 18])
-    monkeypatch.setattr("v2v_server.video.decode._decode_plainly", lambda stack: pytest.fail("the seek failed"))
+    monkeypatch.setattr("v2v_server.video.decode._from_beginning", lambda stack: pytest.fail("the seek failed"))
     np.testing.assert_array_equal(decode_luma(path, index, 14, 3).frames, range_table(8, False)[LUMA[14:17]])
 
 
