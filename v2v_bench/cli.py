@@ -34,6 +34,7 @@ BENCHMARKS = {
     "training_trade": "tradeoff.training_trade",
     "flow": "accuracy.flow",
     "physics": "accuracy.physics",
+    "sensor": "accuracy.sensor",
     "extremes": "accuracy.extremes",
     "scene": "accuracy.scene",
     "learn": "accuracy.learn",

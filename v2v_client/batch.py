@@ -11,7 +11,7 @@ import torch
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import ARRAYS, Provenance
+from v2v_protocol.sample import Provenance
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -19,12 +19,7 @@ class Batch:
     """Samples of one batch, in the order of the epoch.
 
     Attributes:
-        voxels: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``; None when not asked for. Positive
-            counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
-        frames: [B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated; None when not asked for.
-        flow: [B, T, 2, H, W] float16, px in (x, y); None when not asked for. flow[:, t] belongs to voxel t of the
-            target sequence and is zero before ``flow_from``.
-        flow_valid: [B, T, 1, H, W] uint8, 1 where forward and backward flow agree; None when not asked for.
+        arrays: the tensors that were asked for, by name; those of the next four names are at hand as attributes too.
         indices: global index of each sample.
         epoch: of the samples.
         provenance: where each sample came from.
@@ -35,10 +30,7 @@ class Batch:
         decodes: clips that were decoded for it; fewer than its samples where siblings share one.
     """
 
-    voxels: torch.Tensor | None
-    frames: torch.Tensor | None
-    flow: torch.Tensor | None
-    flow_valid: torch.Tensor | None
+    arrays: Mapping[str, torch.Tensor]
     indices: tuple[int, ...]
     epoch: int
     provenance: tuple[Provenance, ...]
@@ -59,10 +51,30 @@ class Batch:
         return f"Batch({arrays}epoch {self.epoch}, indices {some})"
 
     @property
-    def arrays(self) -> dict[str, torch.Tensor]:
-        """The tensors that were asked for, by name."""
-        named = {name: getattr(self, name) for name in ARRAYS}
-        return {name: tensor for name, tensor in named.items() if tensor is not None}
+    def voxels(self) -> torch.Tensor | None:
+        """[B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``; None when not asked for.
+
+        Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
+        """
+        return self.arrays.get("voxels")
+
+    @property
+    def frames(self) -> torch.Tensor | None:
+        """[B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated; None when not asked for."""
+        return self.arrays.get("frames")
+
+    @property
+    def flow(self) -> torch.Tensor | None:
+        """[B, T, 2, H, W] float16, px in (x, y); None when not asked for.
+
+        flow[:, t] belongs to voxel t of the target sequence and is zero before ``flow_from``.
+        """
+        return self.arrays.get("flow")
+
+    @property
+    def flow_valid(self) -> torch.Tensor | None:
+        """[B, T, 1, H, W] uint8, 1 where forward and backward flow agree; None when not asked for."""
+        return self.arrays.get("flow_valid")
 
     @property
     def nbytes(self) -> int:
@@ -71,7 +83,7 @@ class Batch:
 
     def pin_memory(self) -> Batch:
         """A copy in page-locked memory; what ``DataLoader(pin_memory=True)`` calls."""
-        return self._with({name: tensor.pin_memory() for name, tensor in self.arrays.items()})
+        return dataclasses.replace(self, arrays={name: tensor.pin_memory() for name, tensor in self.arrays.items()})
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Batch:
         """This batch with its tensors on ``device``.
@@ -86,11 +98,7 @@ class Batch:
             safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
             return item.to(device, non_blocking=safe)
 
-        return self._with({name: moved(item) for name, item in self.arrays.items()})
-
-    def _with(self, arrays: dict[str, torch.Tensor]) -> Batch:
-        named: dict[str, Any] = dict(arrays)
-        return dataclasses.replace(self, **named)
+        return dataclasses.replace(self, arrays={name: moved(item) for name, item in self.arrays.items()})
 
 
 def _collate(batches: Any, *, collate_fn_map: Any) -> Any:

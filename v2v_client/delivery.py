@@ -97,10 +97,7 @@ def deliver(
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
         tensors = {name: torch.from_numpy(array) for name, array in draft.memory.whole().items()}
         yield Batch(
-            voxels=tensors.get("voxels"),
-            frames=tensors.get("frames"),
-            flow=tensors.get("flow"),
-            flow_valid=tensors.get("flow_valid"),
+            arrays=tensors,
             indices=plan.indices(number),
             epoch=epoch,
             provenance=provenance,

@@ -92,7 +92,9 @@ class Recipe:
     contrast_scale: Range = span((1.0, 3.0), 0.0, 100.0, "range of s in contrast_probability")
 
     gamma: float = number(2.2, 0.05, 20.0, "exponent of the reverse gamma correction", group="Intensity")
-    log_eps: float = number(0.001, 1e-12, 1.0, "epsilon inside the logarithm")
+    log_eps: Range = span(
+        (0.001, 0.001), 1e-12, 1.0, "epsilon inside the logarithm: the dark current as a share of white's photocurrent"
+    )
 
     threshold: Range = span(
         (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
@@ -165,6 +167,11 @@ class Recipe:
         return self.noise_unit == "second" or self.timed_effects
 
     @property
+    def crop_px(self) -> tuple[int, int]:
+        """Height and width of the crop."""
+        return self.crop_height_px, self.crop_width_px
+
+    @property
     def steps(self) -> int:
         """Differences between consecutive frames in a sample, lead voxel included."""
         return (self.voxels_per_clip + self.lead_voxels) * self.bins * self.frames_per_bin
@@ -212,7 +219,7 @@ class Recipe:
         smallest, largest = pixel_thresholds(min(low, high), nominal, self.threshold_mismatch_sigma[1])
         sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
-        ends = math.log(self.log_eps), math.log1p(self.log_eps)
+        ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1])
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
         return most_events(
@@ -221,10 +228,13 @@ class Recipe:
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as plain values (ranges as lists), in a stable order."""
-        return {
+        values = {
             field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
             for field in dataclasses.fields(self)
         }
+        # It was a number before it could be a range, and the digest of a stream shall not change.
+        low, high = self.log_eps
+        return values | {"log_eps": low} if low == high else values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

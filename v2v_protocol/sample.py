@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -19,8 +19,17 @@ from v2v_protocol.settings import require_whole
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
-ARRAYS = ("voxels", "frames", "flow", "flow_valid")
-"""Arrays a consumer may ask for."""
+ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
+    "voxels": lambda recipe, voxel_dtype: (
+        voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, *recipe.crop_px)
+    ),
+    "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+    "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
+    "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
+}  # fmt: skip
+"""Arrays a consumer may ask for: dtype and shape of one sample's (no batch dimension), by the recipe and the spec's
+``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
+1 where forward and backward flow agree."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""
@@ -69,6 +78,7 @@ class SampleParams:
         noise_key: four 32-bit words that key every per-pixel random number of this sample.
         effects: what the camera does beyond the paper's pixel model: the values drawn for those fields of the recipe
             that switch an effect on; empty for the paper's pixel.
+        log_eps: epsilon inside the logarithm where the recipe gives a range; None where it gives one value.
     """
 
     threshold_pos: float
@@ -84,6 +94,7 @@ class SampleParams:
     contrast: float
     noise_key: tuple[int, int, int, int]
     effects: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    log_eps: float | None = None
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
         """Which decoded frame each position of the clip shows.
@@ -98,10 +109,12 @@ class SampleParams:
         return np.cumsum(advance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for the provenance; ``effects`` only where there are any."""
+        """Plain values for the provenance; ``effects`` and ``log_eps`` only where there is something to say."""
         values = _fields(self)
         if not self.effects:
             del values["effects"]
+        if self.log_eps is None:
+            del values["log_eps"]
         return values
 
 
@@ -181,27 +194,17 @@ def _fields(item: Any) -> dict[str, Any]:
 
 
 def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> Layout:
-    """dtype and shape of each asked array of one sample (no batch dimension).
-
-    voxels [T + lead_voxels, bins, H, W] in ``voxel_dtype``; frames [T + lead_frames, 1, H, W] uint8; flow [T, 2, H, W]
-    float16, px in (x, y); flow_valid [T, 1, H, W] uint8, 1 where forward and backward flow agree.
+    """dtype and shape of each asked array of one sample, as :data:`ARRAYS` states them.
 
     Raises:
         UsageError: an array nobody makes, none at all, or one asked twice.
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
-    height, width = recipe.crop_height_px, recipe.crop_width_px
-    known = {
-        "voxels": (voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, height, width)),
-        "frames": ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, height, width)),
-        "flow": ("float16", (recipe.voxels_per_clip, 2, height, width)),
-        "flow_valid": ("uint8", (recipe.voxels_per_clip, 1, height, width)),
-    }
     for name in arrays:
-        if name not in known:
+        if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
-    return {name: known[name] for name in arrays}
+    return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
 
 
 def layout_bytes(layout: Layout) -> int:

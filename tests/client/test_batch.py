@@ -28,8 +28,8 @@ class Somewhere:
 
 def of(voxels: Any) -> Batch:
     return Batch(
-        voxels=voxels, frames=None, flow=None, flow_valid=None, indices=(0,), epoch=0, provenance=(), resume_state={},
-        wait_seconds=0.0, cpu_seconds=0.0, decodes=1,
+        arrays={"voxels": voxels}, indices=(0,), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
+        cpu_seconds=0.0, decodes=1,
     )  # fmt: skip
 
 

@@ -89,7 +89,7 @@ def test_the_paper_preset_holds_the_released_values() -> None:
     assert paper.noise_sigma == (0.0, 0.1)
     assert paper.hot_pixel_share == (0.0, 0.001)
     assert paper.hot_pixel_sigma == (0.0, 10.0)
-    assert (paper.gamma, paper.log_eps) == (2.2, 0.001)
+    assert (paper.gamma, paper.log_eps) == (2.2, (0.001, 0.001))
     assert (paper.pause_probability, paper.pause_stay_probability) == (0.0102, 0.9791)
     # Share of frames in which the camera stands still, from the chain's stationary distribution: about a third.
     share = paper.pause_probability / (paper.pause_probability + 1 - paper.pause_stay_probability)

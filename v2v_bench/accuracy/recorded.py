@@ -80,11 +80,9 @@ def compare(recording: Recording) -> list[dict[str, Any]]:
     many events as the camera did, and how alike the two are there; controls included."""
     records = []
     rising, falling = recording.counts(recording.seconds[0], recording.seconds[-1])
-    lamps = cv2.dilate(
-        (recording.frames.max(axis=0) >= LAMP_LEVEL).astype(np.uint8), np.ones((2 * LAMP_MARGIN_PX + 1,) * 2, np.uint8)
-    ).astype(bool)
+    dazzled = lamps(recording.frames)
     for gamma in (1.0, 2.2):
-        for part, mask in (("whole picture", np.ones_like(lamps)), ("without the lamps", ~lamps)):
+        for part, mask in (("whole picture", np.ones_like(dazzled)), ("without the lamps", ~dazzled)):
             real = float((rising + falling)[mask].sum())
             threshold = min(THRESHOLDS, key=lambda c: abs(np.abs(simulated(recording, c, gamma))[:, mask].sum() - real))
             voxels = simulated(recording, threshold, gamma)
@@ -111,6 +109,12 @@ def compare(recording: Recording) -> list[dict[str, Any]]:
                 }
             )
     return records
+
+
+def lamps(frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    """[h, w] where the picture is clipped at any time, and around."""
+    clipped = (frames.max(axis=0) >= LAMP_LEVEL).astype(np.uint8)
+    return cv2.dilate(clipped, np.ones((2 * LAMP_MARGIN_PX + 1,) * 2, np.uint8)).astype(bool)
 
 
 def simulated(recording: Recording, threshold: float, gamma: float) -> Image:

@@ -145,7 +145,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
             hot_pixel_share=np.random.uniform(*recipe.hot_pixel_share),
             hot_pixel_sigma=np.random.uniform(*recipe.hot_pixel_sigma),
             gamma=recipe.gamma,
-            log_eps=recipe.log_eps,
+            log_eps=recipe.log_eps[0],
         )
         bins = steps.reshape(-1, recipe.bins, recipe.frames_per_bin, *steps.shape[1:]).sum(2)
         return {

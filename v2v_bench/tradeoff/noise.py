@@ -90,7 +90,7 @@ def run_kernel(
     threshold_pos, threshold_neg = np.float32(params.threshold_pos), np.float32(params.threshold_neg)
     kernel(
         np.ascontiguousarray(frames).reshape(len(frames), -1),
-        log_table(recipe.gamma, recipe.log_eps),
+        log_table(recipe.gamma, recipe.log_eps[0]),
         params.source_index(steps),
         np.array(params.noise_key, np.uint32),
         np.full(steps if params.noise_sigma > 0.0 else 0, params.noise_sigma, np.float32),

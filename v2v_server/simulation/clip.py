@@ -177,7 +177,7 @@ def simulate_clip(
         )
     noise_durations = step_seconds if recipe.noise_unit == "second" else np.ones(recipe.steps)
     check_thresholds(params.threshold_pos, params.threshold_neg)
-    intensity = recipe.gamma, recipe.log_eps
+    intensity = recipe.gamma, recipe.log_eps[0] if params.log_eps is None else params.log_eps
     real = choose(AUTO, _most_events(params, _log_ends(*intensity), noise_durations, step_seconds))
     prepared = None
     if params.effects:

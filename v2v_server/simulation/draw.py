@@ -42,8 +42,10 @@ class Purpose(IntEnum):
     FLIP = 7
     CONTRAST = 8
     NOISE_KEY = 9
+    LOG_EPS = 16
 
 
+_LOG_EPS_STEPS = 32
 _FIRST_EFFECTS = {
     name: number
     for number, name in enumerate(
@@ -124,6 +126,7 @@ def draw(
             for name in (effect_settings() if recipe.has_effects else ())
             if (value := _in_range(getattr(recipe, name), stream(_stream_of(name), 1)[0])) > 0.0
         },
+        log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
     )
 
 
@@ -164,6 +167,13 @@ def _thresholds(
     other = one * _in_range(recipe.threshold_ratio, raw[1])
     first, second = float(np.float32(one)), float(np.float32(other))
     return (first, second) if raw[2] >> 63 else (second, first)
+
+
+def _log_eps(ends: Range, raw: int) -> float | None:
+    """None for one value. A range is drawn in even steps: a table of log intensity takes tens of milliseconds, and a
+    worker keeps the last 64."""
+    low, high = ends
+    return None if low == high else low + _below(_LOG_EPS_STEPS + 1, raw) / _LOG_EPS_STEPS * (high - low)
 
 
 def _stream_of(effect: str) -> int:

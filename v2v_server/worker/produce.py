@@ -23,7 +23,6 @@ from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SamplePara
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
-from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.variants import Variant, variants
@@ -33,6 +32,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
+from v2v_server.worker.arrays import MAKERS, Making
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
@@ -164,21 +164,9 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     if into is None:
         into = new_arrays(sample_layout(lease))
-    saturated = 0
+    making = Making(lease.video, draft.spec, params, source, view, seconds, flow)
     for name, array in into.items():
-        if name == "voxels":
-            try:
-                saturated = simulate_clip(view, params, recipe, draft.spec.voxel_dtype, seconds, array).saturated_bins
-            except UsageError as error:
-                # The recipe was checked; what is left is what the corpus says of the video: thresholds, time stamps.
-                raise VideoError(lease.video, None, f"cannot be simulated: {error}") from error
-        elif name == "frames":
-            # These indices are those of frames that are there; checking them once more would cost a copy.
-            np.take(view, source[list(recipe.target_steps)], axis=0, out=array[:, 0], mode="clip")
-        elif name == "flow" and flow is not None:
-            array[...] = flow.flow
-        elif name == "flow_valid" and flow is not None and flow.valid is not None:
-            array[...] = flow.valid
+        MAKERS[name](making, array)
     return Sample(
         arrays=into,
         provenance=Provenance(
@@ -189,7 +177,7 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             candidate=lease.candidate,
             refusals=_refusals(lease),
             params=params,
-            saturated_bins=saturated,
+            saturated_bins=making.saturated_bins,
             irregular_timestamps=irregular,
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,

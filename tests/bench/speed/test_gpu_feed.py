@@ -18,10 +18,11 @@ CPU = torch.device("cpu")
 def batch() -> Batch:
     generator = torch.Generator().manual_seed(0)
     return Batch(
-        voxels=torch.randint(-3, 4, (2, 3, 5, 16, 16), generator=generator, dtype=torch.int8),
-        frames=torch.randint(0, 256, (2, 3, 1, 16, 16), generator=generator, dtype=torch.uint8),
-        flow=None, flow_valid=None, indices=(0, 1), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
-        cpu_seconds=0.0, decodes=2,
+        arrays={
+            "voxels": torch.randint(-3, 4, (2, 3, 5, 16, 16), generator=generator, dtype=torch.int8),
+            "frames": torch.randint(0, 256, (2, 3, 1, 16, 16), generator=generator, dtype=torch.uint8),
+        },
+        indices=(0, 1), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0, cpu_seconds=0.0, decodes=2,
     )  # fmt: skip
 
 

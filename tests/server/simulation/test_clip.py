@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -153,6 +154,13 @@ def test_voxel_array() -> None:
     assert voxel_array(2, 5, 3, 4, "int16").shape == (2, 5, 3, 4)
     with pytest.raises(UsageError, match="uint8"):
         voxel_array(1, 1, 1, 1, "uint8")
+
+
+def test_a_drawn_log_eps_is_that_log_eps() -> None:
+    ranged, fixed = RECIPE.replace(log_eps=(0.01, 0.2)), RECIPE.replace(log_eps=0.1)
+    drawn = simulate_clip(FRAMES, dataclasses.replace(PARAMS, log_eps=0.1), ranged, "int8")
+    np.testing.assert_array_equal(drawn.voxels, simulate_clip(FRAMES, PARAMS, fixed, "int8").voxels)
+    assert (drawn.voxels != simulate_clip(FRAMES, PARAMS, RECIPE, "int8").voxels).any()
 
 
 WARM_UP_AND_COUNT = """

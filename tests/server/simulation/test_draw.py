@@ -192,6 +192,17 @@ def test_effects_are_uniform_in_their_ranges_and_independent() -> None:
     assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 4.5 / math.sqrt(len(many))
 
 
+def test_a_range_of_log_eps_changes_no_other_draw() -> None:
+    plain, other = drawn(count=200), drawn(Recipe(log_eps=(0.01, 0.2)), 200)
+    assert [dataclasses.replace(params, log_eps=None) for params in other] == plain
+    values = [params.log_eps or 0.0 for params in other]
+    assert (min(values), max(values)) == (pytest.approx(0.01), pytest.approx(0.2))
+    assert len(set(values)) == 33  # each needs a table
+    assert abs(np.mean(values) - 0.105) < 4 * 0.19 / math.sqrt(12 * 200)
+    assert "log_eps" not in plain[0].to_dict()
+    assert other[0].to_dict()["log_eps"] == values[0]
+
+
 def test_golden_effects() -> None:
     [params] = drawn(PRESETS["davis346"], seed=2**64 - 1)
     assert params.effects == GOLDEN_EFFECTS

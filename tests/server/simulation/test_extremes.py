@@ -152,7 +152,7 @@ def test_a_clip_is_simulated_in_the_arithmetic_it_needs(hot_sigma: float, second
     params = SampleParams(0.1, 0.125, 0.1, 5, hot_sigma, (), 1.0, 0, 0, False, 0.0, key)
     frames, durations = texture(10), np.full(10, seconds or 1.0)
     got = simulate_clip(frames, params, recipe, "float32", durations if seconds else None).voxels.reshape(10, 48)
-    level = log_table_float64(recipe.gamma, recipe.log_eps).astype(real)[frames.reshape(11, 48)]
+    level = log_table_float64(recipe.gamma, recipe.log_eps[0]).astype(real)[frames.reshape(11, 48)]
     expected, _ = reference.simulate(
         level, key, threshold_pos=0.1, threshold_neg=0.125, noise_scale=0.1 * np.sqrt(durations), hot_count=5,
         hot_sigma=hot_sigma, hot_scale=durations, frames_per_bin=1, dtype="float32",

@@ -56,7 +56,9 @@ def differing_ppm(names: list[str], threshold: float, ratio: float, sigma: float
         noisy = noise.standard_normals(key, recipe.steps, pixels).astype(np.float64) * sigma
         position, normal = noise.hot_pixels(key, 2, pixels)
         noisy[:, position] += normal.astype(np.float64) * 3.0
-        level = oracle.log_intensity(frames[: recipe.frames_needed].reshape(-1, pixels), recipe.gamma, recipe.log_eps)
+        level = oracle.log_intensity(
+            frames[: recipe.frames_needed].reshape(-1, pixels), recipe.gamma, recipe.log_eps[0]
+        )
         trace = oracle.simulate(
             level,
             noisy,

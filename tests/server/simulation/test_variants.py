@@ -72,7 +72,9 @@ def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> Non
                 recipe, seed=1, epoch=0, index=index, picture_height_px=128, picture_width_px=128, video_id="a.mp4",
                 video_thresholds=stated,
             )  # fmt: skip
-            real = choose(AUTO, _most_events(params, _log_ends(recipe.gamma, recipe.log_eps), units, seconds))
+            real = choose(
+                AUTO, _most_events(params, _log_ends(recipe.gamma, params.log_eps or recipe.log_eps[0]), units, seconds)
+            )
             assert Variant("int8", bool(params.effects), real.__name__) in known
 
 

@@ -1,0 +1,169 @@
+"""What people will add, added: a toy through each seam, in a copy of the packages, with two lines besides its own file.
+
+``docs/extending.md`` tells how; this is the proof that it is all there is to do.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.client.fake_server import FakeServer, expected
+from tests.clips import panned_luma, write_clip
+from v2v_client import V2VStreamDataset
+from v2v_protocol import sample
+from v2v_server.worker import arrays
+
+ROOT = Path(__file__).parents[1]
+
+EFFECT = '''
+"""Event loss: the readout drops each step's events of a pixel with the chance of the field."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from v2v_server.simulation import noise
+from v2v_server.simulation.effects.state import hook
+from v2v_server.simulation.pixel import BLOCK_PX, folds_of, word
+
+FIELD, ROWS = "event_loss", 0
+PIXEL, STEP = np.uint32(16), np.uint32(17)
+
+
+class Tables(NamedTuple):
+    chance: Any
+
+
+def prepare(value, clip):
+    return Tables(np.uint32(value * 2**32))
+
+
+def lost(key, value, steps, pixels):
+    """The oracle: [steps, pixels] bool."""
+    pixel, step = noise.words(key, int(PIXEL), np.arange(pixels)), noise.words(key, int(STEP), np.arange(steps))
+    return noise.scramble(noise.scramble(pixel)[None] + step[:, None]) < np.uint32(value * 2**32)
+
+
+@hook
+def after(tables, own, block, at):
+    if tables.chance > 0:
+        pixel, step = folds_of(block.key, PIXEL), word(folds_of(block.key, STEP), at.step)
+        for i in range(BLOCK_PX):
+            if word((word(pixel, at.first + i), step), 0) < tables.chance:
+                block.signed[i] = block.tolerance - block.tolerance
+'''
+EFFECT_LINES = (
+    ("v2v_protocol/recipe.py", "    dead_pixel_share: Range =",
+     '    event_loss: Range = span((0.0, 0.0), 0.0, 0.99, "chance that the events of a step get lost")\n'),
+    ("v2v_server/simulation/effects/__init__.py", '        "dead_pixels",', '        "event_loss",\n'),
+)  # fmt: skip
+
+ARRAY = '''
+"""Depth, of a world in which what is brighter is nearer."""
+
+from v2v_server.worker.arrays import makes
+
+
+@makes("depth")
+def depth(making, out):
+    out[:, 0] = 255.0 - making.view[making.source[list(making.recipe.target_steps)]]
+'''
+ARRAY_LINES = (
+    ("v2v_protocol/sample.py", '    "flow_valid": lambda',
+     '    "depth": lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, *recipe.crop_px)),\n'),
+    ("v2v_server/worker/produce.py", "from v2v_server.worker.arrays import",
+     "import v2v_server.worker.depth  # noqa: F401\n"),
+)  # fmt: skip
+
+USE = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.offline.remake import remake
+from v2v_server.simulation.effects import event_loss
+from v2v_server.simulation.effects.kernel import simulate_pixels_with_effects
+
+folder = Path(sys.argv[1])
+catalogue = open_catalogue(folder, processes=0, cache_dir=folder)
+small = {"voxels_per_clip": 20, "bins": 1, "crop_height_px": 16, "crop_width_px": 24, "hot_pixel_share": 0.0,
+         "pause_probability": 0.0, "flip_probability": 0.0, "threshold": 0.1}
+made = {}
+for name, recipe in (("off", Recipe(**small)), ("on", Recipe(**small, event_loss=(0.2, 0.6)))):
+    made[name] = remake(
+        catalogue, StreamSpec(recipe=recipe), seed=1, epoch=0, index=0, arrays=("voxels", "frames", "depth")
+    )
+    kernels = len(simulate_pixels_with_effects.signatures)
+    assert kernels == (name == "on"), "an effect that is off runs the code that ran without it"
+off, on = made["off"], made["on"]
+params = on.provenance.params
+lost = event_loss.lost(params.noise_key, params.effects["event_loss"], 20, 16 * 24).reshape(20, 1, 16, 24)
+assert np.array_equal(on.arrays["voxels"], np.where(lost, 0, off.arrays["voxels"])), "the oracle"
+assert off.arrays["voxels"].any() and (off.arrays["voxels"] != on.arrays["voxels"]).any()
+assert np.array_equal(on.arrays["depth"], 255.0 - on.arrays["frames"].astype(np.float32))
+json.dump({"off": off.provenance.to_dict()["params"], "on": on.provenance.to_dict()["params"]}, sys.stdout)
+"""
+
+
+def add(root: Path, lines: tuple[tuple[str, str, str], ...]) -> None:
+    """Each line in front of the one that begins so."""
+    for name, before, line in lines:
+        text = (root / name).read_text()
+        assert text.count(before) == 1, f"{name}: {before}"
+        (root / name).write_text(text.replace(before, line + before))
+
+
+@pytest.mark.slow
+def test_a_toy_effect_and_a_toy_array_are_a_file_and_two_lines_each(tmp_path: Path) -> None:
+    for package in ("v2v_protocol", "v2v_server", "v2v_pictures"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "v2v_server/simulation/effects/event_loss.py").write_text(EFFECT)
+    add(tmp_path, EFFECT_LINES)
+    (tmp_path / "v2v_server/worker/depth.py").write_text(ARRAY)
+    add(tmp_path, ARRAY_LINES)
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    write_clip(clips / "a.mp4", panned_luma(30, 16, 24), gop=12)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    run = subprocess.run(
+        [sys.executable, "-c", USE, str(clips)], env=environment, cwd=tmp_path, capture_output=True, text=True,
+        timeout=500,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    provenance = json.loads(run.stdout)
+    assert 0.2 <= provenance["on"]["effects"]["event_loss"] <= 0.6
+    assert provenance["on"] == provenance["off"] | {"effects": provenance["on"]["effects"]}
+
+
+def test_a_toy_array_reaches_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its layout is checked on the wire, and it lies in the batch beside the others."""
+    monkeypatch.setitem(sample.ARRAYS, "depth", lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, 4, 6)))
+    with FakeServer(sequences=8) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=4, arrays=("voxels", "depth"), seed=5)
+        batches = list(dataset)
+    assert len(batches) == 2
+    for batch in batches:
+        assert list(batch.arrays) == ["voxels", "depth"]
+        for row, index in enumerate(batch.indices):
+            np.testing.assert_array_equal(batch.arrays["depth"][row], expected("depth", 5, 0, index))
+
+
+def test_every_array_that_may_be_asked_for_is_made() -> None:
+    assert arrays.MAKERS.keys() == sample.ARRAYS.keys()
+
+
+def test_the_toys_themselves_are_what_they_say() -> None:
+    """Their own file besides, nothing but added lines: two for each."""
+    for lines in (EFFECT_LINES, ARRAY_LINES):
+        assert len(lines) == 2
+        assert all(line.count("\n") == 1 for *_, line in lines)

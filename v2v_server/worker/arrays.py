@@ -1,0 +1,108 @@
+"""The arrays of a sample, each made of what was decoded for it.
+
+An array is a line in ``v2v_protocol.sample.ARRAYS`` (its dtype and shape) and a function here or in a file of its own
+that fills it:
+
+    @makes("depth")
+    def depth(making: Making, out: npt.NDArray[Any]) -> None:
+
+``v2v_server.worker.produce`` imports the files. ``docs/extending.md`` shows a new array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
+from v2v_server.flow import FlowClip
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.view import Frames
+
+
+@dataclass(slots=True)
+class Making:
+    """A sample that is being made.
+
+    Attributes:
+        video: catalogue id.
+        spec, params: what was asked for, and the draw.
+        source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
+        view: [n, H, W] uint8, the decoded frames as the camera sees them.
+        step_seconds: [steps] duration of each step; None where the recipe does not ask for it.
+        flow: of the clip, where it was asked for.
+        saturated_bins: how many bins of the voxels were clipped.
+    """
+
+    video: str
+    spec: StreamSpec
+    params: SampleParams
+    source: npt.NDArray[np.int64]
+    view: Frames
+    step_seconds: npt.NDArray[np.float64] | None
+    flow: FlowClip | None
+    saturated_bins: int = 0
+
+    @property
+    def recipe(self) -> Recipe:
+        """The spec's recipe."""
+        return self.spec.recipe
+
+
+Maker = Callable[[Making, npt.NDArray[Any]], None]
+MAKERS: dict[str, Maker] = {}
+"""What fills each array, by name."""
+
+
+def makes(name: str) -> Callable[[Maker], Maker]:
+    """Decorator of the function that fills the array of that name, which it is given C-contiguous."""
+
+    def register(maker: Maker) -> Maker:
+        MAKERS[name] = maker
+        return maker
+
+    return register
+
+
+@makes("voxels")
+def voxels(making: Making, out: npt.NDArray[Any]) -> None:
+    """Signed event counts.
+
+    Raises:
+        VideoError: what the corpus states of the video (thresholds, time stamps) is beyond what can be simulated.
+    """
+    recipe, dtype = making.recipe, making.spec.voxel_dtype
+    try:
+        made = simulate_clip(making.view, making.params, recipe, dtype, making.step_seconds, out)
+    except UsageError as error:
+        # The recipe was checked; what is left is what the corpus says of the video.
+        raise VideoError(making.video, None, f"cannot be simulated: {error}") from error
+    making.saturated_bins = made.saturated_bins
+
+
+@makes("frames")
+def frames(making: Making, out: npt.NDArray[Any]) -> None:
+    """The frame at the end of each voxel, and the lead frame."""
+    # These indices are those of frames that are there; checking them once more would cost a copy.
+    np.take(making.view, making.source[list(making.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+
+
+@makes("flow")
+def flow(making: Making, out: npt.NDArray[Any]) -> None:
+    """Flow over each voxel."""
+    if making.flow is not None:
+        out[...] = making.flow.flow
+
+
+@makes("flow_valid")
+def flow_valid(making: Making, out: npt.NDArray[Any]) -> None:
+    """Where the flow can be believed."""
+    if making.flow is not None and making.flow.valid is not None:
+        out[...] = making.flow.valid
