@@ -36,7 +36,8 @@ from v2v_client.dataset import V2VStreamDataset
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.simulation.clip import simulate_clip, warm_up
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.variants import warm_up
 from v2v_server.simulation.view import apply_view
 from v2v_server.worker.produce import Decoded, decode_for
 

@@ -28,7 +28,7 @@ from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.catalogue.manifest import read_manifest
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
-from v2v_server.simulation.clip import warm_up
+from v2v_server.simulation.variants import warm_up
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import fingerprint
 

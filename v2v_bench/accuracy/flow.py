@@ -36,8 +36,9 @@ from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.flow.methods import AUTO, METHODS, Estimator, Field, choose, estimator
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.simulation.clip import simulate_clip, warm_up
+from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.variants import warm_up
 from v2v_server.simulation.view import Window, apply_view, source_window
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe

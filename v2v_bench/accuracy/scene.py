@@ -44,7 +44,8 @@ from v2v_server.flow import FlowSettings, flow_for, view_part
 from v2v_server.flow.methods import one_thread
 from v2v_server.prepare.encode import encode_luma
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.simulation.clip import simulate_clip, warm_up
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.variants import warm_up
 from v2v_server.simulation.view import apply_view
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import stream_luma

@@ -35,7 +35,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import SpeedPreset, StreamSpec
-from v2v_server.simulation.clip import warm_up
+from v2v_server.simulation.variants import warm_up
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
 

@@ -37,7 +37,7 @@ from v2v_bench.tradeoff.report import ERROR_KEY, error_fields, name_dominated, o
 from v2v_bench.tradeoff.speed import Speed, Work, leases_of, making, measure
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.spec import StreamSpec
-from v2v_server.simulation.clip import warm_up
+from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
 

@@ -1,0 +1,5 @@
+"""Samples without a server.
+
+remake.py   any sample of any stream again: ``v2v-simulate``, tests, bug reports
+preview.py  what a recipe makes of a video, as pictures
+"""

@@ -1,8 +1,19 @@
 """A virtual event camera: frames in, voxels out.
 
 :func:`simulate` is for anyone with an array of frames; :func:`simulate_log` for log intensities (high dynamic range,
-analytic scenes); ``simulate_clip`` in ``clip.py`` is what the server worker calls. The pixel model is in
-``v2v_protocol.recipe``, the definition of a bin in ``voxel.py``, that of the noise in ``noise.py``.
+analytic scenes); :func:`simulate_clip` is what the server worker calls. The pixel model is in ``v2v_protocol.recipe``.
+
+    draw.py       from a recipe to one camera and its view
+    view.py       what the camera sees of the picture: resize, crop, flip, contrast
+    intensity.py  from grey level to log intensity and to light
+    clip.py       simulating a clip: arguments checked, noise prepared, kernel called
+    pixel.py      the kernel: all pixels, all steps, one pass
+    noise.py      its random numbers: the definition
+    voxel.py      steps, bins and dtypes: the definition
+    effects/      what a camera does beyond the paper's pixel, one file an effect
+    precision.py  float32, float64 or a refusal
+    variants.py   the compiled forms of the kernels, and having them in time
+    vectors.py    what the compiler's language lacks
 """
 
 from __future__ import annotations
@@ -10,9 +21,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from v2v_server.simulation.clip import Voxels, simulate, simulate_clip, simulate_log, warm_up
+    from v2v_server.simulation.clip import Voxels, simulate, simulate_clip, simulate_log
 
-__all__ = ["Voxels", "simulate", "simulate_clip", "simulate_log", "warm_up"]
+__all__ = ["Voxels", "simulate", "simulate_clip", "simulate_log"]
 
 
 def __getattr__(name: str) -> Any:

@@ -14,7 +14,6 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import require_known
-from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects import prepare
@@ -149,7 +148,7 @@ def simulate_clip(
             frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: [steps] duration of each step (``timing.py``); given exactly when ``recipe.needs_seconds``.
+        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
         out: C-contiguous array for the voxels, of their shape and dtype; None makes one.
 
     Returns:
@@ -186,20 +185,6 @@ def simulate_clip(
         frames, _table(*intensity, real), source_index, params, noise_durations,
         recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared, out=out,
     )  # fmt: skip
-
-
-def warm_up() -> None:
-    """Compile, or load from the cache, every variant of the kernels that a server worker usually needs.
-
-    Those are the kernel without effects for every dtype, and the one with effects for int8 alone: each variant takes
-    seconds to compile. What is left is compiled when it is met: effects in another dtype, and float64 arithmetic.
-    """
-    frames, table, steps = np.zeros((2, 1, 1), np.uint8), _table(2.2, 1e-3, np.float32), np.ones(1)
-    params = _params(0.2, 0.2, 0.1, 1, 1.0, 0)
-    for dtype in VOXEL_DTYPES:
-        _run(frames, table, np.arange(2), params, steps, 1, 1, dtype)
-    prepared = _prepared(params, (2.2, 1e-3), steps, 1, np.float32)
-    _run(frames, table, np.arange(2), params, steps, 1, 1, "int8", prepared=prepared)
 
 
 def _simulate_array(

@@ -1,9 +1,10 @@
-"""From grey level to log intensity.
+"""From grey level to log intensity, and to light.
 
     L(F) = log(log_eps + (F / 255) ** gamma)            natural logarithm; paper section 3
 
 The camera's response curve is undone by the reverse gamma correction; the epsilon is the dark floor that keeps the
-logarithm finite.
+logarithm finite: the dark current of a pixel as a share of white's photocurrent. Logarithm and exponential are our own,
+so every host has the same tables.
 """
 
 from __future__ import annotations
@@ -13,6 +14,11 @@ import functools
 
 import numpy as np
 import numpy.typing as npt
+
+Doubles = npt.NDArray[np.float64]
+
+_LOG2_E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_EXP_DEGREE = 14
 
 
 @functools.lru_cache(maxsize=64)
@@ -35,7 +41,7 @@ def log_table(gamma: float, log_eps: float) -> npt.NDArray[np.float32]:
 
 
 @functools.lru_cache(maxsize=64)
-def log_table_float64(gamma: float, log_eps: float) -> npt.NDArray[np.float64]:
+def log_table_float64(gamma: float, log_eps: float) -> Doubles:
     """The same, [256] float64, read-only."""
     with decimal.localcontext(decimal.Context(prec=50)):
         exponent, floor = decimal.Decimal(gamma), decimal.Decimal(log_eps)
@@ -43,3 +49,22 @@ def log_table_float64(gamma: float, log_eps: float) -> npt.NDArray[np.float64]:
     table = np.array([float(level) for level in levels])
     table.setflags(write=False)
     return table
+
+
+def linear_light(gamma: float, log_eps: float) -> Doubles:
+    """i(F) = (F / 255) ** gamma of every grey level, [256] float64 from 0 (black) to 1 (white)."""
+    return np.clip(exponential(log_table_float64(gamma, log_eps)) - log_eps, 0.0, 1.0)
+
+
+def exponential(x: Doubles) -> Doubles:
+    """e ** x to a few units in the last place.
+
+    x = n ln 2 + r, |r| <= ln 2 / 2, and the Taylor series of e ** r (degree 14, truncated below 1e-18).
+    """
+    x = np.maximum(x, -700.0)
+    whole = np.floor(x * _LOG2_E + 0.5)
+    rest = (x - whole * _LN2_HIGH) - whole * _LN2_LOW
+    sum_ = np.ones_like(rest)
+    for k in range(_EXP_DEGREE, 0, -1):
+        sum_ = 1.0 + sum_ * rest / k
+    return np.ldexp(sum_, whole.astype(np.int64))

@@ -1,7 +1,7 @@
 """The compiled forms of the kernels: which a stream may need, and having them.
 
-Each takes seconds to compile, and there are a dozen. A worker has the usual ones from its start (``warm_up`` in
-``clip.py``); the others are made ready where a stream needs them, and before the work on its first sample begins.
+Each takes seconds to compile, and there are a dozen. A worker has the usual ones from its start; the others are made
+ready where a stream needs them, and before the work on its first sample begins.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Variant(NamedTuple):
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
-"""What ``warm_up`` loads."""
+"""What :func:`warm_up` loads: without effects every dtype, with effects int8 alone."""
 
 
 def variants(
@@ -61,3 +61,9 @@ def load(variant: Variant) -> None:
         frames_per_second=1.0,
         shot_noise_hz=1.0 if variant.effects else 0.0,
     )
+
+
+def warm_up() -> None:
+    """Loads, or compiles, what a server worker usually needs."""
+    for variant in sorted(USUAL):
+        load(variant)

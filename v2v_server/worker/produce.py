@@ -24,9 +24,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.timing import step_seconds
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip

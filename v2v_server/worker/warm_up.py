@@ -26,9 +26,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from v2v_server.simulation.clip import warm_up
 from v2v_server.simulation.pixel import simulate_pixels
-from v2v_server.simulation.variants import Variant, load
+from v2v_server.simulation.variants import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
 from v2v_server.system.process import die_with_parent
 

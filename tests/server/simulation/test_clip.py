@@ -168,7 +168,8 @@ import json
 from dataclasses import replace
 import numpy as np
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
-from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, warm_up, words
+from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, words
+from v2v_server.simulation.variants import warm_up
 
 def count():
     return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects, words)]

@@ -24,8 +24,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects import dead_pixels, mismatch, photoreceptor, prepare, shot_noise
-from v2v_server.simulation.effects.light import exponential, linear_light
-from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.intensity import exponential, linear_light, log_table, log_table_float64
 from v2v_server.simulation.voxel import rounding_tolerance
 
 GAMMA, LOG_EPS, FPS = 2.2, 1e-3, 25.0

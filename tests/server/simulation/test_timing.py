@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation.timing import step_seconds
+from v2v_server.simulation.voxel import step_seconds
 
 
 def test_regular_and_variable_rates_are_taken_as_they_are() -> None:

@@ -19,7 +19,8 @@ LOAD_AND_COUNT = """
 import json
 from dataclasses import replace
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
-from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, warm_up
+from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects
+from v2v_server.simulation.variants import warm_up
 from v2v_server.simulation.variants import USUAL, Variant, load
 
 def count():

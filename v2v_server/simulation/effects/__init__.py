@@ -6,7 +6,7 @@
     refractory.py     a pixel is blind after an event
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
-    light.py          linear light of a grey level, and an exponential that is the same on every host
+    state.py          what an effect is given
     kernel.py         the pixel kernel with all of them
 
 An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws) and one file
@@ -40,8 +40,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects.light import linear_light
 from v2v_server.simulation.effects.state import Clip
+from v2v_server.simulation.intensity import linear_light
 from v2v_server.simulation.precision import Real
 
 EFFECTS: tuple[Any, ...] = tuple(

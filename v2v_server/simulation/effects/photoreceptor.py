@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2v_server.simulation.effects.light import Doubles, exponential
 from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.intensity import Doubles, exponential
 from v2v_server.simulation.pixel import BLOCK_PX, look_up
 
 FIELD, ROWS = "photoreceptor_hz", 3

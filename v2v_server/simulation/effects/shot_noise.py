@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects.light import Doubles, exponential
 from v2v_server.simulation.effects.state import Clip, compiled, hook
+from v2v_server.simulation.intensity import Doubles, exponential
 from v2v_server.simulation.pixel import BLOCK_PX, folds_of, look_up, word
 from v2v_server.simulation.vectors import bits_of_float, use_widest_vectors
 
