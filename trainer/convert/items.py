@@ -78,7 +78,20 @@ class SensorSize:
         return cls(int(width), int(height))
 
 
-Item = EventChunk | Picture | SensorSize
+@dataclass(frozen=True, eq=False)
+class FlowField:
+    """True flow from a time to that of the next field.
+
+    Attributes:
+        t_ns: when it begins.
+        flow: float32 [2, H, W] (x, y), px; NaN where it is not known.
+    """
+
+    t_ns: int
+    flow: npt.NDArray[np.float32]
+
+
+Item = EventChunk | Picture | SensorSize | FlowField
 
 
 @dataclass(frozen=True)

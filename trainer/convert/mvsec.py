@@ -6,6 +6,14 @@
 | ``davis/left/image_raw`` | uint8 [M, H, W] |
 | ``davis/left/image_raw_ts`` | float64 [M], s |
 | ``davis/left/image_raw_event_inds`` | int64 [M], the event nearest to each picture |
+
+Where ``*_gt.hdf5`` lies beside it, its flow is taken too:
+
+| path | content |
+|---|---|
+| ``davis/left/flow_dist`` | float64 [N, 2, H, W], (x, y), px to the next field |
+| ``davis/left/flow_dist_ts``, else ``depth_image_raw_ts`` | float64 [N], s |
+| ``davis/left/depth_image_raw`` | float32 [N, H, W]; NaN where no depth, and so no flow, is known |
 """
 
 from __future__ import annotations
@@ -17,7 +25,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize, to_ns
+from trainer.convert.items import EventChunk, FlowField, Item, Options, Picture, Progress, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
 
 READ_EVENTS = 1 << 18
@@ -43,6 +51,10 @@ def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
     """
     with _opened(path) as file:
         yield from _read(file, path, options.camera, progress)
+    truth = path.with_name(path.name.replace("_data", "_gt"))
+    if truth != path and truth.is_file():
+        with _opened(truth) as file:
+            yield from _flow(file, truth, options.camera)
 
 
 @contextlib.contextmanager
@@ -84,3 +96,18 @@ def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Itera
         yield Picture(int(t_ns), pixels, None if nearest is None else max(0, int(nearest[index])))
         done += pixels.nbytes
         progress(done, total)
+
+
+def _flow(file: h5py.File, path: Path, camera: str) -> Iterator[Item]:
+    group = file.get(f"davis/{camera}", {})
+    if "flow_dist" not in group:
+        return
+    fields, depth = group["flow_dist"], group.get("depth_image_raw")
+    times = group["flow_dist_ts" if "flow_dist_ts" in group else "depth_image_raw_ts"][:]
+    if fields.ndim != 4 or fields.shape[1] != 2 or len(times) != len(fields):
+        raise UsageError(f"{path}: flow_dist is {list(fields.shape)} with {len(times)} times, not [N, 2, H, W]")
+    for index, t_ns in enumerate(to_ns(times, str(path))):
+        flow = fields[index].astype(np.float32)
+        if depth is not None:
+            flow[:, ~np.isfinite(depth[index])] = np.nan
+        yield FlowField(int(t_ns), flow)

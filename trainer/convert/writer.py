@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import EventChunk, Item, Picture, SensorSize
+from trainer.convert.items import EventChunk, FlowField, Item, Picture, SensorSize
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 
@@ -79,7 +79,7 @@ class RecordingWriter:
         self._largest = SensorSize(0, 0)
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
-        self._events = self._reordered = 0
+        self._events = self._reordered = self._flow_fields = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = h5py.File(self._partial, "w")
@@ -128,6 +128,11 @@ class RecordingWriter:
             self._size = item
         elif isinstance(item, Picture):
             self._add_picture(item)
+        elif isinstance(item, FlowField):
+            name = f"flow/flow{self._flow_fields:09d}"
+            dataset = self._file.create_dataset(name, data=item.flow, compression="gzip", compression_opts=1)
+            dataset.attrs["timestamp"] = (item.t_ns - self._set_origin(item.t_ns)) * 1e-9
+            self._flow_fields += 1
         elif len(item):
             self._set_origin(int(item.t_ns[0]))
             self._pending.append(item)

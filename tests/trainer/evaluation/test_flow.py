@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.trainer.evaluation.h5_file import write_h5
+from trainer.convert.cli import main as convert
 from trainer.evaluation import paper
 from trainer.evaluation.cli import main
 from trainer.evaluation.flow import HOOD_ROW, FlowRun, evaluate_flow
@@ -122,3 +123,26 @@ def test_the_command_shows_the_paper_beside_it(tmp_path: Path, capsys: pytest.Ca
     assert [record["predictor"] for record in records] == ["network", "zeros"]
     assert records[0]["aee_dense"] == records[1]["aee_dense"]
     assert (tmp_path / "out" / "indoor_flying1.png").is_file()
+
+
+def test_flow_of_mvsec_is_converted_with_its_recording(tmp_path: Path) -> None:
+    """True flow and predicted no motion: the numbers of the raw file come out of the evaluation."""
+    rng = np.random.default_rng(0)
+    times, lengths = 100.0 + 0.05 * np.arange(3), (2.0, 5.0, 1.0)
+    with h5py.File(tmp_path / "indoor_flying1_data.hdf5", "w") as file:
+        t = np.sort(rng.uniform(99.9, 100.2, 300))
+        rows = [rng.integers(0, 24, 300), rng.integers(0, 18, 300), t, rng.choice([-1, 1], 300)]
+        file["davis/left/events"] = np.stack(rows, axis=1)
+    with h5py.File(tmp_path / "indoor_flying1_gt.hdf5", "w") as file:
+        flow, depth = np.zeros((3, 2, 18, 24)), np.ones((3, 18, 24), np.float32)
+        flow[:, 0] = np.array(lengths)[:, None, None]
+        flow[:, :, :9] *= 100
+        depth[:, :9] = np.nan
+        group = file.create_group("davis/left")
+        group["flow_dist"], group["depth_image_raw"], group["depth_image_raw_ts"] = flow, depth, times
+    assert not convert([str(tmp_path / "indoor_flying1_data.hdf5"), "--out", str(tmp_path / "h5"), "--size", "24x18"])
+    (path,) = (tmp_path / "h5").iterdir()
+    found = evaluate_flow(run(constant(0, 0), as_published=False), path, None)["zeros"]
+    assert (found.windows, found.means["aee_dense"]) == (2, pytest.approx(3.5))
+    published = evaluate_flow(run(constant(0, 0), as_published=True), path, None)["zeros"]
+    assert published.means["aee_dense"] == pytest.approx(3.0)
