@@ -22,6 +22,8 @@ from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Death, Supervisor
 
 SLEEPS = "import time\ntime.sleep(600)"
+NAPS = "import time\nwhile True:\n    time.sleep(0.01)"
+"""For programs with a handler in Python: a signal just before a long sleep would be handled after it."""
 LEAVES = "import sys\nsys.exit(3)"
 
 
@@ -98,7 +100,7 @@ def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
 
 
 def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
-    pool: Supervisor = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + SLEEPS)
+    pool: Supervisor = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + NAPS)
     assert pool.watch(0.0, 0) == []
     pool.scale(1)
     assert [pool.watches(name) for name in (b"label-0.1", b"label-2.1")] == [True, True]
@@ -111,7 +113,7 @@ def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callabl
 
 
 def test_one_that_dies_while_it_leaves_is_reported_and_not_replaced(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, "import os, signal, time\nsignal.signal(15, lambda *_: os.kill(os.getpid(), 11))\n" + SLEEPS)
+    pool = start(1, "import os, signal, time\nsignal.signal(15, lambda *_: os.kill(os.getpid(), 11))\n" + NAPS)
     pool.watch(0.0, 0)
     until(lambda: is_loaded(pool.pids()[0]) and _catches_terminate(pool.pids()[0]))
     pool.scale(0)
