@@ -121,7 +121,8 @@ class SampleHeader:
             not open it.
         worker: name of the server worker that made it.
         cpu_seconds: processor time it took there.
-        decoded: whether a clip was decoded for it; False where it came from that of a sibling.
+        decoded: whether a clip was decoded for it, or read; False where it came from that of a sibling.
+        cache: "hit" or "miss" where its worker has a cache, "miss: " and a reason where that can keep no more; else "".
         slot: the slot that the lease named, to which this worker writes no more; 0: it named none.
         quarantine: number of the quarantine snapshot that the lease named, as the provenance says it.
     """
@@ -135,6 +136,7 @@ class SampleHeader:
     worker: str
     cpu_seconds: float
     decoded: bool = True
+    cache: str = ""
     slot: int = 0
     quarantine: int = 0
 

@@ -100,6 +100,7 @@ def encode_sample(
     worker: str,
     cpu_seconds: float,
     decoded: bool = True,
+    cache: str = "",
     slot: int = NO_SLOT,
     in_slot: bool = False,
     quarantine: int = 0,
@@ -109,7 +110,7 @@ def encode_sample(
     Args:
         slot: the slot that the lease named.
         in_slot: the arrays lie there, so the header goes alone.
-        epoch, index, arrays, provenance, worker, cpu_seconds, decoded, quarantine: see :class:`SampleHeader`.
+        epoch, index, arrays, provenance, worker, cpu_seconds, decoded, cache, quarantine: see :class:`SampleHeader`.
 
     Raises:
         LimitExceeded: an array dtype that is not on the allow-list, or an array that is not C-contiguous.
@@ -129,6 +130,7 @@ def encode_sample(
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
+        cache=cache,
         slot=slot,
         quarantine=quarantine,
     )

@@ -39,6 +39,12 @@ class ServeConfig:
     list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text("", "folder of the catalogue index; without it the user's cache", metavar="DIR")
+    cache: str = text(
+        "",
+        "folder that keeps what was decoded, for later epochs to read; servers may share it",
+        metavar="DIR",
+    )
+    cache_gib: float = number(100.0, 0.0, 1e6, "at most so much lies in --cache", unit="GiB", metavar="N")
     list_refused: bool = switch(False, "name every video that cannot be used at the start, not only the first five")
     workers: int = whole(2, 0, MOST_WORKERS, "local worker processes", group="Workers")
     expect_workers: int = whole(

@@ -27,6 +27,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.cache import make_cache
 from v2v_server.store.clips import check_file
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Supervisor
@@ -103,11 +104,16 @@ def serve(config: ServeConfig) -> None:
         max_credit_bytes=config.max_credit_bytes,
         expected_workers=max(config.workers, config.expect_workers),
     )
+    cache_flags: list[str] = []
+    if config.cache:
+        folder = Path(config.cache).absolute()
+        make_cache(folder)
+        cache_flags = ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
         sockets = Sockets(config.bind, config.worker_bind or _private_address(label))
-        pool = Pool(catalogue.root, label)
+        pool = Pool(catalogue.root, label, cache_flags)
         server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file)
         try:
             if question := question_workers(config.workers, usable_cores()):
@@ -155,7 +161,7 @@ class Server:
         self._quarantine_file = quarantine_file
         self._clock = clock or Clock()
         self._next_tick = self._clock()
-        self._status = StatusLine(sys.stderr)
+        self._status = StatusLine(sys.stderr, Path(config.cache) if config.cache else None, config.cache_gib)
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_LONGEST_TROUBLE = 120
+
 
 @dataclass(slots=True)
 class Counters:
@@ -13,6 +15,8 @@ class Counters:
         samples: samples handed to consumers.
         batches: the same in batches of each consumer's own size (a fraction while one is filling).
         decodes: clips decoded for those samples; fewer than samples where siblings share one.
+        cache_hits, cache_misses: of those clips, where workers have a cache.
+        cache_trouble: why a worker's cache keeps no more, when last heard of; empty where it does.
         bytes: of the arrays of those samples.
         in_slots: samples put into memory shared with their consumer; the others travelled in messages.
         worker_cpu_seconds: processor time the workers took for them.
@@ -29,6 +33,9 @@ class Counters:
     samples: int = 0
     batches: float = 0.0
     decodes: int = 0
+    cache_hits: int = 0
+    cache_misses: int = 0
+    cache_trouble: str = ""
     bytes: int = 0
     in_slots: int = 0
     worker_cpu_seconds: float = 0.0
@@ -40,6 +47,14 @@ class Counters:
     workers_lost: int = 0
     missing_videos: int = 0
     malformed: int = 0
+
+    def count_cache(self, said: str) -> None:
+        """Counts what a sample's header says of the cache."""
+        kind, _, trouble = said.partition(": ")
+        self.cache_hits += kind == "hit"
+        self.cache_misses += kind == "miss"
+        if kind == "miss":
+            self.cache_trouble = "".join(filter(str.isprintable, trouble))[:_LONGEST_TROUBLE]
 
     @property
     def faults(self) -> int:

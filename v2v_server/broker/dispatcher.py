@@ -314,6 +314,7 @@ class Dispatcher:
             return False
         self.counters.samples += 1
         self.counters.decodes += header.decoded
+        self.counters.count_cache(header.cache)
         self.counters.worker_cpu_seconds += cpu_seconds
         self.counters.batches += 1 / session.batch_size
         self.counters.bytes += sum(session.form.sizes)

@@ -28,6 +28,7 @@ from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.store.clips import STORE_FORMAT
+from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -118,7 +119,8 @@ class Catalogue:
         return FrameIndex.from_bytes(self._stored_index(id))
 
     def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
-        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, encoded.
+        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, and the pieces of the
+        cache that they lie in, encoded.
 
         A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
         kept, because siblings ask for the same one after the other.
@@ -130,7 +132,10 @@ class Catalogue:
         if key not in self._slices:
             encoded = self._stored_index(id)
             if len(encoded) > _SMALL_INDEX_BYTES:
-                encoded = FrameIndex.from_bytes(encoded).slice(start, count).to_bytes()
+                index = FrameIndex.from_bytes(encoded)
+                first = start // PIECE_FRAMES * PIECE_FRAMES
+                end = min(-(-(start + count) // PIECE_FRAMES) * PIECE_FRAMES, index.end)
+                encoded = index.slice(first, end - first).to_bytes()
             while len(self._slices) >= _KEPT_SLICES:
                 del self._slices[next(iter(self._slices))]
             self._slices[key] = encoded

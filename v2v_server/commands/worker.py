@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
-from v2v_protocol.errors import V2VError
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.catalogue.files import corpus_root
+from v2v_server.store.cache import GIB, Cache, make_cache
 from v2v_server.worker.process import run_worker, unshared_name
 
 
@@ -23,6 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
     work.add_argument("--videos", required=True, metavar="DIR", help="the corpus on this host: what the server's is")
     work.add_argument("--name", help="how its name begins in logs (default: host and process id)")
+    work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
+    work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
@@ -32,7 +35,15 @@ def _run(arguments: argparse.Namespace) -> None:
     # Its own workers a server names itself, and knows them by it.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     root = corpus_root(Path(arguments.videos))
-    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd)
+    cache = None
+    if arguments.cache is not None:
+        if not arguments.cache_gib >= 0:
+            raise UsageError(f"--cache-gib {arguments.cache_gib:g}: give 0 or more")
+        folder = Path(arguments.cache)
+        if arguments.logbook_fd is None:  # for its own workers a server has made it
+            make_cache(folder)
+        cache = Cache(folder, int(arguments.cache_gib * GIB))
+    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,16 @@ import sys
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import TextIO
 
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.cache import GIB, used_bytes
 
 _SHOWN = 5
 _LIVE_SECONDS = 0.5
@@ -95,10 +98,13 @@ class StatusLine:
 
     Args:
         stream: where to.
+        cache: folder of the cache; None: there is none on this host.
+        cache_gib: how much it may hold.
     """
 
-    def __init__(self, stream: TextIO = sys.stderr) -> None:
+    def __init__(self, stream: TextIO = sys.stderr, cache: Path | None = None, cache_gib: float = 0.0) -> None:
         self._stream = stream
+        self._cache, self._cache_gib = cache, cache_gib
         self._live = stream.isatty()
         self._period = _LIVE_SECONDS if self._live else _LOG_SECONDS
         self._next = 0.0
@@ -135,10 +141,18 @@ class StatusLine:
         return (
             f"{self._batches.update(now, counters.batches):.2f} batches/s  "
             f"{self._samples.update(now, counters.samples):.1f} samples/s  "
-            f"{achieved}{shared}"
+            f"{achieved}{shared}{self._of_cache(counters)}"
             f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
             f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
         )
+
+    def _of_cache(self, counters: Counters) -> str:
+        read = counters.cache_hits + counters.cache_misses
+        if not read:
+            return ""
+        held = "" if self._cache is None else f", {used_bytes(self._cache) / GIB:.2f} of {self._cache_gib:g} GiB"
+        trouble = f" ({counters.cache_trouble})" if counters.cache_trouble else ""
+        return f"cache {counters.cache_hits / read:.0%} hits{held}{trouble}  "
 
     def _show(self, text: str) -> None:
         if self._live:

@@ -32,6 +32,8 @@ from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 MAGIC = b"V2VSTOR1"
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
 GROUP_FRAMES = 32
+PIECE_FRAMES = 256
+"""Frames of a piece of the cache, at most: pieces begin at its multiples, or at those of a half or quarter."""
 _LARGEST_GROUP_BYTES = 64 << 20
 _PREFIX = struct.Struct("<8sIQ")
 _LARGEST_HEAD_BYTES = 64 << 20

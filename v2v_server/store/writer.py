@@ -46,6 +46,10 @@ class StoreWriter:
         """Size of the file so far."""
         return self._end
 
+    def fileno(self) -> int:
+        """Descriptor of the file."""
+        return self._file.fileno()
+
     def add(self, picture: npt.NDArray[np.uint8]) -> None:
         """The next frame: [rows, width] uint8.
 

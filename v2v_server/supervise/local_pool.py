@@ -59,9 +59,11 @@ class Pool:
     Args:
         root: the corpus folder.
         label: prefix of the workers' names, unique to this server.
+        flags: more of them for each worker.
     """
 
-    def __init__(self, root: Path, label: str) -> None:
+    def __init__(self, root: Path, label: str, flags: Sequence[str] = ()) -> None:
+        self._flags = flags
         self._posts: list[_Post] = []
         self._leaving: list[_Post] = []  # too many: told to leave
         self._numbered = 0
@@ -215,7 +217,7 @@ class Pool:
         post.close()
         post.logbook = Logbook()
         post.process = subprocess.Popen(
-            [*_command(self._address, self._root, name), "--logbook-fd", str(post.logbook.descriptor)],
+            [*_command(self._address, self._root, name), *self._flags, "--logbook-fd", str(post.logbook.descriptor)],
             stdin=subprocess.DEVNULL,
             pass_fds=(post.logbook.descriptor,),
             env=environment() | _ONE_THREAD,

@@ -14,7 +14,7 @@ version: 4:4:4 H.264 of x264 before build 151 comes out wrong otherwise. So they
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
@@ -147,6 +147,14 @@ def stream_luma(
     Raises:
         UsageError, VideoError: see :func:`decode_cuts`.
     """
+    for _, picture in stream_decoded(path, index, start, count, window):
+        yield picture
+
+
+def stream_decoded(
+    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
+) -> Generator[tuple[str, npt.NDArray[np.uint8]], None, None]:
+    """FFmpeg's name of the format, and the frame: :func:`stream_luma` for those who want to know both."""
     index.position(start, count)
     cut, task, done = Cut(count, _checked(window, index)), Task(os.fspath(path), index, start, 1), 0
     for frames_of in (_from_keyframe_on, _from_beginning):
@@ -155,7 +163,7 @@ def stream_luma(
             for _ in _fill(stream, frames_of(stream)):
                 if stream.taken > done:
                     done += 1
-                    yield stream.picture()
+                    yield stream.codec, stream.picture()
             return
         except _SeekFailed:
             continue

@@ -59,13 +59,14 @@ def sample_message(
     worker: str,
     cpu_seconds: float,
     decoded: bool = True,
+    cache: str = "",
 ) -> Frames:
     """The frames of a lease's sample. Who sends them writes to the room no more.
 
     Args:
         lease: what was asked.
         room: where its sample was made.
-        provenance, worker, cpu_seconds, decoded: see :class:`v2v_protocol.messages.SampleHeader`.
+        provenance, worker, cpu_seconds, decoded, cache: see :class:`v2v_protocol.messages.SampleHeader`.
     """
     return encode_sample(
         epoch=lease.epoch,
@@ -75,6 +76,7 @@ def sample_message(
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
+        cache=cache,
         slot=lease.slot,
         in_slot=room.in_slot,
         quarantine=lease.quarantine,

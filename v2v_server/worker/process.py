@@ -23,6 +23,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.simulation.variants import USUAL
+from v2v_server.store.cache import Cache
 from v2v_server.system.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
 from v2v_server.worker.conversation import CREDIT, Action, Listen, Load, Make, Say, Send, Tools, WorkerConversation
 from v2v_server.worker.decode_cache import Clips
@@ -49,15 +50,18 @@ class Worker:
         root: the corpus folder on this host.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
+        cache: where what is decoded is kept for later epochs; None keeps nothing.
 
     Raises:
         UsageError: the address cannot be connected to.
     """
 
-    def __init__(self, name: str, root: Path, address: str, logbook: int | None = None) -> None:
+    def __init__(
+        self, name: str, root: Path, address: str, logbook: int | None = None, cache: Cache | None = None
+    ) -> None:
         self._name = name
         self._logbook = logbook
-        self._clips = Clips(root)
+        self._clips = Clips(root, cache)
         self._kernels = set(USUAL)  # that are loaded
         self._conversation = WorkerConversation(
             WorkerHello(name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT),
@@ -160,7 +164,7 @@ class Worker:
         room = room_for(lease, sample_layout(lease))
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
-        if decoded:
+        if decoded and not clip.clip.origin:
             # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
             # Python's collector, which waits for many, but each holds pictures.
             gc.collect()
@@ -172,6 +176,7 @@ class Worker:
             worker=self._name,
             cpu_seconds=time.process_time() - started,
             decoded=decoded,
+            cache=self._clips.said_of_cache(clip) if decoded else "",
         )
 
 
@@ -190,7 +195,14 @@ def unshared_name(beginning: str | None) -> str:
     return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 
-def run_worker(address: str, root: Path, name: str | None, parent_pid: int | None, logbook: int | None = None) -> None:
+def run_worker(
+    address: str,
+    root: Path,
+    name: str | None,
+    parent_pid: int | None,
+    logbook: int | None = None,
+    cache: Cache | None = None,
+) -> None:
     """Runs one worker in this process until the server stops it.
 
     Args:
@@ -199,6 +211,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
         name: unique name; by default host, process id and something random.
         parent_pid: the server, when this is one of its own processes: we die with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
+        cache: where what is decoded is kept for later epochs; None keeps nothing.
 
     Raises:
         UsageError: the address cannot be connected to.
@@ -214,7 +227,7 @@ def run_worker(address: str, root: Path, name: str | None, parent_pid: int | Non
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    worker = Worker(name or unshared_name(None), root, address, logbook)
+    worker = Worker(name or unshared_name(None), root, address, logbook, cache)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.
     take_long_turns()

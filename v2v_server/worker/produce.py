@@ -27,7 +27,9 @@ from v2v_server.simulation.draw import draw
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window
 from v2v_server.simulation.voxel import step_seconds
+from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
+from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
@@ -94,13 +96,14 @@ def draft_of(lease: Lease, index: int) -> Draft:
     return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
 
 
-def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decoded, ...]:
+def decode_for(lease: Lease, indices: Sequence[int], root: Path, cache: Cache | None = None) -> tuple[Decoded, ...]:
     """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
 
     Args:
         lease: the work.
         indices: of ``lease.indices``.
         root: folder that the catalogue's ids are relative to, on this host.
+        cache: where what is decoded is kept, and read by later epochs; None keeps nothing.
 
     Raises:
         VideoError: the file is not what was catalogued, or cannot give the frames it promised.
@@ -110,14 +113,14 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path) -> tuple[Decode
     spec = drafts[0].spec
     path = _below(root, lease.video)
     try:
-        clips = clips_of(
-            path,
-            lease.fingerprint,
-            _frame_index(lease, spec.recipe.frames_needed),
-            lease.start_frame,
-            [draft.cut for draft in drafts],
-            spec.recipe.frame_stride,
-        )
+        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [draft.cut for draft in drafts]
+        what = index, lease.start_frame, cuts, spec.recipe.frame_stride
+        clips = None
+        if cache is not None and not is_store_file(path):
+            rows = Rows.parse(lease.rows).bounds(lease.height_px)
+            clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+        if clips is None:
+            clips = clips_of(path, lease.fingerprint, *what)
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error

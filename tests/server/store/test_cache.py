@@ -1,0 +1,271 @@
+"""The cache: samples are those of the source, hit or miss, whatever happens to its folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clips import damaged, panned_luma, write_clip
+from tests.server.prepare.test_lossless_served import FOLDER, FRAMES, SOUND, require_equal
+from v2v_bench.leases import open_leases, whole_sample
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
+from v2v_protocol.messages import Lease
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Sample
+from v2v_protocol.spec import StreamSpec
+from v2v_server.store.cache import Cache, make_cache, piece_frames, used_bytes
+from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.produce import make_sample
+
+SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, crop_width_px=32))
+"""Needs 21 frames."""
+
+
+@pytest.fixture(autouse=True)
+def small_pieces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("v2v_server.store.cache.piece_frames", lambda rows, width_px: 16)
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "index"))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cached") / "source"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(75, 90, 70), b_frames=2, gop=30)
+    write_clip(folder / "b.webm", panned_luma(50, 96, 81), codec="libvpx-vp9")
+    write_clip(folder / "turned.mov", panned_luma(41, 48, 96), rotation_degrees=90)
+    write_clip(folder / "untimed.h264", panned_luma(40), rate=50, b_frames=2)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    make_cache(tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+def leases_of(source: Path, count: int, spec: StreamSpec = SPEC) -> Iterator[tuple[Path, Lease]]:
+    with open_leases(source, "top:0.9", spec) as (root, leases):
+        for lease in islice(leases, count):
+            yield root, lease
+
+
+def made(lease: Lease, clips: Clips) -> tuple[Sample, str]:
+    decoded, _ = clips.take(lease)
+    return make_sample(lease, decoded), clips.said_of_cache(decoded)
+
+
+def epoch(source: Path, cache: Cache, count: int = 8, spec: StreamSpec = SPEC) -> list[str]:
+    """What was said of the cache; every sample is compared with that of the source."""
+    said = []
+    for root, lease in leases_of(source, count, spec):
+        sample, of_cache = made(lease, Clips(root, cache))
+        exact = whole_sample(replace(lease, indices=lease.indices[:1]), root)
+        if of_cache == "hit":
+            require_equal(sample, exact, "cache")
+        else:
+            assert sample.provenance == exact.provenance
+            for name, array in exact.arrays.items():
+                np.testing.assert_array_equal(sample.arrays[name], array)
+        said.append(of_cache)
+    return said
+
+
+def pieces(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("??/*") if path.is_file())
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_first_a_miss_then_hits(source: Path, folder: Path, stride: int) -> None:
+    spec = SPEC if stride == 1 else StreamSpec(recipe=replace(SPEC.recipe, voxels_per_clip=2, frame_stride=2))
+    first = epoch(source, Cache(folder, 1 << 30, 0), 8, spec)
+    assert first[0] == "miss"
+    assert set(first) <= {"hit", "miss"}
+    assert epoch(source, Cache(folder, 1 << 30, 0), 8, spec) == ["hit"] * 8
+    assert used_bytes(folder) == sum(path.stat().st_size for path in pieces(folder))
+    assert not list((folder / "partial").iterdir())
+
+
+def test_siblings_are_read_at_once(source: Path, folder: Path) -> None:
+    spec = StreamSpec(recipe=SPEC.recipe, samples_per_decode=2, sibling_spacing=1)
+    assert epoch(source, Cache(folder, 1 << 30, 0), 8, spec)[0] == "miss"
+    assert set(epoch(source, Cache(folder, 1 << 30, 0), 8, spec)) == {"hit"}
+
+
+def test_at_its_limit_it_keeps_what_it_has(source: Path, folder: Path) -> None:
+    assert set(epoch(source, Cache(folder, 0, 0))) == {"miss: full: 0.00 of 0 GiB"}
+    assert not pieces(folder)
+    epoch(source, Cache(folder, 1 << 30, 0), 2)
+    kept = pieces(folder)
+    said = epoch(source, Cache(folder, used_bytes(folder), 0))
+    assert said[:2] == ["hit", "hit"]
+    assert any("full" in each for each in said)
+    assert pieces(folder) == kept
+
+
+def test_a_disk_that_is_nearly_full_is_left_alone(source: Path, folder: Path) -> None:
+    (said,) = set(epoch(source, Cache(folder, 1 << 30, least_free_bytes=1 << 60)))
+    assert said.startswith("miss: disk full: ")
+
+
+def test_a_folder_that_is_gone_is_not_made_again(source: Path, folder: Path) -> None:
+    cache = Cache(folder, 1 << 30, 0)
+    epoch(source, cache, 2)
+    shutil.rmtree(folder)
+    assert set(epoch(source, cache)) == {"miss: is gone: No such file or directory"}
+    assert not folder.exists()
+    assert set(epoch(source, Cache(folder, 1 << 30, 0))) == {"miss: is gone: No such file or directory"}
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_to(source: Path, folder: Path) -> None:
+    cache = Cache(folder, 1 << 30, 0)
+    (folder / "partial").mkdir(exist_ok=True)
+    (folder / "partial").chmod(0o500)
+    (said,) = set(epoch(source, cache))
+    assert said == "miss: cannot be written to: Permission denied"
+
+
+def test_a_write_that_fails(source: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("v2v_server.store.writer.StoreWriter.close", full)
+    assert set(epoch(source, Cache(folder, 1 << 30, 0))) == {"miss: cannot be written to: No space left on device"}
+    assert not pieces(folder)
+    assert not list((folder / "partial").iterdir())
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "another"])
+def test_a_damaged_piece_is_made_anew(source: Path, folder: Path, how: str) -> None:
+    epoch(source, Cache(folder, 1 << 30, 0))
+    for path in pieces(folder):
+        content = bytearray(path.read_bytes())
+        if how == "flipped":
+            content[600:] = bytes(byte ^ 255 for byte in content[600:])
+        elif how == "another":
+            content = bytearray((source / "a.mp4").read_bytes())
+        path.write_bytes({"cut": content[:600], "empty": b""}.get(how, content))
+    said = epoch(source, Cache(folder, 1 << 30, 0))
+    assert said[0].startswith("miss: a damaged piece was removed: ")
+    assert set(epoch(source, Cache(folder, 1 << 30, 0))) == {"hit"}
+    assert used_bytes(folder) >= sum(path.stat().st_size for path in pieces(folder))
+
+
+def test_a_changed_source(source: Path, folder: Path, tmp_path: Path) -> None:
+    """Nothing of what was kept of the old one is used for the new one; who was promised the old one is refused it."""
+    shutil.copytree(source, tmp_path / "source")
+    epoch(tmp_path / "source", Cache(folder, 1 << 30, 0))
+    kept = len(pieces(folder))
+    for path in (tmp_path / "source").iterdir():
+        old = next(lease for _, lease in leases_of(tmp_path / "source", 40) if lease.video == path.name)
+        write_clip(tmp_path / "new.mp4", panned_luma(75, 90, 70, step=(2, 1)))
+        path.write_bytes((tmp_path / "new.mp4").read_bytes())
+        shutil.rmtree(folder)
+        make_cache(folder)
+        with pytest.raises(VideoChanged):
+            made(old, Clips(tmp_path / "source", Cache(folder, 1 << 30, 0)))
+    assert epoch(tmp_path / "source", Cache(folder, 1 << 30, 0))[0] == "miss"
+    assert kept
+
+
+def test_damage_beyond_a_sample_does_not_spoil_it(tmp_path: Path, folder: Path) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    write_clip(tmp_path / "whole.mp4", panned_luma(60, 90, 64), gop=60)
+    damaged(tmp_path / "whole.mp4", source / "x.mp4", 25)
+    outcomes = set()
+    for root, lease in leases_of(source, 4):
+        exact, refusal = None, ""
+        try:
+            exact = whole_sample(lease, root)
+        except VideoError as error:
+            refusal = str(error)
+        if exact is None:
+            with pytest.raises(VideoError) as cached:
+                made(lease, Clips(root, Cache(folder, 1 << 30, 0)))
+            assert str(cached.value) == refusal
+            outcomes.add("refused")
+        else:
+            sample, said = made(lease, Clips(root, Cache(folder, 1 << 30, 0)))
+            assert said == "miss"
+            np.testing.assert_array_equal(sample.arrays["voxels"], exact.arrays["voxels"])
+            outcomes.add("made")
+    assert outcomes == {"refused", "made"}
+
+
+def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folder: Path) -> None:
+    """Killed in the middle of a piece: the file is there, under a name that nobody reads."""
+    program = (
+        "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
+        "from tests.server.store.test_cache import leases_of, Clips\n"
+        "cache.piece_frames = lambda rows, width: 16\n"
+        "cache.StoreWriter.close = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "(root, lease), = leases_of(Path(sys.argv[1]), 1)\n"
+        "Clips(root, cache.Cache(Path(sys.argv[2]), 1 << 30, 0)).take(lease)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(source), str(folder)], check=False)
+    assert done.returncode == -9
+    assert len(list((folder / "partial").iterdir())) == 1
+    assert not pieces(folder)
+    with (folder / "partial" / "of one that lives").open("wb") as file:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)
+        cache = Cache(folder, 1 << 30, 0)
+        assert [path.name for path in (folder / "partial").iterdir()] == ["of one that lives"]
+    epoch(source, cache)
+    assert set(epoch(source, cache)) == {"hit"}
+
+
+def test_bytes_are_counted_anew_at_the_start(source: Path, folder: Path) -> None:
+    epoch(source, Cache(folder, 1 << 30, 0))
+    right = used_bytes(folder)
+    (folder / "used").write_bytes(b"nonsense")
+    assert used_bytes(folder) == 0
+    make_cache(folder)
+    assert used_bytes(folder) == right
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CorpusError, match=r"--cache .*/file/below: cannot be written to: Not a directory"):
+        make_cache(tmp_path / "file" / "below")
+
+
+def test_pieces_of_large_pictures_are_short() -> None:
+    assert [piece_frames(*size) for size in ((181, 596), (1080, 1920), (2160, 3840), (4320, 8192))] == [
+        256,
+        128,
+        64,
+        64,
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FRAMES, reason=f"no MANIFEST.tsv beside {FOLDER}; set V2V_TEST_VIDEOS")
+def test_samples_of_real_footage(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every shared clip, under both of the paper's recipes."""
+    monkeypatch.setattr("v2v_server.store.cache.piece_frames", piece_frames)
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in SOUND:
+        (source / name).symlink_to(FOLDER / name)
+    for preset, arrays in (("paper", ("voxels", "frames")), ("paper-flow", ("voxels", "frames", "flow", "flow_valid"))):
+        spec = StreamSpec.from_dict({"recipe": {"preset": preset, "voxels_per_clip": 8}, "max_sequences_per_video": 1})
+        for turn in range(2):
+            for root, plain in leases_of(source, len(SOUND) - 4, spec):
+                lease = replace(plain, arrays=arrays)
+                sample, said = made(lease, Clips(root, Cache(folder, 1 << 40, 0)))
+                if turn:
+                    assert said == "hit"
+                    require_equal(sample, whole_sample(lease, root), "cache")
