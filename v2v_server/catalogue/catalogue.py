@@ -133,6 +133,7 @@ class Catalogue:
             encoded = self._stored_index(id)
             if len(encoded) > _SMALL_INDEX_BYTES:
                 index = FrameIndex.from_bytes(encoded)
+                index.position(start, count)
                 first = start // PIECE_FRAMES * PIECE_FRAMES
                 end = min(-(-(start + count) // PIECE_FRAMES) * PIECE_FRAMES, index.end)
                 encoded = index.slice(first, end - first).to_bytes()
