@@ -12,7 +12,7 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -34,7 +34,7 @@ class Setting:
         help: one line for people, without a full stop.
         low, high: limits of a number, both allowed.
         off: 0 stands for "off", although ``low`` is above it; a range may not begin at 0 and end above it.
-        words: the choices of a word.
+        words: the choices of a word; a registry stays itself, so that what is added to it counts.
         unit: of a number, as in "px" or "Hz".
         group: heading under which help and the reference page show it.
         metavar: what stands for the value in help.
@@ -47,7 +47,7 @@ class Setting:
     low: float = -math.inf
     high: float = math.inf
     off: bool = False
-    words: tuple[str, ...] = ()
+    words: Collection[str] = ()
     unit: str = ""
     group: str = ""
     metavar: str = ""
@@ -150,7 +150,7 @@ def switch(default: bool, help: str, **more: Any) -> Any:
 
 def word(default: str, choices: Any, help: str, **more: Any) -> Any:
     """A field for one of some words; ``choices`` is a ``Literal``, or the words."""
-    return _field(Setting("word", default, help, words=typing.get_args(choices) or tuple(choices), **more))
+    return _field(Setting("word", default, help, words=typing.get_args(choices) or choices, **more))
 
 
 def text(default: str, help: str, **more: Any) -> Any:
