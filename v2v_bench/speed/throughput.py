@@ -25,8 +25,8 @@ from v2v_protocol.spec import SPEED_PRESETS
 from v2v_server.system.process import usable_cores
 
 BARS = {"exact, source": 3.3, "exact, dense": 25.0, "exact, fast": 25.0, "exact, h264": 11.0, "fast, h264": 20.0}
-"""Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; `dense`
-and `fast` are the sizes of a lossless corpus, and `dense` stands for `dense-12`, too."""
+"""Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames.
+`dense` and `fast` are the sizes of a lossless corpus, and `dense` stands for `dense-12`, too."""
 LIMIT_BARS = {"exact, source": 0.9}
 """Least share of the decode limit of the same corpus, by the clock."""
 
