@@ -177,8 +177,6 @@ class WorkerHello:
     """A worker offers itself, with room for ``credit`` leases at a time."""
 
     name: str
-    host: str
-    pid: int
     numerics_version: int
     credit: int
 
@@ -226,7 +224,6 @@ class Lease:
 
     Attributes:
         lease: number of the lease.
-        reply_to: routing identity of the consumer (opaque; lets a direct data path be added without a new message).
         spec: canonical bytes of the StreamSpec.
         spec_digest, catalogue_digest: of the identity of its samples.
         seed, epoch: of the identity of its samples.
@@ -243,14 +240,12 @@ class Lease:
         frame_index: ``FrameIndex.to_bytes()`` of at least the part of the file that is needed.
         candidate: which candidate of the index this is.
         refusals: candidates passed over before, as ``Refusal.to_dict()`` says them: {"refusals": [...]}.
-        deadline_seconds: a worker silent for longer than this is taken for hung.
         quarantine: number of the quarantine snapshot that let the candidate pass.
         scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.
         arena, slot: where the sample may be put, see :mod:`v2v_protocol.arena`; "" and 0: in the message only.
     """
 
     lease: int
-    reply_to: bytes
     spec: bytes
     spec_digest: str
     catalogue_digest: str
@@ -269,7 +264,6 @@ class Lease:
     frame_index: bytes
     candidate: int
     refusals: Mapping[str, Any]
-    deadline_seconds: float
     quarantine: int = 0
     scene: bytes = b""
     arena: str = ""

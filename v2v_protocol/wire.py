@@ -43,6 +43,10 @@ from v2v_protocol.messages import (
 
 LARGEST_HEADER_BYTES = 1 << 20
 """Frame 0. The largest in use is a Lease: a frame index of a few thousand frames is a few kilobytes."""
+LARGEST_REQUEST_BYTES = 1 << 16
+"""What a consumer says. The largest in use is a Want of all its credit, with the name of an arena for each index."""
+MOST_CONTAINERS = 4096
+"""Lists and maps of a header. They cost a hundred times their bytes; the most in use, in a Lease, are some dozens."""
 LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
@@ -155,16 +159,20 @@ def decode_map(packed: bytes) -> dict[str, Any]:
     return _mapping(_unpacked(packed, "a map"))
 
 
-def decode(header: Buffer) -> Message:
+def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     """The message in a header frame.
+
+    Args:
+        header: the frame.
+        most_bytes: limit for it.
 
     Raises:
         VersionMismatch: the peer speaks another version.
         LimitExceeded: the frame, or a list in it, is too large, or nested too deeply.
         ProtocolError: anything else that is not a message of ours.
     """
-    if len(header) > LARGEST_HEADER_BYTES:
-        raise LimitExceeded(f"a header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
+    if len(header) > most_bytes:
+        raise LimitExceeded(f"a header of {len(header)} bytes; the limit is {most_bytes}")
     fields = _unpacked(header, "a message")
     if not isinstance(fields, dict) or "v" not in fields or "t" not in fields:
         raise ProtocolError("not a message: no version or type")
@@ -242,8 +250,19 @@ def layout_of(header: SampleHeader) -> dict[str, tuple[str, tuple[int, ...]]]:
 
 
 def _unpacked(packed: Buffer, what: str) -> Any:
+    containers = 0
+
+    def count(container: Any) -> Any:
+        nonlocal containers
+        containers += 1
+        if containers > MOST_CONTAINERS:
+            raise LimitExceeded(f"more than {MOST_CONTAINERS} lists and maps")
+        return container
+
     try:
-        return msgpack.unpackb(packed, raw=False, strict_map_key=True, use_list=True)
+        return msgpack.unpackb(
+            packed, raw=False, strict_map_key=True, use_list=True, list_hook=count, object_hook=count
+        )
     except (ValueError, msgpack.exceptions.UnpackException) as error:
         # msgpack's own errors quote raw bytes; the kind of damage is enough.
         raise ProtocolError(f"not {what}: {type(error).__name__}") from error

@@ -22,6 +22,7 @@ from v2v_protocol.wire import (
     LARGEST_ARRAY_BYTES,
     LARGEST_HEADER_BYTES,
     LARGEST_TUPLE,
+    MOST_CONTAINERS,
     decode,
     decode_map,
     decode_sample,
@@ -229,6 +230,22 @@ def test_an_oversize_header_is_refused_unread() -> None:
         decode(bytes(LARGEST_HEADER_BYTES + 1))
     with pytest.raises(LimitExceeded, match=r"a denied header of .* the limit is"):
         encode(Denied("malformed", "x" * LARGEST_HEADER_BYTES))
+
+
+def test_a_header_of_many_containers_is_refused_before_they_are_made() -> None:
+    """A byte of an empty list becomes a hundred times that: a megabyte of them took half a second."""
+    many = msgpack.packb({"v": PROTOCOL_VERSION, "t": "ping", "x": [[] for _ in range(MOST_CONTAINERS)]})
+    with pytest.raises(LimitExceeded, match=f"more than {MOST_CONTAINERS} lists and maps"):
+        decode(many)
+    with pytest.raises(LimitExceeded):
+        decode_map(msgpack.packb({"x": [{} for _ in range(MOST_CONTAINERS)]}))
+
+
+def test_a_limit_for_a_header_is_its_readers() -> None:
+    ping = bytes(encode(Ping())[0])
+    assert decode(ping, len(ping)) == Ping()
+    with pytest.raises(LimitExceeded, match=f"the limit is {len(ping) - 1}"):
+        decode(ping, len(ping) - 1)
 
 
 def test_the_largest_header_passes() -> None:

@@ -93,6 +93,7 @@ class Peers:
         frames: what each consumer was sent, in raw frames.
         heard: the same, decoded.
         leases: what each worker holds, oldest first; a worker works in this order.
+        owners: the consumer that each lease's sample is for.
         told: what else each worker was told.
         given_up: workers that were to be killed.
         remote: workers that cannot be killed, as on another host; what they hold stays with them.
@@ -111,6 +112,7 @@ class Peers:
     frames: dict[bytes, list[Sequence[Buffer]]] = field(default_factory=dict)
     heard: dict[bytes, list[Message]] = field(default_factory=dict)
     leases: dict[bytes, deque[Lease]] = field(default_factory=dict)
+    owners: dict[int, bytes] = field(default_factory=dict)
     told: dict[bytes, list[Message]] = field(default_factory=dict)
     given_up: list[bytes] = field(default_factory=list)
     remote: set[bytes] = field(default_factory=set)
@@ -138,6 +140,8 @@ class Peers:
                     self.sent.append(("to worker", message))
                     if isinstance(message, Lease):
                         self.leases.setdefault(identity, deque()).append(message)
+                        asked = self.dispatcher._leases.request(message.lease, identity)
+                        self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
                 case GiveUp(identity, reason):
@@ -197,7 +201,11 @@ class Peers:
 
     def join(self, identity: bytes = b"w", credit: int = CREDIT) -> None:
         self.leases[identity] = deque()
-        self.worker_says(identity, WorkerHello(identity.decode(), "host", 1, NUMERICS_VERSION, credit))
+        self.worker_says(identity, WorkerHello(identity.decode(), NUMERICS_VERSION, credit))
+
+    def asked_by(self, lease: Lease) -> bytes:
+        """The consumer that a lease's sample is for, which its worker is not told."""
+        return self.owners[lease.lease]
 
     def begin(self, identity: bytes = b"w") -> Lease:
         lease = self.leases[identity][0]

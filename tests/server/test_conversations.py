@@ -101,7 +101,7 @@ class Worker:
             is_compiled=lambda lease: lease.indices[0] % 2 == 0,
             is_decoded=lambda lease: lease.indices[0] % 3 == 0,
         )
-        hello = WorkerHello(name.decode(), "host", 1, NUMERICS_VERSION, CREDIT)
+        hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
         self.conversation = WorkerConversation(hello, "queue://workers", tools, is_watched=True)
         self.step: Action = Leave()
         world.queues.connect(name)

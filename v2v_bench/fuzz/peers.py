@@ -128,7 +128,7 @@ class Attack:
     def _liar(self) -> None:
         peer = self._connect(self._worker_address)
         credit = self._random.choice((0, 1, 2, 2**64 - 1))
-        self._send(peer, "liar", *encode(WorkerHello("liar", "nowhere", 1, NUMERICS_VERSION, credit)))
+        self._send(peer, "liar", *encode(WorkerHello("liar", NUMERICS_VERSION, credit)))
         leases: list[Lease] = []
         for _ in range(_BURST):
             leases += [message for message in _read(peer, 1) if isinstance(message, Lease)]

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import os
 import signal
-import socket
 import sys
 import time
 from collections import defaultdict, deque
@@ -114,7 +113,7 @@ class NullWorkers:
             self._context.destroy(linger=0)
 
     def _say_hello(self, link: zmq.Socket[bytes]) -> None:
-        hello = WorkerHello(self._names[link], socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT)
+        hello = WorkerHello(self._names[link], NUMERICS_VERSION, CREDIT)
         link.send_multipart(encode(hello))
         # A hello is not answered; a ping is, and after it.
         self._joining.add(link)

@@ -33,7 +33,7 @@ from v2v_protocol.messages import (
 from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Buffer, Frames, decode, encode
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
 from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
@@ -386,7 +386,6 @@ class Dispatcher:
                 spec=session.spec,
                 seed=session.seed,
                 arrays=session.arrays,
-                deadline_seconds=self._leases.deadline_seconds,
                 siblings=siblings,
             )
             return [ToWorker(worker, encode(lease))]
@@ -399,7 +398,7 @@ class Dispatcher:
 def _only(frames: Sequence[Buffer]) -> Message:
     if len(frames) != 1:
         raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
-    return decode(frames[0])
+    return decode(frames[0], LARGEST_REQUEST_BYTES)
 
 
 def _slots(want: Want) -> list[Slot | None]:

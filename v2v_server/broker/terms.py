@@ -32,7 +32,6 @@ def lease_for(
     seed: int,
     arrays: tuple[str, ...],
     number: int = 1,
-    deadline_seconds: float = 60.0,
     siblings: tuple[int, ...] = (),
 ) -> Lease:
     """The lease for one request.
@@ -43,7 +42,6 @@ def lease_for(
         catalogue, spec, seed: of the sample's identity.
         arrays: to be sent.
         number: of the lease.
-        deadline_seconds: see :class:`v2v_protocol.messages.Lease`.
         siblings: indices that are made from the same clip and follow in leases of their own.
 
     Raises:
@@ -58,7 +56,6 @@ def lease_for(
         scene = catalogue.scene(video.id).slice(sequence.start_frame, spec.recipe.frames_needed).to_bytes()
     return Lease(
         lease=number,
-        reply_to=request.session,
         spec=spec.canonical(),
         spec_digest=spec.digest,
         catalogue_digest=catalogue.digest_under(spec.scene),
@@ -78,7 +75,6 @@ def lease_for(
         candidate=request.candidate,
         quarantine=request.snapshot,
         refusals={"refusals": [refusal.to_dict() for refusal in request.refusals]},
-        deadline_seconds=deadline_seconds,
         scene=scene,
         arena="" if request.slot is None else request.slot.arena,
         slot=NO_SLOT if request.slot is None else request.slot.number,

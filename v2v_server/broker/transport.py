@@ -19,11 +19,13 @@ from typing import Any, Protocol, TypeAlias
 import zmq
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_HEADER_BYTES
+from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
 
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
+MOST_UNREAD = 4
+"""Messages of one peer that wait for this server. After that its connection is not read: it waits, and nobody else."""
 _KEEPALIVE_SECONDS = 300
 # Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
@@ -87,7 +89,7 @@ class Sockets:
     def __init__(self, bind: str, worker_bind: str) -> None:
         self._context = zmq.Context()
         try:
-            self._consumers = self._router(bind, "--bind", LARGEST_HEADER_BYTES)
+            self._consumers = self._router(bind, "--bind", LARGEST_REQUEST_BYTES)
             self._workers = self._router(worker_bind, "--worker-bind", LARGEST_ARRAY_BYTES)
         except BaseException:
             self._context.destroy(linger=0)
@@ -104,7 +106,7 @@ class Sockets:
         # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
         router.setsockopt(zmq.IPV6, int("[" in address))
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
-        router.setsockopt(zmq.RCVHWM, MOST_QUEUED)
+        router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)

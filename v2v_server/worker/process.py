@@ -64,7 +64,7 @@ class Worker:
         self._clips = Clips(root, cache)
         self._kernels = set(USUAL)  # that are loaded
         self._conversation = WorkerConversation(
-            WorkerHello(name, socket.gethostname(), os.getpid(), NUMERICS_VERSION, CREDIT),
+            WorkerHello(name, NUMERICS_VERSION, CREDIT),
             address,
             Tools(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels,

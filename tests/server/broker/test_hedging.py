@@ -132,10 +132,10 @@ def test_what_waits_behind_a_hanging_sample_of_another_consumer_is_rescued() -> 
     at.want(0, identity=b"hangs")
     at.begin(b"w1")
     at.want(8)
-    assert [lease.reply_to for lease in at.leases[b"w1"]] == [b"hangs", b"c"]
+    assert [at.asked_by(lease) for lease in at.leases[b"w1"]] == [b"hangs", b"c"]
     at.join(b"w2")
     at.tick(2.0)
-    assert [lease.reply_to for lease in at.leases[b"w2"]] == [b"c"]
+    assert [at.asked_by(lease) for lease in at.leases[b"w2"]] == [b"c"]
     at.work_off(b"w2")
     assert at.samples()[8:] == [(0, 8)]
 
@@ -185,7 +185,7 @@ def test_a_twin_does_not_take_the_worker_that_a_lone_task_waits_for() -> None:
         at.die(b"dies", Cause.UNEXPLAINED)
     at.join(b"busy", credit=2)
     (alone,) = at.leases[b"busy"]
-    assert alone.reply_to == b"other"
+    assert at.asked_by(alone) == b"other"
     at.hello(b"third")
     at.want(2, 3, identity=b"third")
     at.join(b"empties", credit=2)
@@ -193,9 +193,9 @@ def test_a_twin_does_not_take_the_worker_that_a_lone_task_waits_for() -> None:
     at.die(b"busy", Cause.KILLED)
     # The one in work is all that stands between the lone request and its worker, and nothing is added to it.
     at.tick(2.0)
-    assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"third"]
+    assert [at.asked_by(lease) for lease in at.leases[b"empties"]] == [b"third"]
     at.finish(b"empties")
-    assert [lease.reply_to for lease in at.leases[b"empties"]] == [b"other"]
+    assert [at.asked_by(lease) for lease in at.leases[b"empties"]] == [b"other"]
     assert hanging.indices == (20,)
 
 

@@ -234,7 +234,7 @@ class Interleaving(RuleBasedStateMachine):
             self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
         else:
             self.at.worker_says(identity, Result(held[0].lease), b"nonsense")
-            if self.at.dispatcher.sessions.get(held[0].reply_to) is not None:
+            if self.at.dispatcher.sessions.get(self.at.asked_by(held[0])) is not None:
                 self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
         self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
         self.late += [(identity, lease) for lease in held]

@@ -38,7 +38,7 @@ from v2v_server.worker.conversation import (
 )
 
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
-HELLO = WorkerHello("w", "host", 1, 1, 2)
+HELLO = WorkerHello("w", 1, 2)
 IN_SLOT: Frames = [b"header"]
 IN_MESSAGE: Frames = [b"header", b"array"]
 UNKNOWN = Denied(ErrorCode.UNKNOWN_SESSION, "who are you?")

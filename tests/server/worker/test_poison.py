@@ -213,13 +213,13 @@ def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> Non
     # The lone request went first; once it is tried again there is no empty worker any more.
     at.begin(b"w1")
     at.die(b"w1", Cause.KILLED)
-    assert all(lease.reply_to == b"busy" for lease in at.leases[b"w2"])
+    assert all(at.asked_by(lease) == b"busy" for lease in at.leases[b"w2"])
     turns = 0
     while not at.samples():
         turns += 1
         assert turns < 10
         for lease in at.leases[b"w2"]:
-            assert lease.reply_to == b"busy" or len(at.leases[b"w2"]) == 1
+            assert at.asked_by(lease) == b"busy" or len(at.leases[b"w2"]) == 1
         at.begin(b"w2")
         at.finish(b"w2")
     at.work_off(b"w2")
@@ -404,19 +404,23 @@ def test_a_consumer_that_resumes_an_older_snapshot_keeps_it() -> None:
     for identity in (b"c", b"new"):
         at.want(0, 1, identity=identity)
     at.join(credit=8)
-    assert {(lease.reply_to, lease.indices[0]): (lease.candidate, lease.quarantine) for lease in at.leases[b"w"]} == {
+    assert {
+        (at.asked_by(lease), lease.indices[0]): (lease.candidate, lease.quarantine) for lease in at.leases[b"w"]
+    } == {
         (b"c", 0): (0, 0),
         (b"c", 1): (0, 0),
         (b"new", 0): (1, 1),
         (b"new", 1): (0, 1),
     }
     # A new verdict is for those who go on under the newest.
-    crashed = next(lease for lease in at.leases[b"w"] if (lease.reply_to, lease.indices) == (b"new", (1,)))
+    crashed = next(lease for lease in at.leases[b"w"] if (at.asked_by(lease), lease.indices) == (b"new", (1,)))
     at.worker_says(b"w", Begun(crashed.lease))
     at.die(cause=Cause.CRASHED)
     assert at.quarantine.latest == 2
     at.join(credit=8)
-    assert {(lease.reply_to, lease.indices[0]): (lease.candidate, lease.quarantine) for lease in at.leases[b"w"]} == {
+    assert {
+        (at.asked_by(lease), lease.indices[0]): (lease.candidate, lease.quarantine) for lease in at.leases[b"w"]
+    } == {
         (b"c", 0): (0, 0),
         (b"c", 1): (0, 0),
         (b"new", 0): (1, 2),
@@ -456,7 +460,7 @@ def test_after_a_clearing_the_newest_admits_it_and_the_old_one_does_not() -> Non
     for identity in (b"new", b"old"):
         at.want(0, identity=identity)
     at.join()
-    assert {lease.reply_to: lease.candidate for lease in at.leases[b"w"]} == {b"new": 0, b"old": 1}
+    assert {at.asked_by(lease): lease.candidate for lease in at.leases[b"w"]} == {b"new": 0, b"old": 1}
 
 
 def test_lines_that_others_wrote_meanwhile_are_taken_up_with_the_own_verdict() -> None:
@@ -537,7 +541,7 @@ def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatc
     assert any(len(lease.refusals["refusals"]) > 1 for lease in done)
     for lease in done:
         again = remade(monkeypatch, at.quarantine, lease.quarantine, lease.indices[0], failing)
-        assert replace(again, lease=lease.lease, reply_to=b"c", deadline_seconds=DEADLINE) == lease
+        assert replace(again, lease=lease.lease) == lease
 
 
 def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
