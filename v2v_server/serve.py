@@ -183,6 +183,8 @@ class Server:
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now))
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
+            for identity, seconds in self._supervisor.stopped(now).items():
+                self._dispatcher.worker_stopped(identity, seconds)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
@@ -224,7 +226,9 @@ class Server:
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """Ends the process of a worker that hangs, if it is one of ours."""
-        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(Cause.UNEXPLAINED, hopeless.reason)
+        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
+            Cause.UNEXPLAINED, hopeless.reason, for_all=False
+        )
         name = hopeless.identity.decode(errors="replace")
         self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others")
         return loss

@@ -94,6 +94,9 @@ class ToySupervisor:
             self._begin(self.workers[-1], self._address)
         return deaths
 
+    def stopped(self, now: float) -> dict[bytes, float]:
+        return {}
+
     def watches(self, identity: bytes) -> bool:
         return identity in self.workers
 

@@ -38,11 +38,14 @@ class Loss:
         text: what happened, in words: "was ended by SIGSEGV".
         lease: the lease it was at by its own record, 0 for none; None where there is no record and what it announced
             has to do.
+        for_all: whether it speaks against the video for everybody. That a sample took too long does only where the
+            video was being decoded; else it was what its spec asks for.
     """
 
     cause: Cause
     text: str
     lease: int | None = None
+    for_all: bool = True
 
 
 def runs_alone(request: Request) -> bool:

@@ -61,10 +61,18 @@ class Candidates:
         """Why the request's candidate is refused under a snapshot; None when it is not."""
         sequence = self.sequence(session, request)
         video = sequence.video
-        return self._quarantine.refusal(snapshot, video.id, video.fingerprint, sequence.start_frame)
+        return self._quarantine.refusal(
+            snapshot, video.id, video.fingerprint, sequence.start_frame, session.spec.digest
+        )
 
-    def condemn(self, request: Request, reason: str) -> list[Action]:
-        """The request's candidate brought its worker down: a verdict, unless there is one already."""
+    def condemn(self, request: Request, reason: str, *, for_all: bool = True) -> list[Action]:
+        """The request's candidate brought its worker down: a verdict, unless there is one already.
+
+        Args:
+            request: at the candidate.
+            reason: what happened.
+            for_all: the verdict is against the video; else only under the spec of this request's session.
+        """
         session = self._sessions.get(request.session)
         if session is None:
             return []
@@ -72,9 +80,8 @@ class Candidates:
             return self.refuse_condemned(request, reason)
         sequence = self.sequence(session, request)
         video, text = sequence.video, reason[:LONGEST_REASON]
-        return [
-            Condemn(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, self._wall_clock()), request)
-        ]
+        spec, time = "" if for_all else session.spec.digest, self._wall_clock()
+        return [Condemn(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, time, spec), request)]
 
     def refuse_condemned(self, request: Request, reason: str) -> list[Action]:
         """On to the next candidate: by the quarantine if the request's snapshot has the verdict, which says the same to

@@ -42,7 +42,7 @@ from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
 from v2v_server.broker.session import Session, Sessions
-from v2v_server.broker.terms import inspected, lease_for
+from v2v_server.broker.terms import inspected, lease_for, work_seconds
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
 from v2v_server.catalogue.catalogue import Catalogue
 
@@ -56,7 +56,8 @@ class Dispatcher:
     Args:
         catalogue: the corpus.
         default_spec: what a consumer gets that asks for nothing in particular.
-        lease_deadline_seconds: a worker silent for longer over one sample is taken for hung.
+        lease_deadline_seconds: a worker silent for longer over one sample, besides what that sample may take, is taken
+            for hung.
         session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
         max_credit_bytes: bound on the bytes in flight to one consumer.
         quarantine: the snapshots; verdicts that were written down are added to it.
@@ -82,13 +83,13 @@ class Dispatcher:
         expected_workers: int = 0,
     ) -> None:
         self.counters = Counters()
-        self.sessions = Sessions()
+        self._leases = LeaseBook(lease_deadline_seconds)
+        self.sessions = Sessions(self._leases.abandoned)
         self._expected_workers = expected_workers
         self._catalogue = catalogue
         self._quarantine = quarantine
         self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
-        self._leases = LeaseBook(lease_deadline_seconds)
         self._workers = Workers(self._leases)
         self._lone: deque[Request] = deque()
 
@@ -200,6 +201,10 @@ class Dispatcher:
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
+    def worker_stopped(self, identity: bytes, seconds: float) -> None:
+        """A worker's process was stopped from outside for so long; no deadline runs meanwhile."""
+        self._leases.put_off(identity, seconds)
+
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
         """Something sent to a worker did not go out, and nobody will say what became of its process."""
         if identity not in self._workers:
@@ -245,7 +250,7 @@ class Dispatcher:
         actions: list[Action] = []
         self._workers.wake(now)
         for identity in self._workers.hanging(now):
-            actions.append(GiveUp(identity, f"gave no answer for {self._leases.deadline_seconds:g} s"))
+            actions.append(GiveUp(identity, f"gave no answer for {self._leases.limit_seconds(identity):g} s"))
         for identity in self._workers.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
         for request, worker in self._leases.slow(now):
@@ -279,6 +284,7 @@ class Dispatcher:
         decoded = True
         if request is None or session is None:
             self.counters.late_results += 1
+            self._charge(result.lease, identity, now)
         else:
             try:
                 header = inspected(payload, request, session.form)
@@ -295,6 +301,7 @@ class Dispatcher:
         return actions + self._assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
+        self._charge(failed.lease, identity, now)
         request = self._leases.finished(failed.lease, identity, now)
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
@@ -305,6 +312,12 @@ class Dispatcher:
         # The catalogue is of this host's files: if the video is here, other workers can have it too.
         video = self._candidates.sequence(session, request).video
         return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
+
+    def _charge(self, lease: int, worker: bytes, now: float) -> None:
+        """Who asked for it and waits no more pays for it all the same."""
+        debt = self._leases.debt(lease, worker, now)
+        if debt is not None:
+            self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""
@@ -331,7 +344,7 @@ class Dispatcher:
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                actions += self._candidates.condemn(request, verdict)
+                actions += self._candidates.condemn(request, verdict, for_all=loss.for_all)
         return actions + self._assign(now)
 
     # --- requests ----------------------------------------------------------------------------------------------------
@@ -376,12 +389,14 @@ class Dispatcher:
         session = self.sessions.get(request.session)
         if session is None:
             return []
-        number = self._leases.grant(request, worker, now)
+        sequence = self._candidates.sequence(session, request)
+        seconds = work_seconds(session.spec, session.arrays, sequence.video)
+        number = self._leases.grant(request, worker, now, seconds)
         try:
             lease = lease_for(
                 request,
                 number=number,
-                sequence=self._candidates.sequence(session, request),
+                sequence=sequence,
                 catalogue=self._catalogue,
                 spec=session.spec,
                 seed=session.seed,

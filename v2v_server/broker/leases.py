@@ -66,15 +66,18 @@ class Request:
 class _Grant:
     request: Request | None  # None: answered, or its consumer is gone; but the worker still has to get through it
     worker: bytes
-    deadline: float
+    since: float  # when it was granted, or its worker last began something
+    limit_seconds: float  # from then to the answer
     begun_at: float | None = None
+    debtor: bytes | None = None  # who asked for it and waits no more, which does not make it less work
 
 
 class LeaseBook:
     """All leases that are out.
 
     Args:
-        deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer.
+        deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer, besides what
+            the work itself may take.
     """
 
     def __init__(self, deadline_seconds: float) -> None:
@@ -83,6 +86,7 @@ class LeaseBook:
         self._held: dict[bytes, list[int]] = {}
         self._out: dict[tuple[bytes, int, int], list[int]] = {}
         self._durations: dict[bytes, deque[float]] = {}
+        self._abandoned: dict[bytes, int] = {}
         self._next = 1
         self._changed: set[bytes] = set()
 
@@ -114,11 +118,24 @@ class LeaseBook:
         lease = self._leases.get(number)
         return None if lease is None or lease.worker != worker else lease.request
 
-    def grant(self, request: Request, worker: bytes, now: float) -> int:
-        """Gives the request to a worker; returns the number of the lease."""
+    def grant(self, request: Request, worker: bytes, now: float, work_seconds: float = 0.0) -> int:
+        """Gives the request to a worker.
+
+        Args:
+            request, worker: who makes what.
+            now: the time.
+            work_seconds: what the work may take; the deadline is so much later.
+
+        Returns:
+            the number of the lease.
+        """
         number = self._next
         self._next += 1
-        self._leases[number] = _Grant(request, worker, now + self.deadline_seconds)
+        # It waits behind the others.
+        limit = max(
+            [self.deadline_seconds + work_seconds, *(self._leases[n].limit_seconds for n in self._held.get(worker, ()))]
+        )
+        self._leases[number] = _Grant(request, worker, now, limit)
         self._held.setdefault(worker, []).append(number)
         self._out.setdefault(request.sample, []).append(number)
         self._changed.add(worker)
@@ -133,8 +150,32 @@ class LeaseBook:
         if lease is None or lease.worker != worker or lease.begun_at is not None:
             return
         lease.begun_at = now
-        for other in self._held[worker]:
-            self._leases[other].deadline = now + self.deadline_seconds
+        for other in map(self._leases.__getitem__, self._held[worker]):
+            other.since = now
+            other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
+
+    def put_off(self, worker: bytes, seconds: float) -> None:
+        """The worker was stopped from outside for so long: that is not time in which it worked."""
+        for number in self._held.get(worker, ()):
+            lease = self._leases[number]
+            lease.since += seconds
+            if lease.begun_at is not None:
+                lease.begun_at += seconds
+
+    def limit_seconds(self, worker: bytes) -> float:
+        """How long the worker may be silent over what it holds."""
+        return max((self._leases[n].limit_seconds for n in self._held.get(worker, ())), default=self.deadline_seconds)
+
+    def abandoned(self, session: bytes) -> int:
+        """Leases out for samples that this consumer asked for and gave up before they were made."""
+        return self._abandoned.get(session, 0)
+
+    def debt(self, number: int, worker: bytes, now: float) -> tuple[bytes, float] | None:
+        """Who gave up the sample of this lease before it was made, and the seconds that it took all the same."""
+        lease = self._leases.get(number)
+        if lease is None or lease.worker != worker or lease.debtor is None or lease.begun_at is None:
+            return None
+        return lease.debtor, now - lease.begun_at
 
     def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Request | None:
         """The worker answered, well or badly.
@@ -183,7 +224,7 @@ class LeaseBook:
 
     def overdue(self, now: float) -> set[bytes]:
         """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
-        return {lease.worker for lease in self._leases.values() if now > lease.deadline}
+        return {lease.worker for lease in self._leases.values() if now > lease.since + lease.limit_seconds}
 
     def slow(self, now: float) -> list[tuple[Request, bytes]]:
         """For each session its oldest request, with its worker, if it is slow and nobody else is at it.
@@ -200,8 +241,7 @@ class LeaseBook:
             if lease.request is None or len(durations) < _LEAST_REMEMBERED:
                 continue
             limit = max(_LEAST_SLOW_SECONDS, SLOW_FACTOR * statistics.median(durations))
-            waited = now - (lease.deadline - self.deadline_seconds)
-            if waited > limit and len(self._out[lease.request.sample]) == 1:
+            if now - lease.since > limit and len(self._out[lease.request.sample]) == 1:
                 found.append((lease.request, lease.worker))
         return found
 
@@ -213,6 +253,9 @@ class LeaseBook:
         """
         self._durations.pop(session, None)
         for sample in [sample for sample in self._out if sample[0] == session]:
+            for number in self._out[sample]:
+                self._leases[number].debtor = session
+                self._abandoned[session] = self._abandoned.get(session, 0) + 1
             self._retire(sample)
 
     def _retire(self, sample: tuple[bytes, int, int]) -> None:
@@ -222,6 +265,10 @@ class LeaseBook:
 
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)
+        if lease.debtor is not None:
+            self._abandoned[lease.debtor] -= 1
+            if not self._abandoned[lease.debtor]:
+                del self._abandoned[lease.debtor]
         self._changed.add(lease.worker)
         held = self._held[lease.worker]
         held.remove(number)

@@ -6,9 +6,10 @@ crash or a hang is not. Its verdict is written down, because without it nobody c
     snapshot 0      empty
     snapshot n + 1  snapshot n and one verdict more, or nothing (after a clearing)
 
-A verdict refuses one sequence of a video; a second verdict on the same file refuses the whole video. A file that has
-changed since (another fingerprint) is another file. The number of the snapshot that a sample was made under is part of
-its provenance, and every snapshot can be asked for again.
+A verdict says that decoding a video brought a worker down, or that what one spec asks of it took too long; the latter
+counts under that spec only. It refuses one sequence of a video; a second verdict on the same file refuses the whole
+video. A file that has changed since (another fingerprint) is another file. The number of the snapshot that a sample was
+made under is part of its provenance, and every snapshot can be asked for again.
 
 Several servers and a person may write to the quarantine of one corpus at once, so only the file gives numbers, under an
 advisory lock, and only lines that are on disk count. What a process has in memory is always a beginning of the file.
@@ -41,6 +42,7 @@ class Verdict:
         frame: first frame of the sequence.
         reason: what happened.
         time: when, ISO 8601, UTC.
+        spec: digest of the only spec under which it refuses; empty: under any.
     """
 
     snapshot: int
@@ -49,11 +51,13 @@ class Verdict:
     frame: int
     reason: str
     time: str
+    spec: str = ""
 
     def __str__(self) -> str:
         if not self.path:
             return f"snapshot {self.snapshot} ({self.time}): cleared"
-        return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}"
+        only = f" (under spec {self.spec:.12} only)" if self.spec else ""
+        return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}{only}"
 
 
 def clearing(time: str) -> Verdict:
@@ -95,14 +99,21 @@ class Quarantine:
         """
         return self._verdicts[self._cleared(snapshot) : snapshot]
 
-    def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int) -> str | None:
+    def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int, spec: str = "") -> str | None:
         """Why a sequence is refused under a snapshot; None when it is not.
+
+        Args:
+            snapshot: its number.
+            path, fingerprint: of the video.
+            frame: first frame of the sequence.
+            spec: digest of the spec it is asked under.
 
         Raises:
             CorpusError: there is no such snapshot.
         """
         cleared = self._cleared(snapshot)
-        against = [v for v in self._of_file.get((path, fingerprint), ()) if cleared < v.snapshot <= snapshot]
+        of_file = (v for v in self._of_file.get((path, fingerprint), ()) if v.spec in ("", spec))
+        against = [v for v in of_file if cleared < v.snapshot <= snapshot]
         if len(against) >= VERDICTS_PER_VIDEO:
             return f"video in quarantine snapshot {snapshot} ({len(against)} verdicts): {against[-1].reason}"
         for verdict in against:

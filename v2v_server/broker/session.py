@@ -8,13 +8,16 @@ robin", SIGCOMM 1995). What a sample costs is known only once it is made, so a s
 while its balance is positive, and when none is, all waiting sessions earn one quantum. A consumer whose samples take
 ten times the work so gets a tenth of the samples, not ten times the time.
 
+Hello again changes none of this: a session that is opened anew pays the debt of the one before it, and what that one
+had asked for and nobody waits for any more counts as asked until the workers are through with it.
+
 Memory: the server holds at most credit x sample bytes for a session in its queues, whatever the consumer does.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from v2v_protocol.arena import Slot
@@ -27,6 +30,8 @@ from v2v_server.broker.leases import Request
 from v2v_server.schedule.epoch import Schedule
 
 _QUANTUM_SECONDS = 0.05
+_MOST_DEBTS = 4096
+"""Debts remembered of consumers that are not there; the oldest goes first."""
 
 
 @dataclass(slots=True)
@@ -68,9 +73,15 @@ class Session:
 
 
 class Sessions:
-    """All consumers, and whose turn it is."""
+    """All consumers, and whose turn it is.
 
-    def __init__(self) -> None:
+    Args:
+        abandoned: how many samples workers still make that a consumer asked for in an earlier session.
+    """
+
+    def __init__(self, abandoned: Callable[[bytes], int] = lambda identity: 0) -> None:
+        self._abandoned = abandoned
+        self._debts: dict[bytes, float] = {}
         self._sessions: dict[bytes, Session] = {}
         self._turns: deque[bytes] = deque()
 
@@ -85,15 +96,29 @@ class Sessions:
         return self._sessions.get(identity)
 
     def open(self, session: Session) -> None:
-        """Adds a session; one of the same consumer is replaced (its unanswered indices are forgotten)."""
+        """Adds a session; one of the same consumer is replaced (what it asked is forgotten, its debt is not)."""
         self.forget(session.identity)
+        session.balance_seconds -= self._debts.pop(session.identity, 0.0)
         self._sessions[session.identity] = session
         self._turns.append(session.identity)
 
     def forget(self, identity: bytes) -> None:
-        """Drops a session, if there is one."""
-        if self._sessions.pop(identity, None) is not None:
+        """Drops a session, if there is one; what it owes is remembered."""
+        session = self._sessions.pop(identity, None)
+        if session is not None:
             self._turns.remove(identity)
+            if session.balance_seconds < 0.0:
+                self.charge(identity, -session.balance_seconds)
+
+    def charge(self, identity: bytes, seconds: float) -> None:
+        """The consumer, there or not, owes worker time."""
+        session = self._sessions.get(identity)
+        if session is not None:
+            session.balance_seconds -= seconds
+            return
+        self._debts[identity] = self._debts.pop(identity, 0.0) + seconds
+        if len(self._debts) > _MOST_DEBTS:
+            del self._debts[next(iter(self._debts))]
 
     def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
         """The consumer asks for samples. Those it is already waiting for are not made twice, and keep their slots.
@@ -124,7 +149,7 @@ class Sessions:
 
     def next_request(self) -> Request | None:
         """The next request to give to a worker, by deficit round robin; None when nobody waits."""
-        waiting = [identity for identity in self._turns if self._sessions[identity].waiting]
+        waiting = [identity for identity in self._turns if self._may_go_on(self._sessions[identity])]
         if not waiting:
             return None
         while True:
@@ -139,6 +164,11 @@ class Sessions:
             quanta = int(debt / _QUANTUM_SECONDS) + 1
             for identity in waiting:
                 self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
+
+    def _may_go_on(self, session: Session) -> bool:
+        """Whether it waits for something, and its credit is not spent on what it gave up."""
+        at_work = len(session.unanswered) - len(session.waiting)
+        return bool(session.waiting) and self._abandoned(session.identity) + at_work < session.credit
 
     def take_siblings(self, request: Request) -> list[Request]:
         """The waiting requests that are made from the same clip as ``request``; they wait no more."""

@@ -12,6 +12,8 @@ reads is cut off at MOST_QUEUED messages.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
@@ -111,6 +113,9 @@ class Sockets:
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         router.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        if address.startswith("ipc://") and sys.platform.startswith("linux"):
+            # Such a socket is open to every user of this host; the system says whose process connects.
+            router.setsockopt(zmq.IPC_FILTER_UID, os.getuid())
         # A host that vanishes (pre-empted, unplugged) says no farewell, and nothing is said to it that would show it:
         # the system asks, or its connection would stay open as long as this process lives.
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)

@@ -82,7 +82,9 @@ class Remaker:
         while request.candidate < most:
             sequence = self._schedule.candidate(seed, epoch, index, request.candidate)
             video = sequence.video
-            condemned = self._quarantine.refusal(self._snapshot, video.id, video.fingerprint, sequence.start_frame)
+            condemned = self._quarantine.refusal(
+                self._snapshot, video.id, video.fingerprint, sequence.start_frame, spec.digest
+            )
             if condemned is not None:
                 request = next_candidate(request, Refusal(video.id, None, condemned, RefusalKind.QUARANTINED))
                 continue

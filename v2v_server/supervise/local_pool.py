@@ -9,6 +9,7 @@ again without a single sample being finished, something is wrong that restarting
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import signal
@@ -31,7 +32,12 @@ _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0
 _MEMORY_SECONDS = 5.0
 """After the kernel has killed for want of memory, a worker's SIGKILL is taken for its doing: to end takes a moment."""
+_LOOK_SECONDS = 1.0
+"""From one look at whether workers are stopped to the next."""
+_SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
+_AFTER_SHORTAGE_SECONDS = 5.0
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+_STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
@@ -74,6 +80,7 @@ class Pool:
         self._samples_seen = 0
         self._memory_kills = _out_of_memory_kills()
         self._short_of_memory_until = -math.inf
+        self._looked = -math.inf
 
     @property
     def crash_budget(self) -> int:
@@ -146,11 +153,24 @@ class Pool:
                 try:
                     self._start(post)
                 except OSError as error:
-                    # Too many processes, or no memory for one more: that passes, and must not end those that run.
+                    # Too many processes or files, no memory for one more: that passes, must not end those that run, and
+                    # says nothing of workers.
                     text = f"could not be started: {error.strerror or error}"
                     deaths.append(Death(post.identity, Loss(Cause.KILLED, text)))
-                    self._put_off(post, deaths[-1], now)
+                    if error.errno in _SHORTAGES:
+                        post.process, post.start_at = None, now + _AFTER_SHORTAGE_SECONDS
+                    else:
+                        self._put_off(post, deaths[-1], now)
         return deaths
+
+    def stopped(self, now: float) -> dict[bytes, float]:
+        """Workers that are stopped from outside, and for how many seconds since the last call."""
+        since, self._looked = now - self._looked, now if now - self._looked >= _LOOK_SECONDS else self._looked
+        if since < _LOOK_SECONDS:
+            return {}
+        processes = {post.identity: post.process for post in self._all() if post.process is not None}
+        stopped = [name for name, process in processes.items() if _is_stopped(process.pid)]
+        return dict.fromkeys(stopped, min(since, 2 * _LOOK_SECONDS))
 
     def _put_off(self, post: _Post, death: Death, now: float) -> None:
         """Lets some time pass before the next process of a post.
@@ -181,13 +201,14 @@ class Pool:
                 post.given_up = True
                 status = _status(post.process.pid)
                 post.process.kill()
-                if status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
+                if status in _STOPPED:
                     return Loss(Cause.KILLED, "was stopped from outside and killed")
                 at = None if post.logbook is None else post.logbook.lease()
+                decodes = post.logbook is not None and post.logbook.decodes()
                 if status == psutil.STATUS_DISK_SLEEP:
                     # A network file system whose server is away holds every worker at whatever clip it has.
-                    return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at)
-                return Loss(Cause.HUNG, reason, at)
+                    return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at, decodes)
+                return Loss(Cause.HUNG, reason, at, decodes)
         return None
 
     def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
@@ -248,6 +269,15 @@ def _post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
     if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         return Loss(Cause.KILLED, f"was ended by {name} from outside")
     return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
+
+
+def _is_stopped(pid: int) -> bool:
+    """By its own words, which are cheap to ask a thousand workers for."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2][:1]
+    except OSError:
+        return sys.platform != "linux" and _status(pid) in _STOPPED
+    return state in (b"T", b"t")
 
 
 def _status(pid: int) -> str:

@@ -49,6 +49,9 @@ class Supervisor(Protocol):
             WorkerCrashLoop: the workers die again and again without finishing anything.
         """
 
+    def stopped(self, now: float) -> dict[bytes, float]:
+        """Workers that are stopped from outside, and for how many seconds since the last call: no time to work."""
+
     def watches(self, identity: bytes) -> bool:
         """Whether :meth:`watch` will say how that worker ends."""
 

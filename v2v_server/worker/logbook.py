@@ -11,6 +11,7 @@ import os
 import tempfile
 
 _BYTES = 8
+_DECODES, _SIMULATES = b"d", b"s"
 IDLE = 0
 
 
@@ -32,12 +33,16 @@ class Logbook:
         entry = os.pread(self.descriptor, _BYTES, 0)
         return int.from_bytes(entry, "little") if len(entry) == _BYTES else None
 
+    def decodes(self) -> bool:
+        """Whether the worker was decoding a video."""
+        return os.pread(self.descriptor, 1, _BYTES) == _DECODES
+
     def close(self) -> None:
         """Lets go of the file."""
         self._file.close()
 
 
-def note(descriptor: int | None, lease: int) -> None:
-    """The worker's side: it is at this lease now, or IDLE."""
+def note(descriptor: int | None, lease: int, *, decodes: bool = False) -> None:
+    """The worker's side: it is at this lease now, or IDLE; and whether at the decoding of its video."""
     if descriptor is not None:
-        os.pwrite(descriptor, lease.to_bytes(_BYTES, "little"), 0)
+        os.pwrite(descriptor, lease.to_bytes(_BYTES, "little") + (_DECODES if decodes else _SIMULATES), 0)

@@ -135,7 +135,7 @@ class Worker:
             case Make(lease):
                 if not self._clips.has(lease):
                     give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
-                note(self._logbook, lease.lease)
+                note(self._logbook, lease.lease, decodes=True)
                 try:
                     made: Frames | VideoError = self._made(lease)
                 except VideoError as error:
@@ -164,6 +164,7 @@ class Worker:
         room = room_for(lease, sample_layout(lease))
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
+        note(self._logbook, lease.lease)
         if decoded and not clip.clip.origin:
             # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
             # Python's collector, which waits for many, but each holds pictures.

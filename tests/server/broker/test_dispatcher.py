@@ -43,7 +43,9 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decod
 from v2v_server.broker import dispatcher as dispatcher_module
 from v2v_server.broker.actions import Condemn, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
-from v2v_server.broker.blame import Cause
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.terms import work_seconds
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
@@ -753,6 +755,48 @@ def still_serves(at: Peers) -> None:
     assert sorted(at.samples(b"good consumer")) == [(0, 0), (0, 1)]
 
 
+def test_hello_again_resets_no_credit_and_no_debt() -> None:
+    """Repeated ten times a second it took the workers from everybody else."""
+    at = peers()
+    at.hello(batch_size=1, seed=1)
+    session = at.dispatcher.sessions.get(b"c")
+    assert session is not None
+    credit = session.credit
+    at.join(credit=64)
+    for _ in range(5):
+        at.hello(batch_size=1, seed=1)
+        at.want(*range(credit))
+    assert len(at.leases[b"w"]) == credit
+    for _ in range(credit):
+        at.begin()
+        at.finish()
+    assert at.samples() == []
+    at.work_off()
+    assert sorted(at.samples()) == [(0, index) for index in range(credit)]
+
+
+def test_a_slow_spec_gets_the_time_it_needs_and_speaks_against_nobody_elses() -> None:
+    at = peers(corpus(video("v.mp4", width_px=3840, height_px=2160)))
+    at.hello(b"slow", on_bad_video="raise")
+    at.hello(b"quick")
+    lone = at.dispatcher.sessions.get(b"slow")
+    assert lone is not None
+    sequence = lone.schedule.candidate(0, 0, 0, 0)
+    plain = work_seconds(lone.spec, ("voxels",), sequence.video)
+    assert work_seconds(lone.spec, ("voxels", "flow"), sequence.video) > 10 * max(plain, 1.0)
+    verdict = Verdict(1, sequence.video.id, sequence.video.fingerprint, sequence.start_frame, "slow", "t", "one spec")
+    quarantine = Quarantine([verdict, replace(verdict, snapshot=2)])
+    of_video = (2, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
+    assert quarantine.refusal(*of_video, "one spec") is not None
+    assert quarantine.refusal(*of_video, "another") is None
+    at.want(0, identity=b"slow")
+    at.join()
+    at.begin()
+    at.carry_out(at.dispatcher.worker_lost(b"w", Loss(Cause.HUNG, "was slow", for_all=False), at.now))
+    (written,) = at.recorded
+    assert written.spec == lone.spec.digest
+
+
 GARBAGE: list[list[bytes]] = [
     [],
     [b""],
@@ -918,8 +962,6 @@ _near = st.one_of(
     st.builds(
         WorkerHello,
         name=st.text(),
-        host=st.text(),
-        pid=st.just(1),
         numerics_version=st.sampled_from((NUMERICS_VERSION, 0)),
         credit=st.integers(0, 2**64 - 1),
     ),

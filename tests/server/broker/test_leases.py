@@ -52,6 +52,42 @@ def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_susp
     assert book.finished(other, B, 0.0) == numbered(9)
 
 
+def test_a_deadline_scales_with_the_work_also_of_what_is_in_front() -> None:
+    book = LeaseBook(DEADLINE)
+    long = book.grant(numbered(0), A, 0.0, work_seconds=100.0)
+    book.grant(numbered(1), A, 0.0)
+    assert book.limit_seconds(A) == DEADLINE + 100.0
+    assert overdue_workers(book, DEADLINE + 100.0) == []
+    assert overdue_workers(book, DEADLINE + 100.5) == [A]
+    book.begun(long, A, 10.0)
+    assert overdue_workers(book, DEADLINE + 110.0) == []
+
+
+def test_time_stopped_is_not_time_worked() -> None:
+    book = LeaseBook(DEADLINE)
+    book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    book.grant(numbered(1), B, 0.0)
+    book.put_off(A, 100.0)
+    assert overdue_workers(book, DEADLINE + 100.0) == [B]
+    assert overdue_workers(book, DEADLINE + 100.5) == [A, B]
+
+
+def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_it() -> None:
+    book = LeaseBook(DEADLINE)
+    numbers = [book.grant(numbered(index), A, 0.0) for index in range(3)]
+    book.begun(numbers[0], A, 1.0)
+    assert book.abandoned(b"consumer") == 0
+    book.forget_session(b"consumer")
+    assert book.abandoned(b"consumer") == 3
+    assert book.debt(numbers[0], A, 5.0) == (b"consumer", 4.0)
+    assert book.debt(numbers[0], B, 5.0) is None
+    assert book.debt(numbers[1], A, 5.0) is None  # not begun
+    assert book.finished(numbers[0], A, 5.0) is None
+    assert book.abandoned(b"consumer") == 2
+    book.lost(A)
+    assert book.abandoned(b"consumer") == 0
+
+
 def test_a_late_answer_finds_nothing_even_when_the_task_went_back_to_the_same_worker() -> None:
     book = LeaseBook(DEADLINE)
     first = book.grant(REQUEST, A, 0.0)

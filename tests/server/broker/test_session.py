@@ -251,6 +251,21 @@ def test_asking_for_one_sample_at_a_time_is_not_free_of_charge(credit: int) -> N
     assert got[b"cheap"] / got[b"dear"] == pytest.approx(10.0, rel=0.1)
 
 
+def test_a_debt_outlives_the_session() -> None:
+    sessions = opened(session(b"a"))
+    sessions.charge(b"a", 3.0)
+    sessions.open(session(b"a"))
+    sessions.forget(b"a")
+    sessions.charge(b"a", 1.0)  # for what was under way
+    again = session(b"a")
+    sessions.open(again)
+    assert again.balance_seconds == -4.0
+    sessions.forget(b"a")
+    for number in range(5000):
+        sessions.charge(str(number).encode(), 1.0)
+    assert len(sessions._debts) < 5000
+
+
 def test_nothing_is_saved_up_while_idle() -> None:
     a, b = session(b"a"), session(b"b")
     sessions = opened(a, b)

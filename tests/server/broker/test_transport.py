@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,6 +40,35 @@ def _keepalive_is_due(peer: socket.socket) -> bool:
     ends = [f"0100007F:{port:04X}" for _, port in (peer.getpeername(), peer.getsockname())]
     rows = (line.split() for line in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines())
     return any(row[1:3] == ends and row[5].startswith("02:") for row in rows)
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="takes another user's place: Linux, as root")
+def test_another_user_of_the_host_is_no_worker() -> None:
+    """40 leases went to one, and its forged samples to consumers."""
+    sockets = Sockets("tcp://127.0.0.1:*", f"ipc://@v2v-test-{os.getpid()}")
+    says = (
+        "import os, sys, zmq\n"
+        "os.setuid(int(sys.argv[2]))\n"
+        "peer = zmq.Context().socket(zmq.DEALER)\n"
+        "peer.connect(sys.argv[1])\n"
+        "peer.send(b'mine')\n"
+        "peer.poll(3000)\n"
+    )
+
+    def answered(user: int) -> bool:
+        command = [sys.executable, "-c", says, sockets.worker_address, str(user)]
+        with subprocess.Popen(command) as process:
+            came = False
+            while not came and process.poll() is None:
+                came = any(isinstance(arrival, FromWorker) for arrival in sockets.receive(0.1))
+            process.kill()
+        return came
+
+    try:
+        assert answered(0)
+        assert not answered(65534)
+    finally:
+        sockets.close()
 
 
 def test_what_is_sent_to_nobody_is_not_sent(sockets: Sockets) -> None:
