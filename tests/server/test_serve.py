@@ -135,7 +135,7 @@ def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) 
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == [
         ("lost", b"toy1", Loss(Cause.HUNG, "slept")),
-        ("lost", b"elsewhere", Loss(Cause.UNEXPLAINED, "slept")),
+        ("lost", b"elsewhere", Loss(Cause.UNEXPLAINED, "slept", for_all=False)),
     ]
 
 
