@@ -18,7 +18,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from v2v_client.batch import Batch
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
+from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 
@@ -119,9 +119,8 @@ def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
     tensors = {
         name: torch.stack([torch.from_numpy(sample.arrays[name]) for sample in samples]) for name in samples[0].arrays
     }
-    named: dict[str, Any] = {name: tensors.get(name) for name in ARRAYS}
     return Batch(
-        **named,
+        arrays=tensors,
         indices=tuple(sample.provenance.id.index for sample in samples),
         epoch=samples[0].provenance.id.epoch,
         provenance=tuple(sample.provenance for sample in samples),

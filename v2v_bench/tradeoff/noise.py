@@ -27,7 +27,7 @@ from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel
 Kernel = Callable[..., int]
 
 _M0, _M1, _M2 = noise.MIX_FACTORS
-_GENERATOR = "_two_normals"
+_GENERATOR = "two_normals"
 _PAIRS = np.uint32(0x00FF00FF)
 _MEAN = np.float32(8 * 255 / 2)
 _SCALE = np.float32(1 / np.sqrt(8 * (256**2 - 1) / 12))
