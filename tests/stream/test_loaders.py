@@ -184,14 +184,11 @@ def test_another_batch_size_is_exact(
 
 def singles(batch: Batch) -> Iterator[tuple[int, str]]:
     """Index and digest of each sample, as of a batch of its own."""
-    assert batch.voxels is not None
-    assert batch.frames is not None
     for row, index in enumerate(batch.indices):
         alone = dataclasses.replace(
             batch,
             indices=(index,),
-            voxels=batch.voxels[row : row + 1],
-            frames=batch.frames[row : row + 1],
+            arrays={name: array[row : row + 1] for name, array in batch.arrays.items()},
             provenance=batch.provenance[row : row + 1],
         )
         yield index, digest(alone)
