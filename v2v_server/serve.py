@@ -16,11 +16,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
-from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.door import most_connections
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
-from v2v_server.broker.transport import FromConsumer, FromWorker, ServerTransport, Sockets
+from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
@@ -35,6 +36,7 @@ from v2v_server.system.process import keep_freed_memory, open_many_files, usable
 from v2v_server.video.rows import Rows
 
 _MANY_WORKERS_A_CORE = 4
+_FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
 """Of the loop without any message; also from one look at deadlines and deaths to the next."""
 _LONGEST_TURN_SECONDS = 1.0
@@ -112,7 +114,12 @@ def serve(config: ServeConfig) -> None:
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
-        sockets = Sockets(config.bind, config.worker_bind or _private_address(label))
+        sockets = Sockets(
+            config.bind,
+            config.worker_bind or _private_address(label),
+            most_connections=most_connections(_FILES_A_WORKER * max(config.workers, config.expect_workers)),
+            most_queued_bytes=config.max_credit_bytes,
+        )
         pool = Pool(catalogue.root, label, cache_flags)
         server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file)
         try:
@@ -181,6 +188,8 @@ class Server:
                     self._carry_out(self._dispatcher.from_worker(identity, frames, now))
                 case FromConsumer(identity, frames):
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now))
+                case ConsumerGone(identity):
+                    self._dispatcher.consumer_gone(identity, now)
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
             for identity, seconds in self._supervisor.stopped(now).items():
@@ -214,6 +223,8 @@ class Server:
                 case ToWorker() as message:
                     if not self._transport.send(message) and not self._supervisor.watches(message.identity):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
+                case CutOff(identity):
+                    self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case Condemn() as record:

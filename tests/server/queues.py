@@ -39,6 +39,9 @@ class Queues:
         there.append(action.frames)
         return True
 
+    def cut(self, identity: bytes) -> None:
+        self.sent.pop(identity, None)
+
     def close(self) -> None:
         self.sent.clear()
 

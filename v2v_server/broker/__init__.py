@@ -1,8 +1,9 @@
-"""The broker: who gets which sample from which worker. It knows no pixels, and all but two files do no I/O.
+"""The broker: who gets which sample from which worker. It knows no pixels, and all but three files do no I/O.
 
 dispatcher        the mind: messages and deaths in, actions out
 actions           what it wants done; the loop in ``serve.py`` does it
 transport         the way in and out: its protocol, and the two ZeroMQ sockets (I/O)
+door             which consumers are cut off, and which have gone (I/O)
 admission         from a consumer's Hello to its session
 session           what each consumer has asked for, its credit, whose turn it is
 leases            requests, and which worker has which of them

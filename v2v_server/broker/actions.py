@@ -34,6 +34,13 @@ class ToWorker:
 
 
 @dataclass(frozen=True, slots=True)
+class CutOff:
+    """This consumer sends nothing but nonsense: end its connection."""
+
+    identity: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class GiveUp:
     """This worker hangs: end its process where that is in our power, and report its loss."""
 
@@ -80,7 +87,7 @@ class PassOver:
     refusal: Refusal
 
 
-Action: TypeAlias = ToConsumer | ToWorker | GiveUp | Condemn | LookFor | PassOver
+Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | Condemn | LookFor | PassOver
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

@@ -34,7 +34,7 @@ from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
-from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
@@ -47,6 +47,8 @@ from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Wor
 from v2v_server.catalogue.catalogue import Catalogue
 
 MOST_SESSIONS = 4096
+MOST_FAULTS = 16
+"""Malformed messages after which a consumer is cut off: to answer each costs as much as a sample."""
 _MOST_CPU_SECONDS = 86_400.0
 
 
@@ -92,6 +94,7 @@ class Dispatcher:
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self._workers = Workers(self._leases)
         self._lone: deque[Request] = deque()
+        self._faults: dict[bytes, int] = {}  # of consumers that are connected
 
     @property
     def workers(self) -> int:
@@ -110,10 +113,10 @@ class Dispatcher:
         try:
             message = _only(frames)
         except ProtocolError as error:
-            return [ToConsumer(identity, self._malformed(error))]
+            return [self._fault(identity, error)]
         session = self.sessions.get(identity)
         if session is not None:
-            session.liveness.heard(now)
+            session.heard(now)
         match message:
             case Hello():
                 return [self._hello(identity, message, now)]
@@ -128,7 +131,14 @@ class Dispatcher:
                 return self._want(session, message) or self._assign(now)
             case _:
                 stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
-                return [ToConsumer(identity, self._malformed(stray))]
+                return [self._fault(identity, stray)]
+
+    def consumer_gone(self, identity: bytes, now: float) -> None:
+        """The connection of a consumer has ended. It may come back at once over another one, and find its session."""
+        self._faults.pop(identity, None)
+        session = self.sessions.get(identity)
+        if session is not None:
+            session.left_at = now
 
     def consumer_lost(self, identity: bytes) -> None:
         """The consumer left, or cannot be reached any more."""
@@ -137,6 +147,9 @@ class Dispatcher:
         self._lone = deque(request for request in self._lone if request.session != identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float) -> Action:
+        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+            for silent in self.sessions.dispensable(now):
+                self.consumer_lost(silent)
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
             return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
@@ -152,7 +165,7 @@ class Dispatcher:
         try:
             slots = _slots(want)
         except ProtocolError as error:
-            return [ToConsumer(session.identity, self._malformed(error))]
+            return [self._fault(session.identity, error)]
         try:
             for index in want.indices[:1]:
                 SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
@@ -162,6 +175,14 @@ class Dispatcher:
         except (IndexError, UsageError) as error:
             return [_deny(session.identity, ErrorCode.RANGE, str(error))]
         return []
+
+    def _fault(self, identity: bytes, error: ProtocolError) -> Action:
+        """The answer to a consumer's message that is none."""
+        faults = self._faults[identity] = self._faults.pop(identity, 0) + 1
+        if len(self._faults) > MOST_SESSIONS:
+            del self._faults[next(iter(self._faults))]
+        answer = ToConsumer(identity, self._malformed(error))
+        return answer if faults <= MOST_FAULTS else CutOff(identity)
 
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1

@@ -30,6 +30,9 @@ from v2v_server.broker.leases import Request
 from v2v_server.schedule.epoch import Schedule
 
 _QUANTUM_SECONDS = 0.05
+GONE_SECONDS = 10.0
+"""After its connection ended a consumer has so long to come back to its session."""
+SILENT_SECONDS = 60.0
 _MOST_DEBTS = 4096
 """Debts remembered of consumers that are not there; the oldest goes first."""
 
@@ -49,6 +52,7 @@ class Session:
         balance_seconds: worker time it has earned and not used.
         served: samples sent.
         quarantine: number of the quarantine snapshot its samples are made under.
+        left_at: when its connection ended; None while it has one, as far as is known.
         form: of one of its samples.
     """
 
@@ -65,11 +69,17 @@ class Session:
     balance_seconds: float = 0.0
     served: int = 0
     quarantine: int = 0
+    left_at: float | None = None
 
     form: Form = field(init=False)
 
     def __post_init__(self) -> None:
         self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
+
+    def heard(self, now: float) -> None:
+        """Its consumer said something."""
+        self.liveness.heard(now)
+        self.left_at = None
 
 
 class Sessions:
@@ -201,5 +211,18 @@ class Sessions:
         return True
 
     def idle(self, now: float) -> list[bytes]:
-        """Sessions to forget: silent for too long."""
-        return [session.identity for session in self._sessions.values() if session.liveness.is_gone(now)]
+        """Sessions to forget: silent for too long, or without a connection."""
+        return [
+            session.identity
+            for session in self._sessions.values()
+            if session.liveness.is_gone(now) or (session.left_at is not None and now - session.left_at >= GONE_SECONDS)
+        ]
+
+    def dispensable(self, now: float) -> list[bytes]:
+        """Sessions to forget where others need their place: a consumer that is there says something every few
+        seconds."""
+        return [
+            session.identity
+            for session in self._sessions.values()
+            if session.left_at is not None or session.liveness.silence(now) >= SILENT_SECONDS
+        ]

@@ -7,7 +7,7 @@ Samples pass through as the very frames that arrived; only the small header befo
 
 Memory: a consumer asks for more only as it takes what it was sent, so broker bytes <= sum over sessions of credit x
 sample bytes (in ZeroMQ's out-queue of a consumer that is slow) + workers x 2 x sample bytes. A peer that asks and never
-reads is cut off at MOST_QUEUED messages.
+reads is cut off at MOST_QUEUED messages, or at the bytes of its credit (:mod:`v2v_server.broker.door`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import zmq
 from v2v_protocol.errors import UsageError
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.broker.door import MOST_CONNECTIONS, Door
 
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
@@ -49,7 +50,14 @@ class FromWorker:
     frames: Sequence[Any]
 
 
-Arrival: TypeAlias = FromConsumer | FromWorker
+@dataclass(frozen=True, slots=True)
+class ConsumerGone:
+    """The connection of a consumer has ended; it may come back over another one."""
+
+    identity: bytes
+
+
+Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone
 
 
 class ServerTransport(Protocol):
@@ -64,7 +72,8 @@ class ServerTransport(Protocol):
         """Where workers connect."""
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """At most one message of each side, so that neither can shut the other out; the workers' first.
+        """At most one message of each side, so that neither can shut the other out; the workers' first. Last of all who
+        has gone.
 
         Args:
             seconds: longest wait for any of them.
@@ -72,6 +81,9 @@ class ServerTransport(Protocol):
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
         """False when the peer is not connected any more, or does not read what it is sent."""
+
+    def cut(self, identity: bytes) -> None:
+        """Ends the connection of a consumer."""
 
     def close(self) -> None:
         """Ends all connections; what was not sent is dropped."""
@@ -83,17 +95,30 @@ class Sockets:
     Args:
         bind: address for consumers.
         worker_bind: address for workers.
+        most_connections: of consumers, at a time.
+        most_queued_bytes: that may wait for one consumer.
 
     Raises:
         UsageError: an address that cannot be bound; the message names the flag.
     """
 
-    def __init__(self, bind: str, worker_bind: str) -> None:
+    def __init__(
+        self,
+        bind: str,
+        worker_bind: str,
+        *,
+        most_connections: int = MOST_CONNECTIONS,
+        most_queued_bytes: int = 1 << 40,
+    ) -> None:
         self._context = zmq.Context()
+        self._consumers = self._router(LARGEST_REQUEST_BYTES)
+        self._workers = self._router(LARGEST_ARRAY_BYTES)
+        self._door = Door(self._consumers, most_connections, most_queued_bytes)
         try:
-            self._consumers = self._router(bind, "--bind", LARGEST_REQUEST_BYTES)
-            self._workers = self._router(worker_bind, "--worker-bind", LARGEST_ARRAY_BYTES)
+            _bind(self._consumers, bind, "--bind")
+            _bind(self._workers, worker_bind, "--worker-bind")
         except BaseException:
+            self._door.close()
             self._context.destroy(linger=0)
             raise
         self._poller = zmq.Poller()
@@ -102,28 +127,22 @@ class Sockets:
         self.address = self._consumers.getsockopt_string(zmq.LAST_ENDPOINT)
         self.worker_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def _router(self, address: str, flag: str, largest_bytes: int) -> zmq.Socket[bytes]:
+    def _router(self, largest_bytes: int) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
-        # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
-        router.setsockopt(zmq.IPV6, int("[" in address))
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         router.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        if address.startswith("ipc://") and sys.platform.startswith("linux"):
-            # Such a socket is open to every user of this host; the system says whose process connects.
+        if sys.platform.startswith("linux"):
+            # An ipc:// address is open to every user of this host; the system says whose process connects.
             router.setsockopt(zmq.IPC_FILTER_UID, os.getuid())
         # A host that vanishes (pre-empted, unplugged) says no farewell, and nothing is said to it that would show it:
         # the system asks, or its connection would stay open as long as this process lives.
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)
         router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
-        try:
-            router.bind(address)
-        except zmq.ZMQError as error:
-            raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
         return router
 
     def receive(self, seconds: float) -> list[Arrival]:
@@ -132,8 +151,9 @@ class Sockets:
         arrivals: list[Arrival] = []
         if self._workers in ready and (message := _receive(self._workers)) is not None:
             arrivals.append(FromWorker(*message))
-        if self._consumers in ready and (message := _receive(self._consumers)) is not None:
+        if self._consumers in ready and (message := _receive(self._consumers, self._door)) is not None:
             arrivals.append(FromConsumer(*message))
+        arrivals += map(ConsumerGone, self._door.take_ended())
         return arrivals
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
@@ -150,14 +170,30 @@ class Sockets:
             if error.errno == zmq.EHOSTUNREACH:
                 return False
             raise
+        if isinstance(action, ToConsumer):
+            self._door.sent(action.identity, sum(map(len, action.frames)))
         return True
+
+    def cut(self, identity: bytes) -> None:
+        """See :class:`ServerTransport`."""
+        self._door.cut(identity)
 
     def close(self) -> None:
         """Closes both sockets; what was not sent is dropped."""
+        self._door.close()
         self._context.destroy(linger=0)
 
 
-def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
+def _bind(router: zmq.Socket[bytes], address: str, flag: str) -> None:
+    # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
+    router.setsockopt(zmq.IPV6, int("[" in address))
+    try:
+        router.bind(address)
+    except zmq.ZMQError as error:
+        raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
+
+
+def _receive(router: zmq.Socket[bytes], door: Door | None = None) -> tuple[bytes, list[Any]] | None:
     """A message that is there, and who sent it.
 
     The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
@@ -170,4 +206,6 @@ def _receive(router: zmq.Socket[bytes]) -> tuple[bytes, list[Any]] | None:
             frames.append(frame if frames else frame.bytes)
     except zmq.Again:
         return None  # a connection that just ended took it along
+    if door is not None:
+        door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
     return identity.bytes, frames

@@ -41,10 +41,12 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import Condemn, GiveUp, ToConsumer
+from v2v_server.broker.actions import Condemn, CutOff, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.dispatcher import MOST_FAULTS
 from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
 from v2v_server.broker.terms import work_seconds
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
 from v2v_server.schedule.epoch import MOST_CANDIDATES
@@ -753,6 +755,42 @@ def still_serves(at: Peers) -> None:
     for worker in sorted(at.leases):
         at.work_off(worker)
     assert sorted(at.samples(b"good consumer")) == [(0, 0), (0, 1)]
+
+
+def test_who_sends_nothing_but_nonsense_is_cut_off() -> None:
+    at = peers()
+    for _ in range(MOST_FAULTS):
+        (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
+        assert isinstance(answer, ToConsumer)
+    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [CutOff(b"bad")]
+    at.dispatcher.consumer_gone(b"bad", 0.0)
+    (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
+    assert isinstance(answer, ToConsumer)
+    still_serves(at)
+
+
+def test_a_consumer_whose_connection_ended_has_a_moment_to_come_back() -> None:
+    at = peers()
+    for name in (b"comes back", b"does not"):
+        at.hello(name)
+        at.dispatcher.consumer_gone(name, at.now)
+    at.tick(GONE_SECONDS - 1)
+    assert len(at.dispatcher.sessions) == 2
+    at.consumer_says(b"comes back", Ping())
+    at.tick(2.0)
+    assert [session.identity for session in at.dispatcher.sessions] == [b"comes back"]
+
+
+def test_sessions_of_peers_that_are_gone_make_room_for_newcomers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatcher_module, "MOST_SESSIONS", 3)
+    at = peers()
+    at.hello(b"silent")
+    at.now += SILENT_SECONDS
+    at.hello(b"there")
+    at.hello(b"left")
+    at.dispatcher.consumer_gone(b"left", at.now)
+    at.hello(b"newcomer")
+    assert {session.identity for session in at.dispatcher.sessions} == {b"there", b"newcomer"}
 
 
 def test_hello_again_resets_no_credit_and_no_debt() -> None:

@@ -1,0 +1,189 @@
+"""Hostile consumers at the sockets: each is cut off, memory stays, and others are served meanwhile."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+import psutil
+import pytest
+import zmq
+
+from tests.waiting import until
+from v2v_protocol.messages import Ping, Pong
+from v2v_protocol.wire import encode
+from v2v_server.broker import door
+from v2v_server.broker.actions import ToConsumer
+from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, Sockets
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
+
+ROUTER_READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
+GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL" + bytes(16 + 1 + 31)
+MIB = 1 << 20
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Sockets]]:
+    opened: list[Sockets] = []
+
+    def start(**limits: int) -> Sockets:
+        opened.append(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", **limits))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
+
+
+@pytest.fixture
+def consumer() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
+    context = zmq.Context()
+    peers: list[zmq.Socket[bytes]] = []
+
+    def connect(sockets: Sockets, name: bytes) -> zmq.Socket[bytes]:
+        peer = context.socket(zmq.DEALER)
+        peers.append(peer)
+        peer.setsockopt(zmq.ROUTING_ID, name)
+        peer.setsockopt(zmq.RECONNECT_IVL, -1)
+        peer.connect(sockets.address)
+        return peer
+
+    yield connect
+    context.destroy(linger=0)
+
+
+def raw(sockets: Sockets) -> socket.socket:
+    """A peer that speaks ZMTP by hand, up to the end of the handshake."""
+    peer = socket.create_connection(("127.0.0.1", int(sockets.address.rpartition(":")[2])))
+    peer.sendall(GREETING + ROUTER_READY)
+    return peer
+
+
+def is_cut_off(peer: socket.socket, part: bytes) -> bool:
+    """Whether the connection ends when 8 MiB of parts are sent."""
+    peer.settimeout(10.0)
+    try:
+        for _ in range(8 * MIB // len(part)):
+            peer.sendall(part)
+        while peer.recv(4096):
+            pass
+    except ConnectionError:
+        return True
+    except TimeoutError:
+        return False
+    return True
+
+
+def next_from(sockets: Sockets, kind: type) -> Arrival:
+    came: list[Arrival] = []
+
+    def there() -> bool:
+        came.extend(one for one in sockets.receive(0.05) if isinstance(one, kind))
+        return bool(came)
+
+    until(there)
+    return came[0]
+
+
+@pytest.mark.parametrize("part", [b"\x01\x00" * 8192, (b"\x01\xff" + bytes(255)) * 64], ids=["empty", "of 255 bytes"])
+def test_parts_without_end_are_cut_off_before_they_are_collected(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], part: bytes
+) -> None:
+    """One peer's parts grew the server byte for byte, empty ones a hundredfold; the honest consumer notices nothing."""
+    sockets = serve()
+    honest = consumer(sockets, b"honest")
+    before = psutil.Process().memory_info().rss
+    cut: list[bool] = []
+    hostile = [raw(sockets) for _ in range(8)]
+    threads = [
+        threading.Thread(target=lambda peer: cut.append(is_cut_off(peer, part)), args=(each,)) for each in hostile
+    ]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        honest.send_multipart(encode(Ping()))
+        assert next_from(sockets, FromConsumer).identity == b"honest"
+    for thread in threads:
+        thread.join()
+    for each in hostile:
+        each.close()
+    assert cut == [True] * 8
+    assert psutil.Process().memory_info().rss - before < 300 * MIB
+    assert sockets.send(ToConsumer(b"honest", encode(Pong())))
+    assert honest.poll(5000)
+
+
+def test_whose_connection_has_ended_is_said(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    sockets = serve()
+    peer = consumer(sockets, b"c")
+    peer.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    peer.close()
+    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
+
+
+def test_a_consumer_that_takes_its_place_over_another_connection_is_not_gone(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    sockets = serve()
+    first, other = consumer(sockets, b"c"), consumer(sockets, b"other")
+    first.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    again = consumer(sockets, b"c")
+    again.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    first.close()
+    other.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    other.close()
+    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"other")
+
+
+def test_who_asks_for_more_than_it_takes_is_cut_off(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(door, "_SLACK_BYTES", MIB)
+    sockets = serve(most_queued_bytes=MIB)
+    deaf = consumer(sockets, b"deaf")
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    sample = bytes(4 * MIB)
+    sent = [sockets.send(ToConsumer(b"deaf", [b"", sample])) for _ in range(30)]
+    assert all(sent)
+    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"deaf")
+
+
+def test_connections_are_bounded_and_those_that_say_nothing_make_room(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    """Idle ones took every file that the process may open, and ended it."""
+    sockets = serve(most_connections=4)
+    honest = consumer(sockets, b"honest")
+    honest.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    idle = [raw(sockets) for _ in range(20)]
+    until(lambda: len(sockets._door._connections) <= 4)
+    newcomer = consumer(sockets, b"newcomer")
+    newcomer.send_multipart(encode(Ping()))
+    arrival = next_from(sockets, FromConsumer)
+    assert isinstance(arrival, FromConsumer)
+    assert arrival.identity == b"newcomer"
+    assert sockets.send(ToConsumer(b"honest", encode(Pong())))
+    for each in idle:
+        each.close()
+
+
+def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]) -> None:
+    sockets = serve()
+    peer = consumer(sockets, b"c")
+    peer.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    sockets.cut(b"stranger")
+    sockets.cut(b"c")
+    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")

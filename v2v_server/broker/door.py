@@ -1,0 +1,236 @@
+"""The door: a watch over the consumers' connections, which ZeroMQ counts by nothing but the size of one part. I/O.
+
+ZeroMQ collects all parts of a message before it delivers one, and keeps what a peer does not read. It has no limit for
+either. The system counts both for it: bytes that came over a connection, and bytes that the other end has taken. A
+thread looks at them many times a second and ends the connection of a peer that
+
+    sends more than any request without its end in sight     memory of the server, without a message
+    has asked for more than it takes                         memory of the server, for samples
+    says nothing that is a message after it has connected    a file of the server
+    comes when all connections are taken
+
+The connection is shut down under ZeroMQ, which then forgets the peer and what it kept for it. An honest consumer that
+is cut off by mistake connects again and goes on. The loop learns whose connections have ended.
+
+Only TCP on Linux is watched; an ``ipc://`` address lets in our own user only.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import resource
+import socket
+import struct
+import sys
+import termios
+import threading
+import time
+from dataclasses import dataclass
+
+import zmq
+
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES
+
+LOOK_SECONDS = 0.05
+SAYS_NOTHING_SECONDS = 30.0
+"""A consumer says Hello as soon as it has connected."""
+MOST_CONNECTIONS = 4096 + 256
+_LARGEST_UNREAD_BYTES = 6 * LARGEST_REQUEST_BYTES
+"""More than ZeroMQ holds of whole messages (``transport.MOST_UNREAD``) and of one that is on its way."""
+_SLACK_BYTES = 64 << 20
+_EVENTS = int(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_CLOSED)
+_TCP_INFO_BYTES, _ACKED, _RECEIVED = 136, 120, 128  # of struct tcp_info, Linux
+
+
+def most_connections(files_for_others: int) -> int:
+    """Connections that leave at least half of this process's files to everything else.
+
+    Args:
+        files_for_others: that workers take.
+    """
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return MOST_CONNECTIONS
+    return max(1, min(MOST_CONNECTIONS, (soft - files_for_others) // 2))
+
+
+@dataclass(slots=True)
+class _Connection:
+    peer: object  # its address, by which it is known again
+    since: float
+    identity: bytes | None = None
+    consumed: int = 0  # bytes that ZeroMQ had taken at the last look
+    delivered: int = 0  # of those, how many at least are in messages that were delivered
+    heard: bool = False  # a message since the last look
+    sent: int = 0
+    cut: bool = False
+
+
+class Door:
+    """Watches a socket's connections in a thread of its own, until closed.
+
+    Args:
+        router: the socket; not bound yet.
+        most_connections: at a time.
+        most_queued_bytes: of samples that a consumer has asked for and its host has not taken.
+    """
+
+    def __init__(self, router: zmq.Socket[bytes], most_connections: int, most_queued_bytes: int) -> None:
+        self._most_connections = most_connections
+        self._most_queued_bytes = most_queued_bytes + _SLACK_BYTES
+        self._connections: dict[int, _Connection] = {}
+        self._files: dict[bytes, int] = {}
+        self._early: dict[int, bytes] = {}
+        self._ended: list[bytes] = []
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        if sys.platform == "linux":
+            monitor = router.get_monitor_socket(_EVENTS)
+            self._thread = threading.Thread(target=self._watch, args=(monitor,), name="v2v-door", daemon=True)
+            self._thread.start()
+
+    def heard(self, identity: bytes, file: int) -> None:
+        """A whole message came from a consumer, over the connection of that descriptor."""
+        with self._lock:
+            connection = self._connections.get(file)
+            if connection is None:
+                self._early[file] = identity  # the thread has not seen it come; or it has just ended, or is no TCP
+                return
+            connection.heard = True
+            if connection.identity != identity:
+                connection.identity = identity
+                self._files[identity] = file
+
+    def sent(self, identity: bytes, size: int) -> None:
+        """So many bytes are on their way to a consumer."""
+        with self._lock:
+            connection = self._connections.get(self._files.get(identity, -1))
+            if connection is not None:
+                connection.sent += size
+
+    def cut(self, identity: bytes) -> None:
+        """Ends a consumer's connection."""
+        with self._lock:
+            file = self._files.get(identity, -1)
+            if file in self._connections:
+                self._cut(file)
+
+    def take_ended(self) -> list[bytes]:
+        """Consumers whose connection has ended since the last call."""
+        with self._lock:
+            ended, self._ended = self._ended, []
+        return ended
+
+    def close(self) -> None:
+        """Stops watching. To be called before the socket is closed."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    # --- in the thread ------------------------------------------------------------------------------------------------
+
+    def _watch(self, monitor: zmq.Socket[bytes]) -> None:
+        look_at = time.monotonic()
+        while not self._closing.is_set():
+            now = time.monotonic()
+            if monitor.poll(max(0, int(1000 * (look_at - now)))):
+                self._take_events(monitor, now)
+            if now >= look_at:
+                look_at = now + LOOK_SECONDS
+                with self._lock:
+                    for file in list(self._connections):
+                        self._look(file, now)
+        monitor.close(linger=0)
+
+    def _take_events(self, monitor: zmq.Socket[bytes], now: float) -> None:
+        while monitor.poll(0):
+            event, file = struct.unpack("=hi", monitor.recv_multipart()[0])
+            with self._lock:
+                self._forget(file)
+                if event == zmq.EVENT_ACCEPTED:
+                    self._accept(file, now)
+
+    def _accept(self, file: int, now: float) -> None:
+        peer = _peer(file)
+        if peer is None:
+            return
+        self._connections[file] = _Connection(peer, now, self._early.pop(file, None))
+        if (identity := self._connections[file].identity) is not None:
+            self._files[identity] = file
+        if len(self._connections) > self._most_connections:
+            # Those who have said nothing yet, the oldest first; perhaps the newcomer itself.
+            silent = (each for each, known in self._connections.items() if known.identity is None and not known.cut)
+            self._cut(next(silent, file))
+
+    def _forget(self, file: int) -> None:
+        connection = self._connections.pop(file, None)
+        if connection is None or connection.identity is None or self._files.get(connection.identity) != file:
+            return  # said nothing, or is here again over another connection
+        del self._files[connection.identity]
+        self._ended.append(connection.identity)
+
+    def _look(self, file: int, now: float) -> None:
+        connection = self._connections[file]
+        counted = None if connection.cut else _counted(file)
+        if counted is None:
+            return
+        consumed, taken = counted
+        if connection.heard:
+            # Messages come in order: what had come at the last look is delivered, or is in the few that wait.
+            connection.heard, connection.delivered = False, connection.consumed
+        connection.consumed = consumed
+        if (
+            consumed - connection.delivered > _LARGEST_UNREAD_BYTES
+            or connection.sent - taken > self._most_queued_bytes
+            or (connection.identity is None and now - connection.since > SAYS_NOTHING_SECONDS)
+        ):
+            self._cut(file)
+
+    def _cut(self, file: int) -> None:
+        connection = self._connections[file]
+        connection.cut = True
+        if _peer(file) != connection.peer:
+            return  # it is closed already, and the descriptor is another's
+        link = _link(file)
+        try:
+            link.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass  # it has just ended
+        finally:
+            link.detach()
+
+
+def _link(file: int) -> socket.socket:
+    """A connection that is ZeroMQ's: to be detached after use, never closed."""
+    return socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=file)
+
+
+def _peer(file: int) -> object:
+    """Address of the other end; None where there is no connection."""
+    try:
+        link = socket.socket(fileno=file)
+    except OSError:
+        return None
+    try:
+        return link.getpeername() if link.family in (socket.AF_INET, socket.AF_INET6) else None
+    except OSError:
+        return None
+    finally:
+        link.detach()
+
+
+def _counted(file: int) -> tuple[int, int] | None:
+    """Bytes that ZeroMQ has read from a connection, and bytes that the other end's system has taken."""
+    link = _link(file)
+    try:
+        info = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
+        waiting = int(struct.unpack("=i", fcntl.ioctl(file, termios.FIONREAD, bytes(4)))[0])
+    except OSError:
+        return None
+    finally:
+        link.detach()
+    if len(info) < _TCP_INFO_BYTES:
+        return None  # Linux before 4.1
+    taken, received = (int(struct.unpack_from("=Q", info, offset)[0]) for offset in (_ACKED, _RECEIVED))
+    return received - waiting, taken
