@@ -21,6 +21,7 @@ import errno
 import fcntl
 import json
 import os
+import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from v2v_protocol.errors import CorpusError
 from v2v_server.catalogue.refresh import index_path
 
 VERDICTS_PER_VIDEO = 2
+_LONGEST_LOCK_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +184,7 @@ def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdi
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     with open(file, "a+b", buffering=0) as out:
-        fcntl.flock(out, fcntl.LOCK_EX)  # until the file is closed
+        _lock(out.fileno(), file)  # until the file is closed
         out.seek(0)
         whole = out.readall()
         lines = _parse(file, whole).lines
@@ -205,6 +207,20 @@ def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdi
     if not whole:
         _sync_folder(file.parent)
     return [*lines[known.latest :], numbered]
+
+
+def _lock(descriptor: int, file: Path) -> None:
+    """Writers hold the lock for a moment; who holds it longer, which any reader may, must not stop a server."""
+    until = time.monotonic() + _LONGEST_LOCK_SECONDS
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise BlockingIOError(
+                    errno.EAGAIN, f"another process has locked it for {_LONGEST_LOCK_SECONDS:g} s; end that one", file
+                ) from None
+            time.sleep(0.01)
 
 
 def _sync_folder(folder: Path) -> None:

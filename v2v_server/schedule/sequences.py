@@ -21,6 +21,9 @@ from v2v_server.catalogue.catalogue import VideoEntry
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
+MOST_CLIP_BYTES = 2 << 30
+"""What a worker may have to hold of decoded frames for one lease."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
@@ -61,7 +64,7 @@ class SequenceTable:
                 longest.append(_longest_clip(video.frames, spec.recipe))
                 refusals.append(_too_short(video, spec.recipe))
                 continue
-            if (refusal := _too_small(video, rows, spec.recipe)) is not None:
+            if (refusal := _too_small(video, rows, spec.recipe) or _too_large(video, rows, spec)) is not None:
                 refusals.append(refusal)
                 continue
             fit = (video.frames - spec.recipe.frames_needed) // self._stride + 1
@@ -139,6 +142,19 @@ def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
         f"at most {longest_run} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
     )
     return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+
+
+def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
+    """The frames of a lease are held whole until they are resized, however small the sample becomes."""
+    recipe = spec.recipe
+    top, bottom = rows.bounds(video.height_px)
+    cropped = recipe.resize_scale == (1.0, 1.0)
+    frame = recipe.crop_height_px * recipe.crop_width_px if cropped else (bottom - top) * video.width_px
+    size = frame * (recipe.steps + 1) * spec.samples_per_decode
+    if size <= MOST_CLIP_BYTES:
+        return None
+    reason = f"one sample takes {size >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
+    return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
 
 
 def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.broker import quarantine as quarantine_module
 from v2v_server.broker.quarantine import (
     VERDICTS_PER_VIDEO,
     Quarantine,
@@ -307,3 +308,16 @@ def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
     assert [each.snapshot for each in lines] == list(range(1, 41))
     for name in "ab":
         assert [each.frame for each in lines if each.path == name] == list(range(20))
+
+
+def test_a_lock_that_somebody_keeps_stops_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may read the file can take a shared lock on it."""
+    monkeypatch.setattr(quarantine_module, "_LONGEST_LOCK_SECONDS", 0.05)
+    file = tmp_path / "q.jsonl"
+    file.touch()
+    with file.open("rb") as reader:
+        fcntl.flock(reader, fcntl.LOCK_SH)
+        with pytest.raises(OSError, match="another process has locked it"):
+            write_verdict(file, verdict(), Quarantine())
+    assert file.read_bytes() == b""
+    assert len(write_verdict(file, verdict(), Quarantine())) == 1

@@ -14,7 +14,7 @@ from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import VideoEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
 from v2v_server.video.rows import Rows
 
 FULL = Rows()
@@ -162,6 +162,22 @@ def test_the_remedy_for_a_small_picture_admits_it(height: int, width: int, crop_
     scale = float(match[1])
     assert table(small, spec=StreamSpec(recipe=recipe.replace(resize_scale=(1.0, scale)))).count > 0
     assert scale <= max(crop_height / height, crop_width / width) + 0.002
+
+
+def test_what_a_worker_would_have_to_hold_is_refused_before_it_starts() -> None:
+    """Pictures that are made small are held whole first: 706 MiB for a sample of 177 KB."""
+    large = video("v.mp4", frames=1000, width_px=3840, height_px=2160)
+    most = MOST_CLIP_BYTES // (3840 * 2160) - 1  # steps
+
+    def under(steps: int, **fields: Any) -> SequenceTable:
+        recipe = Recipe(voxels_per_clip=steps, bins=1, crop_height_px=64, crop_width_px=64, **fields)
+        return table(large, spec=StreamSpec(recipe))
+
+    assert under(most, resize_scale=(0.1, 0.1)).count
+    (refusal,) = under(most + 1, resize_scale=(0.1, 0.1)).refusals
+    assert re.fullmatch(r"one sample takes 20\d\d MiB of decoded frames, the limit is 2048 MiB", refusal.reason)
+    assert "resize_scale 1" in refusal.remedy
+    assert under(most + 1).count  # cropped as it is decoded
 
 
 def test_rows_count() -> None:
