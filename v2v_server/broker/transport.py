@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -207,5 +208,6 @@ def _receive(router: zmq.Socket[bytes], door: Door | None = None) -> tuple[bytes
     except zmq.Again:
         return None  # a connection that just ended took it along
     if door is not None:
-        door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
+        with suppress(zmq.ZMQError):  # of some messages, whose connection just ended, ZeroMQ does not know
+            door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
     return identity.bytes, frames
