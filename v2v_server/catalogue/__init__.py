@@ -1,0 +1,14 @@
+"""The catalogue: which videos there are, under stable names, and what each of them holds.
+
+catalogue        the snapshot that everything else works from
+files            which files a corpus has
+listfile         list files like the paper's
+survey           probing many files in processes of their own
+index_file       what probing found, on disk
+refresh          bringing that up to date
+scene            what a video shows, in a few numbers
+look             the look that finds these numbers
+scenes           the numbers of a whole corpus
+manifest         what a prepared folder says of itself
+manifest_writer  writing that
+"""

@@ -1,0 +1,10 @@
+"""The command lines, thin: arguments -> configuration -> call.
+
+serve       v2v-serve
+worker      v2v-worker
+simulate    v2v-simulate
+preview     v2v-preview
+prepare     v2v-prepare
+quarantine  v2v-quarantine
+spec_flags  the flags for what a stream is made of
+"""

@@ -1,1 +1,14 @@
+"""One video file: from its bytes to luma.
 
+source       opening it, for sequential reading
+probe        what it holds
+packets      what a packet says without being decoded
+frame_index  which frames it has, and where decoding may begin
+decode       a range of frames, exactly
+collect      the asked frames of one pass of a decoder
+luma         which grey is meant
+full_range   limited range to full range, compiled
+orientation  how a stored picture must be turned
+rows         which rows may be used
+fingerprint  which file it is
+"""
