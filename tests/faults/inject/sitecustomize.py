@@ -37,12 +37,13 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
+    from v2v_server.worker import arrays
     from v2v_server.worker import decode_cache as clips
     from v2v_server.worker import process as worker
     from v2v_server.worker import produce
 
     at = {"video": ""}
-    decode_for, decode_cuts, simulate_clip = clips.decode_for, produce.decode_cuts, produce.simulate_clip
+    decode_for, clips_of, simulate_clip = clips.decode_for, produce.clips_of, arrays.simulate_clip
     sample_message = worker.sample_message
 
     def decoding(lease, *rest):
@@ -58,8 +59,8 @@ def _install(fault: dict) -> None:
         return call
 
     clips.decode_for = decoding
-    produce.decode_cuts = before("decode", decode_cuts)
-    produce.simulate_clip = before("simulate", simulate_clip)
+    produce.clips_of = before("decode", clips_of)
+    arrays.simulate_clip = before("simulate", simulate_clip)
     worker.sample_message = before("send", sample_message)
 
 
