@@ -347,9 +347,9 @@ def free_ports(count: int) -> list[int]:
 
 
 def shared_memory() -> set[str]:
-    """Names of the shared memory of this host; empty where it is not a folder."""
+    """Names of the shared memory of this host: files, for a folder there is somebody's place for temporary files."""
     folder = Path("/dev/shm")
-    return set(os.listdir(folder)) if folder.is_dir() else set()
+    return {item.name for item in os.scandir(folder) if item.is_file()} if folder.is_dir() else set()
 
 
 def abandoned_memory(before: set[str]) -> list[str]:
