@@ -19,7 +19,7 @@ from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
-from v2v_client.position.state import ResumeState, Stream
+from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_client.session.connection import Connection
 from v2v_client.session.liveness import Patience
 from v2v_protocol.errors import StateMismatch, UsageError
@@ -124,7 +124,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._ambient = _distributed() or (0, 1)
         self._position = Position(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
-        self._offered: Stream | None = None  # what the server said when it was only asked
+        self._offered: StreamIdentity | None = None  # what the server said when it was only asked
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return self._position.agreed().epoch
 
     @property
-    def stream(self) -> Stream | None:
+    def stream(self) -> StreamIdentity | None:
         """What the samples are made of: resolved spec, digests, sequences per epoch; None before the first Welcome."""
         return self._position.agreed().stream
 
@@ -163,7 +163,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         stream = self.stream
         if stream is None:
             raise UsageError(f"{self._address} has not been asked yet: iterate first")
-        return {field.name: getattr(stream, field.name) for field in dataclasses.fields(Stream)} | {
+        return {field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)} | {
             "address": self._address,
             "arrays": list(self._arrays),
             "batch_size": self._batch_size,

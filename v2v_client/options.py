@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from v2v_client.position.state import Stream
+from v2v_client.position.state import StreamIdentity
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, StreamSpec
@@ -39,7 +39,7 @@ class Options:
         clip = StreamSpec(recipe=spec.recipe if is_ours else _LONGEST)
         StreamSpec.from_dict({"flow_from": self._asked.get("flow_from")}, default=clip)
 
-    def spec(self, pinned: Stream | None, side: str) -> Mapping[str, Any]:
+    def spec(self, pinned: StreamIdentity | None, side: str) -> Mapping[str, Any]:
         """What to ask the server for: a pinned stream's spec, which must be what the options say.
 
         Args:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trainer.convert.faery_reader import read_prophesee
-from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize
+from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 from v2v_protocol.errors import UsageError
 
 EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -38,7 +38,7 @@ def recognises(path: Path) -> bool:
         return file.read(9) == b"#ROSBAG V"
 
 
-def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """Events and pictures of a bag.
 
     Times of EventPackets count from the stamp of the first packet, with the sensor's clock between the events.
@@ -111,7 +111,7 @@ def _read_packets(bag: Any, events: str, images: str | None, path: Path, progres
                     raise UsageError(f"{path}: packets on {events} change from {encoding} to {this_encoding}")
                 stream.write(message.array(np.dtype("u1"), count).tobytes())
         offset_ns: int | None = None
-        for item in read_prophesee(raw_file, Options(), lambda _done, _total: None):
+        for item in read_prophesee(raw_file, ConvertOptions(), lambda _done, _total: None):
             if isinstance(item, EventChunk) and len(item):
                 if offset_ns is None:
                     offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])

@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    options = items.Options(
+    options = items.ConvertOptions(
         size=None if arguments.size is None else items.SensorSize.parse(arguments.size),
         time_unit=arguments.time_unit,
         camera=arguments.camera,

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trainer.convert import bag, evaid, faery_reader, ijrr, mvsec
-from trainer.convert.items import Item, Options, Progress
+from trainer.convert.items import ConvertOptions, Item, Progress
 from trainer.convert.writer import RecordingWriter, Written
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Form:
+class RawForm:
     """A raw form.
 
     Attributes:
@@ -26,17 +26,17 @@ class Form:
 
     title: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, Options, Progress], Iterator[Item]]
+    read: Callable[[Path, ConvertOptions, Progress], Iterator[Item]]
     published_shift: int = 0
 
 
 FORMS = {
-    "ijrr": Form("IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt", ijrr.recognises, ijrr.read),
-    "evaid": Form("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
-    "mvsec": Form("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
-    "bag": Form("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
-    "aedat4": Form("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
-    "prophesee": Form("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
+    "ijrr": RawForm("IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt", ijrr.recognises, ijrr.read),
+    "evaid": RawForm("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
+    "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
+    "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
+    "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
+    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
 }
 
 
@@ -82,7 +82,7 @@ def convert(
     destination: str | Path,
     *,
     form: str | None = None,
-    options: Options | None = None,
+    options: ConvertOptions | None = None,
     overwrite: bool = False,
     progress: Progress = lambda _done, _total: None,
 ) -> Converted:
@@ -99,7 +99,7 @@ def convert(
         UsageError: the source is missing, damaged or not understood; the destination exists or lies in the source.
     """
     source, destination = Path(source), Path(destination)
-    options = options or Options()
+    options = options or ConvertOptions()
     if form is None:
         form = recognise(source)
     elif form not in FORMS:

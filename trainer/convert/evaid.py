@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from trainer.convert.archive import Archive
-from trainer.convert.items import Item, Options, Picture, Progress, SensorSize
+from trainer.convert.items import ConvertOptions, Item, Picture, Progress, SensorSize
 from trainer.convert.text_events import NS_PER_UNIT, read_text_events
 from v2v_protocol.errors import UsageError
 
@@ -24,7 +24,7 @@ def recognises(path: Path) -> bool:
         return archive.find(TIMES) is not None and bool(_members(archive, "event", (".txt",)))
 
 
-def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """The items of one recording; the event files follow each other in the order of their names.
 
     Raises:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import EventChunk, Item, Options, Picture, Progress, SensorSize
+from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 from v2v_protocol.errors import UsageError
 
 AEDAT4_MAGIC = b"#!AER-DAT4"
@@ -41,7 +41,7 @@ def recognises_prophesee(path: Path) -> bool:
     return path.suffix in (".raw", ".dat") and _head(path).startswith(b"%")
 
 
-def read_aedat4(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """Events and frames of the first camera of a file; a frame's time is the middle of its exposure.
 
     Raises:
@@ -66,7 +66,7 @@ def read_aedat4(path: Path, options: Options, progress: Progress) -> Iterator[It
             progress(done, total)
 
 
-def read_prophesee(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """Events of a file; the sensor's size is in its header or in ``options``.
 
     Words of EVT carry the lower bits of a time only; the upper bits come by themselves, many times a millisecond.

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.convert.archive import Archive
-from trainer.convert.items import Item, Options, Picture, Progress, to_ns
+from trainer.convert.items import ConvertOptions, Item, Picture, Progress, to_ns
 from trainer.convert.text_events import read_text_events
 from v2v_protocol.errors import UsageError
 
@@ -29,7 +29,7 @@ def recognises(path: Path) -> bool:
         return archive.find(EVENTS) is not None
 
 
-def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """The items of one recording.
 
     Raises:
@@ -50,7 +50,7 @@ def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
         yield from _read_archive(archive, options, progress)
 
 
-def _read_archive(archive: Archive, options: Options, progress: Progress) -> Iterator[Item]:
+def _read_archive(archive: Archive, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     events = archive.find(EVENTS)
     if events is None:
         raise UsageError(f"{archive.path} has no {EVENTS}")

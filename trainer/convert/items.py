@@ -95,7 +95,7 @@ Item = EventChunk | Picture | SensorSize | FlowField
 
 
 @dataclass(frozen=True)
-class Options:
+class ConvertOptions:
     """What a user may have to say because a raw form does not.
 
     Attributes:

@@ -25,7 +25,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from trainer.convert.items import EventChunk, FlowField, Item, Options, Picture, Progress, SensorSize, to_ns
+from trainer.convert.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
 
 READ_EVENTS = 1 << 18
@@ -43,7 +43,7 @@ def recognises(path: Path) -> bool:
         return "davis" in file
 
 
-def read(path: Path, options: Options, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
     """The items of one camera of a recording.
 
     Raises:

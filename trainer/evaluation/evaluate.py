@@ -14,7 +14,7 @@ from trainer.evaluation import layout
 from trainer.evaluation.cuts import Cut, DataSet
 from trainer.evaluation.metrics import Metric
 from trainer.evaluation.pictures import chosen_steps, draw_step
-from trainer.evaluation.readers import Recording, Window
+from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
 from trainer.evaluation.voxelise import VoxelSettings
@@ -98,7 +98,7 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
             _windows(run, recording, data_set.cuts[sequence])
 
 
-def _windows(run: Run, recording: Recording, cut: Cut | None) -> list[Window]:
+def _windows(run: Run, recording: Recording, cut: Cut | None) -> list[EventWindow]:
     if run.fps is not None:
         return recording.regular_windows(run.fps)
     return recording.windows(cut if run.use_cuts else None)
@@ -144,7 +144,9 @@ def evaluate_sequence(
 
 
 @contextlib.contextmanager
-def _video(drawing: Drawing, data_set: str, sequence: str, windows: list[Window]) -> Iterator[pictures.Video | None]:
+def _video(
+    drawing: Drawing, data_set: str, sequence: str, windows: list[EventWindow]
+) -> Iterator[pictures.Video | None]:
     if not drawing.video or drawing.folder is None:
         yield None
         return

@@ -29,7 +29,7 @@ from rich.table import Table
 
 from trainer import pictures
 from trainer.evaluation import paper
-from trainer.evaluation.readers import Recording, Window
+from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
@@ -124,8 +124,8 @@ def evaluate_flow(
 
 
 def _estimate(
-    run: FlowRun, recording: Recording, windows: Sequence[Window]
-) -> Iterator[tuple[Window, npt.NDArray[np.float32], FlowImage]]:
+    run: FlowRun, recording: Recording, windows: Sequence[EventWindow]
+) -> Iterator[tuple[EventWindow, npt.NDArray[np.float32], FlowImage]]:
     """Window, voxel grid and prediction [2, H, W], in order; memory is carried from the first to the last."""
     network, state = run.network.to(run.device).eval(), None
     # A network that looks at the window before as well sees nothing in front of the first.

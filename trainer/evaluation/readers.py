@@ -40,7 +40,7 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Window:
+class EventWindow:
     """Events ``start:stop``, from ``begin`` to ``end`` seconds; ``target`` is the picture at the end, or None."""
 
     start: int
@@ -224,7 +224,7 @@ class Recording:
             raise UsageError(f"{self.path} has neither pictures nor sensor_resolution: the sensor's size is unknown")
         return int(stated[0]), int(stated[1])
 
-    def windows(self, cut: tuple[float, float] | None = None) -> list[Window]:
+    def windows(self, cut: tuple[float, float] | None = None) -> list[EventWindow]:
         """Windows between consecutive pictures.
 
         Args:
@@ -249,11 +249,11 @@ class Recording:
         if len(images) < 2:
             raise UsageError(f"{self.path}: {len(images)} pictures in the cut {cut}; two or more make a window")
         return [
-            Window(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
+            EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
             for one, other in itertools.pairwise(images)
         ]
 
-    def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[Window]:
+    def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[EventWindow]:
         """Windows between the times of consecutive flow fields; the target is the field of the window.
 
         Args:
@@ -277,10 +277,10 @@ class Recording:
         made = []
         for one, other in itertools.pairwise(fields):
             start, stop = (bisect.bisect_left(self._times, each.time) for each in (one, other))
-            made.append(Window(start, max(start, stop), one.time, other.time, other if one_later else one))
+            made.append(EventWindow(start, max(start, stop), one.time, other.time, other if one_later else one))
         return made
 
-    def flow(self, window: Window) -> npt.NDArray[np.float32]:
+    def flow(self, window: EventWindow) -> npt.NDArray[np.float32]:
         """The field of a window of :meth:`flow_windows`, [2, H, W] (x, y) px; NaN or 0 where it is not known.
 
         Raises:
@@ -293,7 +293,7 @@ class Recording:
             raise UsageError(f"{self.path}: {window.target.key} is {list(field.shape)}, not {[2, *self.size]}")
         return field
 
-    def regular_windows(self, fps: float) -> list[Window]:
+    def regular_windows(self, fps: float) -> list[EventWindow]:
         """Windows of equal length from the first event to the last; without targets.
 
         Raises:
@@ -307,9 +307,9 @@ class Recording:
             raise UsageError(f"{self.path} lasts {last - first:.3f} s, less than one window at {fps:g} a second")
         edges = [first + step / fps for step in range(count + 1)]
         indices = [bisect.bisect_left(self._times, edge) for edge in edges]
-        return [Window(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
+        return [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
 
-    def events(self, window: Window) -> Events:
+    def events(self, window: EventWindow) -> Events:
         """The events of a window, in order of time.
 
         Raises:
@@ -340,7 +340,7 @@ class Recording:
         return np.asarray(pixels)
 
 
-def _in_order(events: Events, window: Window, path: Path) -> Events:
+def _in_order(events: Events, window: EventWindow, path: Path) -> Events:
     """Those that come a little late sorted in, as sensors and files have some; where one lies further outside of its
     window than this is long, the file has no order in which windows could be searched.
     """

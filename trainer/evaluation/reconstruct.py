@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from trainer.evaluation.readers import Image, Recording, Window
+from trainer.evaluation.readers import EventWindow, Image, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
@@ -39,7 +39,7 @@ class Step:
         camera_time: of that picture, seconds.
     """
 
-    window: Window
+    window: EventWindow
     events: int
     voxels: npt.NDArray[np.float32]
     prediction: npt.NDArray[np.float32]
@@ -49,7 +49,7 @@ class Step:
 
 def reconstruct(
     recording: Recording,
-    windows: Sequence[Window],
+    windows: Sequence[EventWindow],
     network: VoxelNetwork,
     settings: VoxelSettings,
     *,

@@ -20,7 +20,7 @@ from v2v_client import Batch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlowSettings:
+class FlowTaskSettings:
     """What is minimised.
 
     Attributes:
@@ -43,10 +43,10 @@ def flow_loss(prediction: Tensor, truth: Tensor, valid: Tensor | None, gamma: fl
     """Mean absolute difference over both components and all pixels that count.
 
     Args:
-        prediction: [B, T, 2, H, W], or [updates, B, T, 2, H, W]: see :class:`FlowSettings`.
+        prediction: [B, T, 2, H, W], or [updates, B, T, 2, H, W]: see :class:`FlowTaskSettings`.
         truth: [B, T, 2, H, W].
         valid: [B, T, 1, H, W], 1 where a pixel counts; None: all do.
-        gamma: see :class:`FlowSettings`.
+        gamma: see :class:`FlowTaskSettings`.
 
     Returns:
         A scalar, in float32 at least; 0 where nothing counts.
@@ -70,9 +70,11 @@ class Flow(Task):
     is asked for.
     """
 
-    Settings = FlowSettings
+    Settings = FlowTaskSettings
 
-    def __init__(self, settings: FlowSettings, network: VoxelNetwork, device: torch.device, *, bfloat16: bool) -> None:
+    def __init__(
+        self, settings: FlowTaskSettings, network: VoxelNetwork, device: torch.device, *, bfloat16: bool
+    ) -> None:
         self.settings = settings
         self.device = device
         self._lead_voxels = network.lead_voxels

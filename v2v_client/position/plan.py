@@ -18,7 +18,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from v2v_client.position.state import LoaderShare, ResumeState, Stream
+from v2v_client.position.state import LoaderShare, ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 
@@ -136,16 +136,18 @@ class Consumer:
     rank: int
     world_size: int
 
-    def plan(self, stream: Stream, state: ResumeState | None) -> EpochPlan:
+    def plan(self, stream: StreamIdentity, state: ResumeState | None) -> EpochPlan:
         """The batches of an epoch from ``state`` on; from its beginning without."""
         origin, position = (0, 0) if state is None else (state.origin, state.position)
         return EpochPlan(stream.sequences, self.world_size, self.rank, self.batch_size, origin, position)
 
-    def beginning(self, stream: Stream | None, epoch: int) -> ResumeState:
+    def beginning(self, stream: StreamIdentity | None, epoch: int) -> ResumeState:
         """The state before an epoch."""
         return ResumeState(stream, self.seed, epoch, 0, 0, self.world_size)
 
-    def after(self, stream: Stream, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
+    def after(
+        self, stream: StreamIdentity, epoch: int, plan: EpochPlan, batch: int, quarantine: int | None
+    ) -> ResumeState:
         """The rank's state after a batch; after the last one, that is the beginning of the next epoch."""
         if batch + 1 == plan.batches:
             return self.beginning(stream, epoch + 1)
@@ -154,7 +156,7 @@ class Consumer:
 
     def in_share(
         self,
-        stream: Stream | None,
+        stream: StreamIdentity | None,
         epoch: int,
         begun: ResumeState | None,
         *,

@@ -15,7 +15,7 @@ from torch.utils.data import get_worker_info
 
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.shared import Agreed, Shared
-from v2v_client.position.state import ResumeState, Stream
+from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 _NO_BATCH_YET = 0
@@ -48,7 +48,9 @@ class Iteration:
         """Numbers of the batches that are still to be delivered here."""
         return plan.batches_of_worker(self.worker, self.workers)[self.done :]
 
-    def after(self, consumer: Consumer, stream: Stream | None, done: int, quarantine: int | None = None) -> ResumeState:
+    def after(
+        self, consumer: Consumer, stream: StreamIdentity | None, done: int, quarantine: int | None = None
+    ) -> ResumeState:
         """The state of its loader worker, which has delivered ``done`` batches of its share."""
         return consumer.in_share(
             stream,
@@ -170,7 +172,7 @@ class Position:
         here, there = (loaded.epoch, loaded.origin, loaded.position), (epoch, state.origin, state.position)
         return loaded.share.batches if here == there else _NO_BATCH_YET
 
-    def pin(self, stream: Stream, address: str) -> None:
+    def pin(self, stream: StreamIdentity, address: str) -> None:
         """A server offered ``stream`` where none was known.
 
         Raises:

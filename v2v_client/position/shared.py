@@ -37,7 +37,7 @@ from typing import Any
 
 from torch.utils.data import get_worker_info
 
-from v2v_client.position.state import ResumeState, Stream
+from v2v_client.position.state import ResumeState, StreamIdentity
 
 _MOST_ITERATIONS = 8
 """That loader workers may still join, or finish."""
@@ -82,7 +82,7 @@ class Agreed:
 
     epoch: int
     state: ResumeState | None = None
-    stream: Stream | None = None
+    stream: StreamIdentity | None = None
     stale: bool = False
     beginnings: int = 0
     numbers: int = 0

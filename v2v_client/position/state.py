@@ -21,7 +21,7 @@ STATE_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class StreamIdentity:
     """The server's half of every sample's identity.
 
     Attributes:
@@ -37,7 +37,7 @@ class Stream:
     sequences: int
 
     @classmethod
-    def of(cls, welcome: Welcome) -> Stream:
+    def of(cls, welcome: Welcome) -> StreamIdentity:
         """
         Raises:
             ProtocolError: the spec is none, or the digest is not its own.
@@ -64,7 +64,7 @@ class Stream:
         """The spec."""
         return StreamSpec.from_dict(self.spec)
 
-    def require_same(self, other: Stream, *, ours: str, theirs: str) -> None:
+    def require_same(self, other: StreamIdentity, *, ours: str, theirs: str) -> None:
         """
         Args:
             other: the stream that is offered.
@@ -131,7 +131,7 @@ class ResumeState:
         quarantine: number of the quarantine snapshot to go on under; None for the server's newest.
     """
 
-    stream: Stream | None
+    stream: StreamIdentity | None
     seed: int
     epoch: int
     origin: int
@@ -142,7 +142,7 @@ class ResumeState:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
-        pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(Stream)}
+        pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(StreamIdentity)}
         return {
             "version": STATE_VERSION,
             **pinned,
@@ -165,7 +165,7 @@ class ResumeState:
             version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
             raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
-        known |= {field.name for field in dataclasses.fields(Stream)}
+        known |= {field.name for field in dataclasses.fields(StreamIdentity)}
         if values.keys() != known:
             raise UsageError(f"not a state of V2VStreamDataset: keys {sorted(values)}, expected {sorted(known)}")
         share, quarantine = values["loader_worker"], values["quarantine"]
@@ -181,7 +181,7 @@ class ResumeState:
         )
 
 
-def _stream(values: Mapping[str, Any]) -> Stream | None:
+def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
     if values["spec"] is None:
         return None
     if not isinstance(values["spec"], Mapping):
@@ -189,7 +189,7 @@ def _stream(values: Mapping[str, Any]) -> Stream | None:
     for name in ("spec_digest", "catalogue_digest"):
         if not isinstance(values[name], str):
             raise UsageError(f"state: {name} = {values[name]!r} is no text")
-    return Stream(
+    return StreamIdentity(
         spec=values["spec"],
         spec_digest=values["spec_digest"],
         catalogue_digest=values["catalogue_digest"],

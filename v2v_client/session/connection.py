@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 
-from v2v_client.position.state import Stream
+from v2v_client.position.state import StreamIdentity
 from v2v_client.session.conversation import Arrival, Conversation, Event, State
 from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
@@ -49,7 +49,7 @@ class Connection:
         hello: Hello,
         epoch: int,
         *,
-        pinned: Stream | None = None,
+        pinned: StreamIdentity | None = None,
         pinned_by: str = "this dataset",
         patience: Patience | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -69,7 +69,7 @@ class Connection:
         )
 
     @property
-    def stream(self) -> Stream:
+    def stream(self) -> StreamIdentity:
         """What the server offers; known once this is open."""
         return self._conversation.stream
 

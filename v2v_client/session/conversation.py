@@ -26,7 +26,7 @@ from typing import Any
 import numpy.typing as npt
 
 from v2v_client.memory.slots import Answer, Slots
-from v2v_client.position.state import Stream
+from v2v_client.position.state import StreamIdentity
 from v2v_client.session.liveness import Patience
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
@@ -132,7 +132,7 @@ class Conversation:
         strays: samples of another epoch, dropped.
     """
 
-    stream: Stream
+    stream: StreamIdentity
     layout: Layout
     form: Form
 
@@ -142,7 +142,7 @@ class Conversation:
         hello: Hello,
         epoch: int,
         *,
-        pinned: Stream | None,
+        pinned: StreamIdentity | None,
         pinned_by: str,
         patience: Patience,
         now: float,
@@ -171,7 +171,7 @@ class Conversation:
         self._owed = False  # a request was denied for credit since everything was asked again
         self._credit_denials = 0
         self._last: int | None = None  # last sample received
-        self._pinned: Stream | None = None
+        self._pinned: StreamIdentity | None = None
         self.state = State.CLOSED
         self.outbox: list[Message] = []
         self.credit = 0
@@ -179,7 +179,7 @@ class Conversation:
         if pinned is not None:
             self._pin(pinned)
 
-    def _pin(self, stream: Stream) -> None:
+    def _pin(self, stream: StreamIdentity) -> None:
         spec = stream.resolved
         self._pinned = stream
         self._hello = replace(self._hello, spec=stream.spec)
@@ -357,7 +357,7 @@ class Conversation:
         return self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS
 
     def _welcomed(self, welcome: Welcome, now: float) -> None:
-        stream = Stream.of(welcome)
+        stream = StreamIdentity.of(welcome)
         if welcome.credit < 1:
             raise ProtocolError(f"{self._address} grants a credit of {welcome.credit} samples")
         if self._pinned is None:

@@ -17,6 +17,7 @@ Only TCP on Linux is watched; an ``ipc://`` address lets in our own user only.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import resource
 import socket
@@ -192,13 +193,12 @@ class Door:
         connection.cut = True
         if _peer(file) != connection.peer:
             return  # it is closed already, and the descriptor is another's
-        link = _link(file)
-        try:
-            link.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            pass  # it has just ended
-        finally:
-            link.detach()
+        with contextlib.suppress(OSError):  # it has just ended
+            link = _link(file)
+            try:
+                link.shutdown(socket.SHUT_RDWR)
+            finally:
+                link.detach()
 
 
 def _link(file: int) -> socket.socket:
@@ -222,7 +222,10 @@ def _peer(file: int) -> object:
 
 def _counted(file: int) -> tuple[int, int] | None:
     """Bytes that ZeroMQ has read from a connection, and bytes that the other end's system has taken."""
-    link = _link(file)
+    try:
+        link = _link(file)
+    except OSError:
+        return None  # it has just ended, and its event is on its way
     try:
         info = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
         waiting = int(struct.unpack("=i", fcntl.ioctl(file, termios.FIONREAD, bytes(4)))[0])

@@ -69,6 +69,7 @@ class _Grant:
     since: float  # when it was granted, or its worker last began something
     limit_seconds: float  # from then to the answer
     begun_at: float | None = None
+    stopped_seconds: float = 0.0  # of them, in which its worker was stopped from outside
     debtor: bytes | None = None  # who asked for it and waits no more, which does not make it less work
 
 
@@ -151,14 +152,18 @@ class LeaseBook:
             return
         lease.begun_at = now
         for other in map(self._leases.__getitem__, self._held[worker]):
-            other.since = now
+            other.since, other.stopped_seconds = now, 0.0
             other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
 
     def put_off(self, worker: bytes, seconds: float) -> None:
-        """The worker was stopped from outside for so long: that is not time in which it worked."""
+        """The worker was stopped from outside for so long: that is not time in which it worked.
+
+        One that stays stopped is overdue all the same, after twice its time: somebody waits for its samples. And while
+        it is stopped they may be given to a second worker (:meth:`slow`).
+        """
         for number in self._held.get(worker, ()):
             lease = self._leases[number]
-            lease.since += seconds
+            lease.stopped_seconds = min(lease.stopped_seconds + seconds, lease.limit_seconds)
             if lease.begun_at is not None:
                 lease.begun_at += seconds
 
@@ -224,7 +229,11 @@ class LeaseBook:
 
     def overdue(self, now: float) -> set[bytes]:
         """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
-        return {lease.worker for lease in self._leases.values() if now > lease.since + lease.limit_seconds}
+        return {
+            lease.worker
+            for lease in self._leases.values()
+            if now > lease.since + lease.limit_seconds + lease.stopped_seconds
+        }
 
     def slow(self, now: float) -> list[tuple[Request, bytes]]:
         """For each session its oldest request, with its worker, if it is slow and nobody else is at it.

@@ -21,7 +21,7 @@ from v2v_server.catalogue.files import (
     regular_files,
     video_files,
 )
-from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.catalogue.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
@@ -290,7 +290,7 @@ def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[
 def _snapshot(
     root: Path,
     rows: Rows,
-    records: dict[str, Record],
+    records: dict[str, IndexRow],
     listed: Sequence[ListEntry],
     refused: dict[str, str],
     notes: list[str],
@@ -367,7 +367,7 @@ def _snapshot(
     )
 
 
-def _entry(record: Record, entry: ListEntry) -> VideoEntry:
+def _entry(record: IndexRow, entry: ListEntry) -> VideoEntry:
     return VideoEntry(
         id=record.id,
         fingerprint=record.fingerprint,

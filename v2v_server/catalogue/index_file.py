@@ -47,7 +47,7 @@ CREATE TABLE IF NOT EXISTS scene (
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class IndexRow:
     """What is known of one file.
 
     Attributes:
@@ -76,7 +76,7 @@ class Record:
     frame_index: bytes | None = None
 
 
-_COLUMNS = ", ".join(name for name in Record.__slots__ if name != "frame_index")
+_COLUMNS = ", ".join(name for name in IndexRow.__slots__ if name != "frame_index")
 
 
 class Store:
@@ -114,14 +114,14 @@ class Store:
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
-    def records(self) -> dict[str, Record]:
+    def records(self) -> dict[str, IndexRow]:
         """All records by id, without their frame indices.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
         with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video")) as rows:
-            return {row[0]: Record(*row) for row in rows}
+            return {row[0]: IndexRow(*row) for row in rows}
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
         """The encoded frame index of a file; None if the index does not know that state of it.
@@ -163,17 +163,15 @@ class Store:
         """
         self._change("INSERT OR REPLACE INTO scene (id, fingerprint, look, data) VALUES (?, ?, ?, ?)", list(scenes))
 
-    def put(self, records: Iterable[Record]) -> None:
+    def put(self, records: Iterable[IndexRow]) -> None:
         """Add or replace records, in one transaction.
 
         Raises:
             sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
         """
-        rows = [tuple(getattr(record, name) for name in Record.__slots__) for record in records]
-        self._change(
-            f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({', '.join('?' * len(Record.__slots__))})",
-            rows,
-        )
+        rows = [tuple(getattr(record, name) for name in IndexRow.__slots__) for record in records]
+        places = ", ".join("?" * len(IndexRow.__slots__))
+        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({places})", rows)
 
     def forget(self, ids: Iterable[str]) -> None:
         """Drop records, in one transaction.

@@ -21,7 +21,7 @@ from typing import Any
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.catalogue.files import answers
-from v2v_server.catalogue.index_file import Record
+from v2v_server.catalogue.index_file import IndexRow
 from v2v_server.catalogue.scene import Scene
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
@@ -169,7 +169,7 @@ class Manifest:
                 refused[id] = f"was not prepared: {self.videos[id].problem}"
         return tuple(id for id in wanted if id not in refused)
 
-    def describes(self, record: Record) -> bool:
+    def describes(self, record: IndexRow) -> bool:
         """Whether the file that was probed is the one that was prepared.
 
         A lossless one may be damaged since: it says itself what it was made of, and each of its blocks is checked when
@@ -181,7 +181,7 @@ class Manifest:
             return record.problem is None and record.frames == video.frames and is_either
         return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
 
-    def as_source(self, record: Record) -> Record:
+    def as_source(self, record: IndexRow) -> IndexRow:
         """The record of a prepared file, with what has to agree with its source even where there is no sound file:
         the sequences of all others keep their places only if the source's frames are counted."""
         video = self.videos[record.id]

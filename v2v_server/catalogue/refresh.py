@@ -13,7 +13,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.catalogue.files import Notice, answers
-from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
 
@@ -57,7 +57,7 @@ def up_to_date(
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, dict[str, Record], list[str]]:
+) -> tuple[Store, dict[str, IndexRow], list[str]]:
     """An open index that knows every id, its records, and notes for the user.
 
     The index is in memory, with a note, where the file cannot serve.
@@ -88,7 +88,7 @@ def _refreshed(
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, dict[str, Record]]:
+) -> tuple[Store, dict[str, IndexRow]]:
     store = Store(path)
     try:
         known = store.records()
@@ -107,7 +107,7 @@ def _refreshed(
         raise
 
 
-def _stale(root: Path, ids: Sequence[str], known: Mapping[str, Record], notice: Notice | None) -> list[str]:
+def _stale(root: Path, ids: Sequence[str], known: Mapping[str, IndexRow], notice: Notice | None) -> list[str]:
     """Those of the ids whose files are new or changed."""
 
     def is_unchanged(id: str) -> bool:
@@ -147,8 +147,8 @@ def _gone(root: Path, ids: Iterable[str], notice: Notice | None) -> list[str]:
     return gone
 
 
-def _batches(records: Iterator[Record], total: int, progress: Progress | None) -> Iterator[list[Record]]:
-    batch: list[Record] = []
+def _batches(records: Iterator[IndexRow], total: int, progress: Progress | None) -> Iterator[list[IndexRow]]:
+    batch: list[IndexRow] = []
     for done, record in enumerate(records, 1):
         batch.append(record)
         if progress is not None:

@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.catalogue.index_file import Record, Store
+from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
@@ -53,7 +53,7 @@ class Looking:
         self,
         store: Store,
         root: Path,
-        records: Mapping[str, Record],
+        records: Mapping[str, IndexRow],
         processes: int,
         progress: Callable[[int, int], None] | None,
     ) -> None:
@@ -78,7 +78,7 @@ class Looking:
         store.put_scenes(batch)
 
     def runs(
-        self, store: Store, records: Iterable[Record], unseen: set[str], digest: str
+        self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str
     ) -> tuple[list[tuple[tuple[int, int], ...]], str]:
         """The runs of each video, and a digest that names all that is known of them.
 
@@ -99,8 +99,8 @@ class Looking:
         return runs, sha.hexdigest()[:32]
 
     def _found(
-        self, store: Store, root: Path, missing: list[Record], processes: int
-    ) -> Generator[tuple[Record, Scene], None, None]:
+        self, store: Store, root: Path, missing: list[IndexRow], processes: int
+    ) -> Generator[tuple[IndexRow, Scene], None, None]:
         by_id = {record.id: record for record in missing}
         left = []
         for record in missing:
@@ -110,10 +110,10 @@ class Looking:
             else:
                 left.append(record)
 
-        def jobs() -> Iterator[_Job]:
+        def jobs() -> Iterator[_ToLookAt]:
             for record in left:
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _Job(record.id, index, self._window(record))
+                yield _ToLookAt(record.id, index, self._window(record))
 
         look = partial(_look_at, os.fspath(root))
         suspects = []
@@ -130,13 +130,13 @@ class Looking:
             if not isinstance(scene, Died) and scene:
                 yield by_id[job.id], Scene.from_bytes(scene)
 
-    def _told(self, record: Record) -> Scene | None:
+    def _told(self, record: IndexRow) -> Scene | None:
         """What the manifest says."""
         if self.manifest is None or not self.manifest.videos[record.id].scene or not self.manifest.describes(record):
             return None
         return Scene.from_bytes(b64decode(self.manifest.videos[record.id].scene))
 
-    def _window(self, record: Record) -> Window | None:
+    def _window(self, record: IndexRow) -> Window | None:
         try:
             top, bottom = self.rows.bounds(record.height_px)
         except UsageError:
@@ -145,13 +145,13 @@ class Looking:
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _ToLookAt:
     id: str
     index: bytes
     window: Window | None
 
 
-def _look_at(root: str, job: _Job) -> bytes:
+def _look_at(root: str, job: _ToLookAt) -> bytes:
     """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
     decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.catalogue.index_file import Record
+from v2v_server.catalogue.index_file import IndexRow
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
@@ -22,11 +22,11 @@ LARGEST_MEMORY_BYTES = 2 << 30
 """What a process may allocate to examine a file: enough for 16 pictures of the largest size, or a list of 2**24 frames.
 A file of some kB can claim a thousand million frames, for which a demuxer would make room."""
 
-Examine = Callable[[str, str], Record]
+Examine = Callable[[str, str], IndexRow]
 """(root, id) -> what is known of that file; see :func:`examine`."""
 
 
-def examine(root: str, id: str) -> Record:
+def examine(root: str, id: str) -> IndexRow:
     """What is known of one file. Never raises: what goes wrong is the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is looked at again next time.
@@ -37,17 +37,17 @@ def examine(root: str, id: str) -> Record:
         mark = fingerprint(path)
         facts = _facts(path)
         if _state(path) != before:
-            return Record(id, -1, problem="changes while it is read; the next start tries again")
+            return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
-        return Record(id, -1, problem=f"cannot be read: {error.strerror or error}")
+        return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:
-        return Record(id, -1, problem=error.reason)
+        return IndexRow(id, -1, problem=error.reason)
     except VideoError as error:
         where = "" if error.frame is None else f"frame {error.frame}: "
-        return Record(id, *before, problem=where + error.reason)
+        return IndexRow(id, *before, problem=where + error.reason)
     except Exception as error:  # noqa: BLE001 - one strange file must not end the survey of all others
-        return Record(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
-    return Record(
+        return IndexRow(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
+    return IndexRow(
         id,
         *before,
         fingerprint=f"{mark}-{facts.content}" if facts.content else mark,
@@ -93,7 +93,7 @@ def survey(
     processes: int,
     examine: Examine = examine,
     longest_seconds: float = LONGEST_SECONDS,
-) -> Generator[Record, None, None]:
+) -> Generator[IndexRow, None, None]:
     """A record for each id, in any order.
 
     A file at which a process died is examined once more when all others are done, alone: the process may have been
@@ -111,7 +111,7 @@ def survey(
     suspects: list[str] = []
     for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
         if isinstance(found, Died) and found.overdue_seconds:
-            yield Record(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
+            yield IndexRow(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
         elif isinstance(found, Died):
             suspects.append(id)
         else:
@@ -120,12 +120,12 @@ def survey(
         yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 
-def _culprit(root: Path, id: str, death: Died) -> Record:
+def _culprit(root: Path, id: str, death: Died) -> IndexRow:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
-        return Record(id, -1, problem=f"{why}; the next start tries again")
+        return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return Record(id, *_state(Path(root, id)), problem=why)
+        return IndexRow(id, *_state(Path(root, id)), problem=why)
     except OSError:
-        return Record(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again
+        return IndexRow(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again

@@ -10,7 +10,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.config import recipe_setting
-from v2v_server.offline.preview import KINDS, Look, preview
+from v2v_server.offline.preview import KINDS, Shot, preview
 
 _MOST_CAMERAS = 32
 
@@ -53,12 +53,12 @@ def _run(arguments: argparse.Namespace) -> None:
         if arguments.recipe is not None:
             raise UsageError("--compare names the recipes: leave --recipe out")
         looks = [
-            Look(Path(name).stem, recipe_setting(name, arguments.set), arguments.seed) for name in arguments.compare
+            Shot(Path(name).stem, recipe_setting(name, arguments.set), arguments.seed) for name in arguments.compare
         ]
         what = "the same clip under " + ", ".join(look.title for look in looks)
     else:
         recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
-        looks = [Look(f"seed {seed}", recipe, seed) for seed in range(arguments.seed, arguments.seed + arguments.seeds)]
+        looks = [Shot(f"seed {seed}", recipe, seed) for seed in range(arguments.seed, arguments.seed + arguments.seeds)]
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     preview(
         arguments.source,

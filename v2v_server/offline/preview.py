@@ -29,7 +29,7 @@ _GIF_EVERY = 2  # every other bin: half the size
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Shot:
     """One camera of a preview.
 
     Attributes:
@@ -46,7 +46,7 @@ class Look:
 def preview(
     source: str,
     out: Path,
-    looks: Sequence[Look],
+    looks: Sequence[Shot],
     spec: Mapping[str, Any],
     *,
     title: str,
@@ -100,7 +100,7 @@ def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int) -> 
 
 
 def _camera(
-    catalogue: Catalogue, look: Look, spec: Mapping[str, Any], with_flow: bool, say: Callable[[str], None]
+    catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, say: Callable[[str], None]
 ) -> Camera:
     stream = StreamSpec.from_dict({**spec, "recipe": look.recipe})
     fitted = _fitted(catalogue, stream)

@@ -236,11 +236,11 @@ def _outcomes(
     jobs = []
     for video in videos:
         try:
-            jobs.append(_Job(video, _window(video, catalogue.rows), standing.get(video.id)))
+            jobs.append(_ToPrepare(video, _window(video, catalogue.rows), standing.get(video.id)))
         except UsageError as error:
             yield video, _record(video, 0, 0, str(error), encoding)
 
-    def transcodings() -> Iterator[tuple[_Job, Transcoding]]:
+    def transcodings() -> Iterator[tuple[_ToPrepare, Transcoding]]:
         for job in jobs:
             id = job.video.id
             index = catalogue.frame_index(id).to_bytes()
@@ -265,7 +265,7 @@ def _outcomes(
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _ToPrepare:
     """A video to be transcoded; or, where its prepared file stands, only to be looked at."""
 
     video: VideoEntry
@@ -278,13 +278,13 @@ def _window(video: VideoEntry, rows: Rows) -> Window:
     return top, 0, bottom - top, video.width_px
 
 
-def _deadline_seconds(job: _Job) -> float:
+def _deadline_seconds(job: _ToPrepare) -> float:
     """Some fifty times as long as a core takes to transcode and verify it: for one that waits for a file for ever."""
     video = job.video
     return 600 + video.frames * (0.5 + 5e-6 * video.width_px * video.height_px)
 
 
-def _attempt(job: tuple[_Job, Transcoding]) -> Made | Scene | str:
+def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
     """What was made or seen, or why nothing was."""
     try:
         return transcode(job[1]) if job[0].standing is None else look_again(job[1])

@@ -176,7 +176,7 @@ def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: l
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class BlockRecord:
     """Where the blocks of a group lie.
 
     Attributes:
@@ -188,13 +188,13 @@ class Record:
     checks: list[int]
 
 
-def unpack_record(group: int, data: bytes) -> Record | None:
+def unpack_record(group: int, data: bytes) -> BlockRecord | None:
     """The record of a group; None if it is damaged."""
     if len(data) < 16 or _check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
         return None
     blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
     starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))
-    return Record(starts.tolist(), blocks["check"].tolist())
+    return BlockRecord(starts.tolist(), blocks["check"].tolist())
 
 
 def block_check(block: bytes | memoryview, group: int, number: int) -> int:

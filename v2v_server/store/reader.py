@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, Record, block_check, read_head, unpack_record
+from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, BlockRecord, Head, block_check, read_head, unpack_record
 from v2v_server.store.packing import UnpackingError, unpack
 from v2v_server.video.orientation import Window
 
@@ -112,7 +112,7 @@ class StoreFile:
                 part = out[:, upper - top : lower - top, here - left : there - left]
                 from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
 
-    def _record(self, group: int) -> Record:
+    def _record(self, group: int) -> BlockRecord:
         size = self.head.record_bytes
         record = unpack_record(group, self._pread(size, self._table + group * size, group))
         if record is None:
@@ -120,7 +120,7 @@ class StoreFile:
         return record
 
     def _blocks(
-        self, group: int, record: Record, before: int, columns: range, column_bytes: int
+        self, group: int, record: BlockRecord, before: int, columns: range, column_bytes: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
         """Neighbouring blocks of a row, checked and unpacked.
 

@@ -31,7 +31,7 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class FrameRange:
     """Which frames of a file are to be decoded.
 
     Attributes:
@@ -53,14 +53,14 @@ def window_of(cut: Cut) -> Window:
 class Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, task: Task, cuts: Sequence[Cut]) -> None:
-        self.task = task
-        self.index = index = task.index
+    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut]) -> None:
+        self.wanted = wanted
+        self.index = index = wanted.index
         self.codec = ""  # FFmpeg's name, once decoding has begun
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
-        self._stride = stride = task.stride
-        first, most = task.start - index.first, max(cut.count for cut in cuts)
+        self._stride = stride = wanted.stride
+        first, most = wanted.start - index.first, max(cut.count for cut in cuts)
         self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
         self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
@@ -94,7 +94,7 @@ class Stack:
 
     def _is_next(self, frame: VideoFrame, ordinal: int) -> bool:
         if not self.index.seekable:
-            return ordinal >= self.task.start and (ordinal - self.task.start) % self._stride == 0
+            return ordinal >= self.wanted.start and (ordinal - self.wanted.start) % self._stride == 0
         if frame.pts is None:
             self.refuse("the decoder delivers a frame without a time stamp")
         expected = self._expected[self.taken]
@@ -142,7 +142,7 @@ class Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.task.path, self.task.start + self.taken * self._stride, why)
+        raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
 
     def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
         """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
@@ -151,11 +151,11 @@ class Stack:
             yield self._orientation.upright(raw)
 
 
-class Stream(Stack):
+class LastFrame(Stack):
     """Keeps only the last of the asked frames, of one cut."""
 
-    def __init__(self, task: Task, cut: Cut) -> None:
-        super().__init__(task, [cut])
+    def __init__(self, wanted: FrameRange, cut: Cut) -> None:
+        super().__init__(wanted, [cut])
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         ((stored, last),) = self._parts

@@ -27,7 +27,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, Stack, Stream, Task
+from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
@@ -98,7 +98,7 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    taken, codec = _decode(Task(os.fspath(path), index, start, stride), checked)
+    taken, codec = _decode(FrameRange(os.fspath(path), index, start, stride), checked)
     return tuple(
         DecodedClip(
             grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
@@ -120,10 +120,10 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode(task: Task, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
     """The cuts, [count, h, w] uint8 each, and the codec's name."""
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(task, cuts)
+        stack = Stack(wanted, cuts)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass
@@ -156,9 +156,9 @@ def stream_decoded(
 ) -> Generator[tuple[str, npt.NDArray[np.uint8]], None, None]:
     """FFmpeg's name of the format, and the frame: :func:`stream_luma` for those who want to know both."""
     index.position(start, count)
-    cut, task, done = Cut(count, _checked(window, index)), Task(os.fspath(path), index, start, 1), 0
+    cut, wanted, done = Cut(count, _checked(window, index)), FrameRange(os.fspath(path), index, start, 1), 0
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stream = Stream(task, cut)
+        stream = LastFrame(wanted, cut)
         try:
             for _ in _fill(stream, frames_of(stream)):
                 if stream.taken > done:
@@ -179,13 +179,13 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
         _SeekFailed, VideoError: it did not work out, or there is nothing to be saved; decoding from the beginning has
             the last word.
     """
-    task, index = stack.task, stack.task.index
-    if not index.seekable or task.start == 0:
+    wanted, index = stack.wanted, stack.wanted.index
+    if not index.seekable or wanted.start == 0:
         raise _SeekFailed
-    which = int(np.searchsorted(index.keyframes, task.start, side="right")) - 1
+    which = int(np.searchsorted(index.keyframes, wanted.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
-    begin = int(index.pts[index.position(task.start, 1)])
-    with opened(task.path) as (container, stream):
+    begin = int(index.pts[index.position(wanted.start, 1)])
+    with opened(wanted.path) as (container, stream):
         codec = stack.codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
@@ -205,8 +205,8 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
 
 def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
     """Every frame of the file."""
-    task = stack.task
-    with opened(task.path) as (container, stream):
+    wanted = stack.wanted
+    with opened(wanted.path) as (container, stream):
         stack.codec = stream.codec_context.codec.canonical_name
         try:
             yield from _decoded(stream, packets(container, stream))

@@ -9,10 +9,10 @@ import pytest
 
 from v2v_client.position.plan import Consumer
 from v2v_client.position.position import Iteration, Position
-from v2v_client.position.state import ResumeState, Stream
+from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
-STREAM = Stream({}, "spec", "catalogue", 1, sequences=24)
+STREAM = StreamIdentity({}, "spec", "catalogue", 1, sequences=24)
 ALONE = Consumer(seed=3, batch_size=4, rank=0, world_size=1)
 HALF = Consumer(seed=3, batch_size=4, rank=1, world_size=2)
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, expected
-from v2v_client.position.state import Stream
+from v2v_client.position.state import StreamIdentity
 from v2v_client.session.connection import Connection
 from v2v_client.session.conversation import TRANSITIONS, Conversation, Event, State
 from v2v_client.session.liveness import ListeningClock, Patience
@@ -22,7 +22,7 @@ from v2v_protocol.wire import Frames, decode, encode, encode_sample
 
 PATIENCE = Patience(timeout_seconds=60, ping_seconds=2, rewant_seconds=10)
 WELCOME = Welcome(SPEC.to_dict(), SPEC.digest, "catalogue", 1, sequences=20, credit=3)
-STREAM = Stream.of(WELCOME)
+STREAM = StreamIdentity.of(WELCOME)
 HELLO = Hello(SPEC.to_dict(), ("voxels", "frames"), 4, 5)
 FORGOTTEN = Denied(ErrorCode.UNKNOWN_SESSION, "say Hello")
 

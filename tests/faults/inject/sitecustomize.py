@@ -37,10 +37,9 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
-    from v2v_server.worker import arrays
+    from v2v_server.worker import arrays, produce
     from v2v_server.worker import decode_cache as clips
     from v2v_server.worker import process as worker
-    from v2v_server.worker import produce
 
     at = {"video": ""}
     decode_for, clips_of, simulate_clip = clips.decode_for, produce.clips_of, arrays.simulate_clip

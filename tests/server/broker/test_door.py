@@ -187,3 +187,13 @@ def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callab
     sockets.cut(b"stranger")
     sockets.cut(b"c")
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
+
+
+def test_a_connection_that_has_just_ended_ends_no_watch() -> None:
+    """Its descriptor is closed before its event comes."""
+    ours, theirs = socket.socketpair()
+    file = ours.fileno()
+    ours.close()
+    theirs.close()
+    assert door._counted(file) is None
+    assert door._peer(file) is None

@@ -67,9 +67,22 @@ def test_time_stopped_is_not_time_worked() -> None:
     book = LeaseBook(DEADLINE)
     book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
     book.grant(numbered(1), B, 0.0)
-    book.put_off(A, 100.0)
-    assert overdue_workers(book, DEADLINE + 100.0) == [B]
-    assert overdue_workers(book, DEADLINE + 100.5) == [A, B]
+    book.put_off(A, DEADLINE / 2)
+    assert overdue_workers(book, 1.5 * DEADLINE) == [B]
+    assert overdue_workers(book, 1.5 * DEADLINE + 0.5) == [A, B]
+
+
+def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_before() -> None:
+    book = LeaseBook(DEADLINE)
+    for index in range(20):
+        number = book.grant(numbered(index), B, 0.0)
+        book.begun(number, B, 0.0)
+        book.finished(number, B, 0.1)
+    book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    for second in range(10 * int(DEADLINE)):
+        book.put_off(A, 1.0)
+        assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 2 * DEADLINE)
+        assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
 
 
 def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_it() -> None:

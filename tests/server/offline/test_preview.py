@@ -13,7 +13,7 @@ from PIL import Image as Pictures
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands import preview as command
-from v2v_server.offline.preview import Look, preview
+from v2v_server.offline.preview import Shot, preview
 
 TINY = {"voxels_per_clip": 3, "crop_height_px": 48, "crop_width_px": 64}
 
@@ -27,7 +27,7 @@ def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> 
     for kind in ("png", "mp4", "gif", "html"):
         out = tmp_path / f"preview.{kind}"
         preview(
-            str(clip), out, [Look("a", TINY, 0), Look("b", TINY, 1)], {}, title="t", cache_dir=str(tmp_path),
+            str(clip), out, [Shot("a", TINY, 0), Shot("b", TINY, 1)], {}, title="t", cache_dir=str(tmp_path),
             with_flow=kind == "png", say=lambda line: None,
         )  # fmt: skip
     with Pictures.open(tmp_path / "preview.png") as picture:
@@ -41,7 +41,7 @@ def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> 
 
 def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    looks = [Look("paper", "paper", 0)]
+    looks = [Shot("paper", "paper", 0)]
     preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
     assert "paper: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
@@ -51,7 +51,7 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
 def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
     still = write_clip(tmp_path / "still.mp4", panned_luma(1, 64, 64))
     with pytest.raises(CorpusError, match=r"still\.mp4"):
-        preview(str(still), tmp_path / "p.png", [Look("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
+        preview(str(still), tmp_path / "p.png", [Shot("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
     assert not (tmp_path / "p.png").exists()
 
 
@@ -61,7 +61,7 @@ def test_the_command_compares_recipes_on_one_clip(
     seen: list[tuple[str, int]] = []
     drawn = command.preview
 
-    def spy(source: str, out: Path, looks: list[Look], *rest: object, **named: object) -> None:
+    def spy(source: str, out: Path, looks: list[Shot], *rest: object, **named: object) -> None:
         seen.extend((look.title, look.seed) for look in looks)
         drawn(source, out, looks, *rest, **named)  # type: ignore[arg-type]
 
@@ -116,4 +116,4 @@ def test_what_is_wrong_is_one_line_and_leaves_no_file(
 
 def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="ends in"):
-        preview(str(clip), tmp_path / "p.tiff", [Look("", "paper", 0)], {}, title="t")
+        preview(str(clip), tmp_path / "p.tiff", [Shot("", "paper", 0)], {}, title="t")

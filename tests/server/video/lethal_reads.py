@@ -6,18 +6,18 @@ import os
 import signal
 from pathlib import Path
 
-from v2v_server.catalogue.index_file import Record
+from v2v_server.catalogue.index_file import IndexRow
 from v2v_server.catalogue.survey import examine
 
 
-def lethal(root: str, id: str) -> Record:
+def lethal(root: str, id: str) -> IndexRow:
     """Dies over files of that name, as over a bug of the decoder."""
     if "lethal" in id:
         os.kill(os.getpid(), signal.SIGSEGV)
     return examine(root, id)
 
 
-def killed_once(root: str, id: str) -> Record:
+def killed_once(root: str, id: str) -> IndexRow:
     """Is killed from outside over each file, the first time."""
     mark = Path(root, f"{id}.killed")
     if not mark.exists():
@@ -26,18 +26,18 @@ def killed_once(root: str, id: str) -> Record:
     return examine(root, id)
 
 
-def always_killed(root: str, id: str) -> Record:
+def always_killed(root: str, id: str) -> IndexRow:
     """Is killed from outside over every file."""
     os.kill(os.getpid(), signal.SIGKILL)
     return examine(root, id)
 
 
-def always_exits(root: str, id: str) -> Record:
+def always_exits(root: str, id: str) -> IndexRow:
     """Ends with a status over every file, as over a module that is not installed."""
     os._exit(3)
 
 
-def waiting(root: str, id: str) -> Record:
+def waiting(root: str, id: str) -> IndexRow:
     """Waits for ever over files of that name, as over storage that does not answer."""
     if "waiting" in id:
         signal.pause()

@@ -17,7 +17,7 @@ from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import scene
 from trainer.convert import cli, convert, text_events
 from trainer.convert.faery_reader import _errors_of_faery
-from trainer.convert.items import EventChunk, Options, SensorSize
+from trainer.convert.items import ConvertOptions, EventChunk, SensorSize
 from trainer.convert.text_events import read_text_events
 from v2v_protocol.errors import UsageError
 
@@ -182,15 +182,15 @@ def test_a_panic_of_the_decoder_is_told_as_damage(raised: BaseException, expecte
 
 
 def test_size_given_where_the_file_has_none(tmp_path: Path) -> None:
-    done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=Options(size=SensorSize(30, 20)))
+    done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=ConvertOptions(size=SensorSize(30, 20)))
     assert done.written.size == SensorSize(30, 20)
 
 
 def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> None:
     raw_forms.write_bag(tmp_path / "a.bag", scene())
     for options, message in (
-        (Options(events_topic="/none"), r"0 topics of events; .*/dvs/events \(dvs_msgs/msg/EventArray\)"),
-        (Options(images_topic="/none"), r"no pictures on /none; they are on /dvs/image_raw"),
+        (ConvertOptions(events_topic="/none"), r"0 topics of events; .*/dvs/events \(dvs_msgs/msg/EventArray\)"),
+        (ConvertOptions(images_topic="/none"), r"no pictures on /none; they are on /dvs/image_raw"),
     ):
         with pytest.raises(UsageError, match=message):
             convert(tmp_path / "a.bag", tmp_path / "a.h5", options=options)

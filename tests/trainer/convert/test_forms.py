@@ -14,7 +14,7 @@ from tests.trainer.convert import raw_forms
 from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import HEIGHT, PERIOD_US, WIDTH, WINDOWS, Scene, expected_voxels, scene
 from trainer.convert import convert
-from trainer.convert.items import Options, SensorSize
+from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from v2v_protocol.errors import UsageError
@@ -111,7 +111,7 @@ def test_events_alone(tmp_path: Path, case: str) -> None:
     form, name, write = WITHOUT[case]
     original = scene()
     write(tmp_path / name, original)
-    options = Options(size=SensorSize(WIDTH, HEIGHT)) if case == "text" else Options()
+    options = ConvertOptions(size=SensorSize(WIDTH, HEIGHT)) if case == "text" else ConvertOptions()
     done = convert(tmp_path / name, tmp_path / "own.h5", options=options)
     assert (done.form, done.written.images, done.written.size) == (form, 0, SensorSize(WIDTH, HEIGHT))
     check_events(tmp_path / "own.h5", original)
@@ -144,7 +144,7 @@ def test_the_published_event_index_is_kept_beside_ours(tmp_path: Path) -> None:
 
 def test_the_right_camera_of_a_stereo_recording(tmp_path: Path) -> None:
     raw_forms.write_mvsec(tmp_path / "fly_data.hdf5", scene())
-    convert(tmp_path / "fly_data.hdf5", tmp_path / "fly.h5", options=Options(camera="right"))
+    convert(tmp_path / "fly_data.hdf5", tmp_path / "fly.h5", options=ConvertOptions(camera="right"))
     with h5py.File(tmp_path / "fly.h5") as file:
         np.testing.assert_array_equal(file["events/xs"][:], scene().x + 1)
 
@@ -161,7 +161,7 @@ def test_text_units_and_header(tmp_path: Path) -> None:
     ):
         (tmp_path / "own.txt").write_text(text)
         out = tmp_path / "own.h5"
-        done = convert(tmp_path / "own.txt", out, options=Options(time_unit=unit), overwrite=True)
+        done = convert(tmp_path / "own.txt", out, options=ConvertOptions(time_unit=unit), overwrite=True)
         assert done.written.seconds == pytest.approx(seconds, abs=1e-12)
         assert done.written.size == (SensorSize(24, 18) if text.startswith("24") else SensorSize(2, 3))
         with h5py.File(out) as file:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.trainer.conftest import WEIGHTS
 from trainer.convert import Converted, convert
-from trainer.convert.items import Options, SensorSize
+from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from v2v_protocol.errors import UsageError
@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 EVENTS = WEIGHTS.parent / "events"
 
 
-def converted(name: str, folder: Path, options: Options | None = None) -> Converted:
+def converted(name: str, folder: Path, options: ConvertOptions | None = None) -> Converted:
     if not (EVENTS / name).is_file():
         pytest.skip(f"no file {EVENTS / name}: set V2V_TEST_WEIGHTS to the folder beside `events`")
     return convert(EVENTS / name, folder / "recording.h5", options=options)
@@ -46,7 +46,7 @@ def test_aedat4_of_a_davis(tmp_path: Path) -> None:
 def test_evt2(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give --size"):
         converted("faery_evt2.raw", tmp_path)
-    done = converted("faery_evt2.raw", tmp_path, Options(size=SensorSize(640, 480)))
+    done = converted("faery_evt2.raw", tmp_path, ConvertOptions(size=SensorSize(640, 480)))
     assert (done.form, done.written.events, done.written.reordered_events) == ("prophesee", 521_252, 0)
 
 
@@ -59,7 +59,7 @@ def test_bag_of_evt3_packets(tmp_path: Path) -> None:
 
 
 def test_text_of_a_davis240(tmp_path: Path) -> None:
-    done = converted("ijrr_boxes_translation_slice.txt", tmp_path, Options(size=SensorSize(240, 180)))
+    done = converted("ijrr_boxes_translation_slice.txt", tmp_path, ConvertOptions(size=SensorSize(240, 180)))
     assert (done.form, done.written.events) == ("ijrr", 162_100)
     with Recording(done.destination) as recording:
         windows = recording.regular_windows(25)

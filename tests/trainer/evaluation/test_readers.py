@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.trainer.evaluation.h5_file import random_recording, write_h5
 from trainer.evaluation import readers
-from trainer.evaluation.readers import Recording, Window
+from trainer.evaluation.readers import EventWindow, Recording
 from v2v_protocol.errors import UsageError
 
 PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
@@ -249,14 +249,14 @@ def test_events_without_an_order_are_refused(tmp_path: Path, order: list[int]) -
         Recording(disordered(tmp_path, order)) as opened,
         pytest.raises(UsageError, match=r"event \d, at .*Sort the file"),
     ):
-        opened.events(Window(0, len(T), 1.05, 1.25, None))
+        opened.events(EventWindow(0, len(T), 1.05, 1.25, None))
 
 
 def test_times_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     pictures = [(PIXELS, given) for given in stamped(1.05, 1.45)]
     path = write_h5(tmp_path / "a.h5", np.where(T == 1.2, np.nan, T), T, T, T, pictures)
     with Recording(path) as opened, pytest.raises(UsageError, match="event 2, at nan s"):
-        opened.events(Window(0, len(T), 1.0, 1.5, None))
+        opened.events(EventWindow(0, len(T), 1.0, 1.5, None))
 
 
 def damaged(path: Path, name: str) -> Path:
