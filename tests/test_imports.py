@@ -137,3 +137,14 @@ def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
+
+
+def test_no_two_classes_have_one_name() -> None:
+    """But for what the files of one seam have in common: every effect has its ``Tables``."""
+    found: dict[str, list[str]] = {}
+    for package in ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer"):
+        for path in modules(package):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef) and "effects" not in path.parts:
+                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
