@@ -202,7 +202,7 @@ def test_workers_that_always_die_end_in_one_clear_error(
         dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=10)
         with pytest.raises(ServerLost):  # of the server, or that no worker has been there for so long
             list(dataset)
-        until(lambda: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE)
+        until(lambda: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE, seconds=200)
         assert "died in a row without finishing a sample" in server.last_lines()
 
 
