@@ -21,6 +21,7 @@ from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.simulation.variants import Variant
+from v2v_server.store.cache import Cache
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.handover import Room
@@ -72,7 +73,9 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)
         monkeypatch.setattr(worker_module, "load_in_turn", lambda variant: at.did.append("load"))
         monkeypatch.setattr(worker_module, "give_way", lambda: at.did.append("give way"))
-        monkeypatch.setattr(worker_module, "note", lambda _, lease: at.did.append(f"note {lease}"))
+        monkeypatch.setattr(
+            worker_module, "note", lambda _, lease, decodes=False: decodes or at.did.append(f"note {lease}")
+        )
         monkeypatch.setattr(Clips, "take", lambda self, lease: (None, False))
         monkeypatch.setattr(Clips, "has", lambda self, lease: lease.lease == 2)
         thread = threading.Thread(target=worker.run)
@@ -121,7 +124,7 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     names: list[str] = []
 
     class Named(Worker):
-        def __init__(self, name: str, root: Path, address: str, logbook: int | None) -> None:
+        def __init__(self, name: str, root: Path, address: str, logbook: int | None, cache: Cache | None) -> None:
             names.append(name)
 
         def run(self) -> None:
