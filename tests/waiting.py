@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 
 
-def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    """Returns as soon as a condition holds; a minute is long enough for nearly anything here.
+def until(condition: Callable[[], object]) -> None:
+    """Returns as soon as a condition holds; a minute is long enough for anything here.
 
     Raises:
         TimeoutError: it does not.
     """
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + 60.0
     pause = threading.Event()
     while not condition():
         if time.monotonic() > deadline:

@@ -199,10 +199,10 @@ def test_workers_that_always_die_end_in_one_clear_error(
 ) -> None:
     with _faulty(monkeypatch, clips, "--cache-dir", str(cache), stage="decode", action="exit") as server:
         process = psutil.Process(server.pid)
-        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=10)
-        with pytest.raises(ServerLost):  # of the server, or that no worker has been there for so long
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, timeout_seconds=90)
+        with pytest.raises(ServerLost):  # patient: workers die only while somebody asks for samples
             list(dataset)
-        until(lambda: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE, seconds=200)
+        until(lambda: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE)
         assert "died in a row without finishing a sample" in server.last_lines()
 
 
