@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import resource
+import select
 import socket
 import struct
 import sys
@@ -81,25 +82,30 @@ class Door:
         self._most_queued_bytes = most_queued_bytes + _SLACK_BYTES
         self._connections: dict[int, _Connection] = {}
         self._files: dict[bytes, int] = {}
-        self._early: dict[int, bytes] = {}
         self._ended: list[bytes] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
         if sys.platform == "linux":
-            monitor = router.get_monitor_socket(_EVENTS)
-            self._thread = threading.Thread(target=self._watch, args=(monitor,), name="v2v-door", daemon=True)
+            self._monitor = router.get_monitor_socket(_EVENTS)
+            self._thread = threading.Thread(target=self._watch, args=(self._monitor,), name="v2v-door", daemon=True)
             self._thread.start()
 
     def heard(self, identity: bytes, file: int) -> None:
         """A whole message came from a consumer, over the connection of that descriptor."""
         with self._lock:
+            if self._monitor is None:
+                return
+            self._take_events()
             connection = self._connections.get(file)
-            if connection is None:
-                self._early[file] = identity  # the thread has not seen it come; or it has just ended, or is no TCP
+            if connection is None:  # it has gone already
+                if identity not in self._files:
+                    self._ended.append(identity)
                 return
             connection.heard = True
             if connection.identity != identity:
+                if connection.identity is not None:  # who had the descriptor before, and was heard late
+                    self._leave(connection.identity, file)
                 connection.identity = identity
                 self._files[identity] = file
 
@@ -113,6 +119,7 @@ class Door:
     def cut(self, identity: bytes) -> None:
         """Ends a consumer's connection."""
         with self._lock:
+            self._take_events()
             file = self._files.get(identity, -1)
             if file in self._connections:
                 self._cut(file)
@@ -126,39 +133,46 @@ class Door:
     def close(self) -> None:
         """Stops watching. To be called before the socket is closed."""
         self._closing.set()
-        if self._thread is not None:
+        if self._monitor is not None:
             self._thread.join()
+            self._monitor.close(linger=0)
+            self._monitor = None
 
     # --- in the thread ------------------------------------------------------------------------------------------------
 
     def _watch(self, monitor: zmq.Socket[bytes]) -> None:
+        # A socket is for one thread at a time, and the loop reads this one, too: only its descriptor is waited for
+        # without the lock.
+        waiting = select.poll()
+        waiting.register(int(monitor.getsockopt(zmq.FD)), select.POLLIN)
         look_at = time.monotonic()
         while not self._closing.is_set():
-            now = time.monotonic()
-            if monitor.poll(max(0, int(1000 * (look_at - now)))):
-                self._take_events(monitor, now)
-            if now >= look_at:
-                look_at = now + LOOK_SECONDS
-                with self._lock:
+            waiting.poll(max(0.0, 1000 * (look_at - time.monotonic())))
+            with self._lock:
+                self._take_events()
+                if (now := time.monotonic()) >= look_at:
+                    look_at = now + LOOK_SECONDS
                     for file in list(self._connections):
                         self._look(file, now)
-        monitor.close(linger=0)
 
-    def _take_events(self, monitor: zmq.Socket[bytes], now: float) -> None:
-        while monitor.poll(0):
-            event, file = struct.unpack("=hi", monitor.recv_multipart()[0])
-            with self._lock:
-                self._forget(file)
-                if event == zmq.EVENT_ACCEPTED:
-                    self._accept(file, now)
+    # --- under the lock -----------------------------------------------------------------------------------------------
 
-    def _accept(self, file: int, now: float) -> None:
-        peer = _peer(file)
-        if peer is None:
+    def _take_events(self) -> None:
+        """Who has come and who has gone, in order, up to now.
+
+        ZeroMQ tells of a connection before it delivers a message of it, but in another place: whoever asks about a
+        message's connection reads these first.
+        """
+        if self._monitor is None:
             return
-        self._connections[file] = _Connection(peer, now, self._early.pop(file, None))
-        if (identity := self._connections[file].identity) is not None:
-            self._files[identity] = file
+        while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            event, file = struct.unpack("=hi", self._monitor.recv_multipart()[0])
+            self._forget(file)
+            if event == zmq.EVENT_ACCEPTED:
+                self._accept(file)
+
+    def _accept(self, file: int) -> None:
+        self._connections[file] = _Connection(_peer(file), time.monotonic())
         if len(self._connections) > self._most_connections:
             # Those who have said nothing yet, the oldest first; perhaps the newcomer itself.
             silent = (each for each, known in self._connections.items() if known.identity is None and not known.cut)
@@ -166,10 +180,13 @@ class Door:
 
     def _forget(self, file: int) -> None:
         connection = self._connections.pop(file, None)
-        if connection is None or connection.identity is None or self._files.get(connection.identity) != file:
-            return  # said nothing, or is here again over another connection
-        del self._files[connection.identity]
-        self._ended.append(connection.identity)
+        if connection is not None and connection.identity is not None:
+            self._leave(connection.identity, file)
+
+    def _leave(self, identity: bytes, file: int) -> None:
+        if self._files.get(identity) == file:  # otherwise it is here again over another connection
+            del self._files[identity]
+            self._ended.append(identity)
 
     def _look(self, file: int, now: float) -> None:
         connection = self._connections[file]
@@ -191,8 +208,8 @@ class Door:
     def _cut(self, file: int) -> None:
         connection = self._connections[file]
         connection.cut = True
-        if _peer(file) != connection.peer:
-            return  # it is closed already, and the descriptor is another's
+        if connection.peer is None or _peer(file) != connection.peer:
+            return  # no TCP; or closed already, and the descriptor is another's
         with contextlib.suppress(OSError):  # it has just ended
             link = _link(file)
             try:

@@ -189,6 +189,57 @@ def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callab
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
 
 
+@pytest.fixture
+def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy host: the door's thread never gets its turn."""
+    monkeypatch.setattr(door.Door, "_watch", lambda _door, _monitor: None)
+
+
+@pytest.mark.usefixtures("unwatched")
+def test_who_is_heard_before_the_watch_looks_is_cut_off_and_its_end_is_said(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    sockets = serve()
+    other, hasty, left = (consumer(sockets, name) for name in (b"other", b"hasty", b"left"))
+    for each in (hasty, left):
+        each.send_multipart(encode(Ping()))
+        next_from(sockets, FromConsumer)
+    sockets.cut(b"hasty")
+    left.close()
+    gone: set[bytes] = set()
+
+    def both() -> bool:
+        other.send_multipart(encode(Ping()))
+        gone.update(one.identity for one in sockets.receive(0.05) if isinstance(one, ConsumerGone))
+        return gone == {b"hasty", b"left"}
+
+    until(both)
+
+
+@pytest.mark.usefixtures("unwatched")
+def test_who_has_gone_before_it_is_heard_is_said_to_be_gone(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    sockets = serve()
+    names = [b"%d" % number for number in range(20)]
+    for name in names:
+        peer = consumer(sockets, name)
+        peer.setsockopt(zmq.LINGER, -1)
+        peer.send_multipart(encode(Ping()))
+        peer.close()
+    other = consumer(sockets, b"other")
+    heard: set[bytes] = set()
+    gone: set[bytes] = set()
+
+    def all_gone() -> bool:
+        other.send_multipart(encode(Ping()))
+        for one in sockets.receive(0.05):
+            (gone if isinstance(one, ConsumerGone) else heard).add(one.identity)
+        return b"other" in heard and gone == heard - {b"other"}
+
+    until(all_gone)
+
+
 def test_a_connection_that_has_just_ended_ends_no_watch() -> None:
     """Its descriptor is closed before its event comes."""
     ours, theirs = socket.socketpair()
