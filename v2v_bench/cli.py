@@ -41,6 +41,7 @@ BENCHMARKS = {
     "learn": "accuracy.learn",
     "chaos": "chaos.chaos",
     "chaos_check": "chaos.check",
+    "siege": "chaos.siege",
     "soak": "chaos.soak",
     "fuzz": "fuzz.fuzz",
     "limits": "limits",

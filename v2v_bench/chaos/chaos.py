@@ -12,6 +12,7 @@ process of its own compares the consumers' logs with the schedule and with sampl
                     the server was killed, batches count once the new one said it was ready
     mismatched      samples that show another place than the schedule says, differ from an earlier sighting of the
                     same, or differ from what the checker makes
+    condemned       lines of the quarantine that no planted SIGSEGV explains: videos that are good
     leftovers       processes, zombies, listening ports, temporary files, shared memory; processes that did not leave
                     when asked
     rss slope       of the server's main process: least squares over one point a second, one slope, an intercept for
@@ -48,12 +49,16 @@ from v2v_bench.speed.memory import Fit, fit, rss_mib
 from v2v_client.tools.loadtest import percentile
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
+from v2v_server.broker.quarantine import quarantine_path, read_quarantine
 from v2v_server.catalogue.files import VIDEO_SUFFIXES
 
 _LOOK_SECONDS = 0.05
 _WARM_UP_SECONDS = 8.0
 _LAST_BATCH_SECONDS = 120.0
-FAILING = ("lost", "duplicated", "mismatched", "leftovers", "out_of_order", "broken_lives", "stalled", "failures")
+FAILING = (
+    *("lost", "duplicated", "mismatched", "condemned", "out_of_order"),
+    *("leftovers", "broken_lives", "stalled", "failures"),
+)
 """Keys of the record that must be 0."""
 
 
@@ -135,6 +140,12 @@ def checked(fleet: Fleet, remakes: int, seed: int) -> dict[str, Any]:
     return verdict
 
 
+def condemned(fleet: Fleet) -> int:
+    """Lines of the server's quarantine that speak of anything but the SIGSEGV of a worker, which is planted here."""
+    file = quarantine_path(fleet.videos, fleet.cache)
+    return sum("SIGSEGV" not in line.reason for line in read_quarantine(file).lines)
+
+
 def record_of(
     fleet: Fleet, run: Run, verdict: dict[str, Any], left: Sequence[str], slope: Fit | None
 ) -> tuple[dict[str, Any], dict[str, list[float]]]:
@@ -156,6 +167,7 @@ def record_of(
         "lost": verdict.pop("lost"),
         "duplicated": verdict.pop("duplicated"),
         "mismatched": verdict.pop("mismatched"),
+        "condemned": condemned(fleet),
         "leftovers": len(left),
         "recovery_p50_seconds": percentile(known, 0.5) if known else None,
         "recovery_p99_seconds": percentile(known, 0.99) if known else None,
@@ -246,7 +258,7 @@ def _run(asked: argparse.Namespace) -> int:
             videos = folder / "clips"
             webvid_like(asked.footage, videos, gop=12, frames=300, clips=len(asked.footage))
         fleet = Fleet(folder, videos, asked.workers, asked.consumers, asked.lease_deadline_seconds)
-        most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*"))
+        most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1
         return _torment_and_judge(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)
     finally:
         if asked.keep is None:

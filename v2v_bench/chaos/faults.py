@@ -9,9 +9,11 @@
     server-kill                   kill -9; it is started again on the same address
     consumer-kill                 kill -9; it goes on from the state it saved last
     consumer-pause                it is stopped for a few seconds: it must hold up nobody else
+    peers-parts, -headers, ...    eight hostile consumers for some seconds, see :mod:`v2v_bench.chaos.hostile`
+    peers-slow                    an honest one whose samples take long
 
-A SEGV is blamed on the video in work, by design, and two of them take that video out of the corpus for good; so there
-are at most as many as there are videos.
+A SEGV is blamed on the sequence in work, by design, and two of them take that video out of the corpus for good. There
+are fewer than videos, for a long clip may be a video's only sequence.
 """
 
 from __future__ import annotations
@@ -20,9 +22,11 @@ import contextlib
 import os
 import random
 import signal
+import subprocess
 from dataclasses import dataclass, field
 
 from v2v_bench.chaos.fleet import Fleet
+from v2v_bench.chaos.hostile import KINDS
 
 WEIGHTS = {
     "worker-kill": 5.0,
@@ -37,12 +41,13 @@ WEIGHTS = {
     "server-kill": 1.5,
     "consumer-kill": 5.0,
     "consumer-pause": 1.0,
+    **{f"peers-{kind}": 0.5 for kind in KINDS},
 }
 """How often each kind is chosen, relative to the others."""
-PAUSES = ("worker-pause", "further-pause", "consumer-pause")
 _SIGNALS = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "segv": signal.SIGSEGV, "hang": signal.SIGSTOP}
 _MOST_FURTHER_WORKERS = 2
 _LONGEST_TRUCE_SECONDS = 20.0
+_LONGEST_SIEGE_SECONDS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,7 @@ class Fault:
     @property
     def is_kill(self) -> bool:
         """Whether it ended the process, at once or by the watchdog."""
-        return self.kind not in PAUSES and self.kind != "further-add"
+        return self.kind.partition("-")[2] in _SIGNALS
 
 
 @dataclass(slots=True)
@@ -92,6 +97,7 @@ class Chaos:
     _last: float = field(init=False, default=0.0)
     _logged: int = field(init=False, default=0)
     _paused: list[tuple[float, int]] = field(init=False, default_factory=list)
+    _peers: list[tuple[float, subprocess.Popen[bytes]]] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
@@ -100,6 +106,8 @@ class Chaos:
         """Does what is due. To be called often."""
         self._continue([pid for until, pid in self._paused if until <= now])
         self._paused = [(until, pid) for until, pid in self._paused if until > now]
+        self._dismiss([peers for until, peers in self._peers if until <= now])
+        self._peers = [(until, peers) for until, peers in self._peers if until > now]
         if self._next is not None and now >= self._next and self._progressed(now):
             possible = [kind for kind in self.kinds if self._possible(kind)]
             if possible:
@@ -116,9 +124,10 @@ class Chaos:
         return self.fleet.logged_bytes() != self._logged or now - self._last > _LONGEST_TRUCE_SECONDS
 
     def end(self) -> None:
-        """No more faults; whoever is paused goes on."""
+        """No more faults; whoever is paused goes on, and hostile peers go."""
         self._continue([pid for _, pid in self._paused])
-        self._paused = []
+        self._dismiss([peers for _, peers in self._peers])
+        self._paused, self._peers = [], []
 
     def _possible(self, kind: str) -> bool:
         who, _, how = kind.partition("-")
@@ -129,6 +138,8 @@ class Chaos:
         if who == "server":
             # One that is not up yet may be killed as well, but a corpus on a busy host would never be served.
             return self.fleet.server.pid is not None and self.fleet.port_file.exists()
+        if who == "peers":
+            return not self._peers
         if how == "add":
             return len(self.fleet.further_workers) < _MOST_FURTHER_WORKERS
         places = self.fleet.further_workers if who == "further" else self.fleet.crowd
@@ -139,6 +150,9 @@ class Chaos:
         consumer = None
         if how == "add":
             self.fleet.add_worker()
+        elif who == "peers":
+            until = now + self._random.uniform(0.3, 1.0) * _LONGEST_SIEGE_SECONDS
+            self._peers.append((until, self.fleet.peers(how)))
         elif who == "worker":
             pids = self.fleet.server_workers()
             if not pids:
@@ -168,3 +182,9 @@ class Chaos:
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):  # somebody killed it meanwhile
                 os.kill(pid, signal.SIGCONT)
+
+    @staticmethod
+    def _dismiss(all_peers: list[subprocess.Popen[bytes]]) -> None:
+        for peers in all_peers:
+            peers.kill()
+            peers.wait()

@@ -84,6 +84,7 @@ class Fleet:
         consumers: how many.
         lease_deadline_seconds: for the server.
         server_module: what is run as the server.
+        server_flags: more of its flags.
 
     Attributes:
         failures: processes that ended unasked.
@@ -96,6 +97,7 @@ class Fleet:
     consumers: int
     lease_deadline_seconds: float
     server_module: str = "v2v_server"
+    server_flags: tuple[str, ...] = ()
     failures: list[Failure] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
@@ -167,6 +169,7 @@ class Fleet:
             # The server's own recipe only has to fit the corpus: every consumer states its own.
             *("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32"),
             *("--parent-pid", str(os.getpid())),
+            *self.server_flags,
         ]
 
     # --- living -------------------------------------------------------------------------------------------------------
@@ -219,6 +222,19 @@ class Fleet:
         place = Process(f"worker {name}", [*command, "--videos", str(self.videos), "--name", name], folder)
         self._spawn(place)
         self.further_workers.append(place)
+
+    def peers(self, kind: str) -> subprocess.Popen[bytes]:
+        """Hostile peers of that kind (:mod:`v2v_bench.chaos.hostile`); whoever asks ends them."""
+        command = [sys.executable, "-m", "v2v_bench.chaos.hostile", "--address", self._address, "--kind", kind]
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {MARK: self.token, "TMPDIR": str(self.tmp)},
+            start_new_session=True,
+            preexec_fn=last_in_line,
+        )
 
     def server_workers(self) -> list[int]:
         """Process ids of the server's own workers."""
@@ -324,6 +340,13 @@ class Fleet:
             except (psutil.AccessDenied, psutil.NoSuchProcess, psutil.ZombieProcess, OSError):
                 continue  # not ours, or gone
         return found
+
+
+def last_in_line() -> None:
+    """Gives the calling process what others leave of the processor: to be called in a new one, before its program."""
+    os.nice(19)
+    with suppress(OSError):  # else the share of its session would not be lowered, where sessions have one
+        Path("/proc/self/autogroup").write_text("19", encoding="ascii")
 
 
 def free_ports(count: int) -> list[int]:

@@ -14,8 +14,9 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_bench.chaos import chaos
 from v2v_bench.chaos.consumer import PROFILES, profile
-from v2v_bench.chaos.faults import PAUSES, WEIGHTS, Fault
+from v2v_bench.chaos.faults import WEIGHTS, Fault
 from v2v_bench.chaos.fleet import Fleet, abandoned_memory, free_ports, shared_memory
+from v2v_bench.chaos.hostile import KINDS
 
 DEMANDED = (
     "kills",
@@ -30,9 +31,11 @@ DEMANDED = (
 )
 
 
-def test_every_kind_of_fault_is_a_kill_but_pauses_and_additions() -> None:
+def test_every_kind_of_fault_is_a_kill_but_pauses_additions_and_peers() -> None:
     ended = {kind for kind in WEIGHTS if Fault(kind, 0.0).is_kill}
-    assert ended == set(WEIGHTS) - set(PAUSES) - {"further-add"}
+    assert set(WEIGHTS) - ended == {"worker-pause", "further-pause", "further-add", "consumer-pause"} | {
+        f"peers-{kind}" for kind in KINDS
+    }
 
 
 def test_a_server_is_back_when_the_next_one_is_ready() -> None:

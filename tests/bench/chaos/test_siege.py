@@ -1,0 +1,74 @@
+"""The siege: each kind of hostile peer against a server for real, for a moment; and its bars."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from v2v_bench.chaos.fleet import Fleet
+from v2v_bench.chaos.hostile import KINDS
+from v2v_bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("siege-clips")
+    for number in range(3):
+        write_clip(folder / f"{number}.mp4", panned_luma(240, 160, 210))
+    return folder
+
+
+@pytest.mark.slow
+def test_every_kind_is_survived_and_the_memory_comes_back(tmp_path: Path, corpus: Path) -> None:
+    fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0, server_flags=("--max-credit-bytes", str(CREDIT_MIB << 20)))
+    del fleet.crowd[0]
+    try:
+        fleet.start()
+        records = besiege(fleet, tuple(KINDS), turns=1, seconds=3.0)
+        assert fleet.server.pid is not None
+        assert spell(fleet, 3.0).rate > 0
+    finally:
+        fleet.kill()
+    # How fast the others are meanwhile is for the bench: here they only go on.
+    assert all(record["kept"] > 0 for record in records), records
+    assert not [text for record in records for text in missed({**record, "kept": 1.0})], records
+
+
+@pytest.mark.slow
+def test_an_attack_arrives(tmp_path: Path, corpus: Path) -> None:
+    """Idle peers hold the server's files while they are there: the siege is no siege if nobody comes."""
+    fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0)
+    del fleet.crowd[0]
+    try:
+        fleet.start()
+        assert fleet.server.pid is not None
+        server = psutil.Process(fleet.server.pid)
+        calm = server.num_fds()
+        peers = fleet.peers("idle")
+        most = calm
+        try:
+            for _ in range(100):
+                most = max(most, server.num_fds())
+                if most > calm + 50:
+                    break
+                spell(fleet, 0.1)
+        finally:
+            peers.kill()
+            peers.wait()
+        assert most > calm + 50
+    finally:
+        fleet.kill()
+
+
+def test_bars() -> None:
+    good = {"kind": "parts", "kept": 0.8, "peak_mib": 300.0 + CREDIT_MIB * (PEERS + 1), "after_mib": 20.0}
+    assert not missed(good)
+    for name, value in (("kept", 0.79), ("peak_mib", 301.0 + CREDIT_MIB * (PEERS + 1)), ("after_mib", 20.1)):
+        assert len(missed(good | {name: value})) == 1
+    assert not missed(good | {"kind": "slow", "kept": 0.3})

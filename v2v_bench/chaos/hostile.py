@@ -1,0 +1,161 @@
+"""Eight hostile consumers of one kind, as a process: until SIGTERM.
+
+    python -m v2v_bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind parts
+
+    parts      raw peers whose messages have no end: one part after the other, each with MORE behind it
+    headers    the largest and most costly header that is let in, as fast as it is taken
+    hello      says Hello ten times a second, asks for as much as it may, and never reads
+    leave      says Hello under a new name and goes, again and again: its sessions stay behind
+    idle       takes connections, half of them in the middle of the handshake, and says nothing
+    slow       no enemy: a stream that is allowed and takes long (flow on whole pictures, long clips)
+
+Whoever is cut off connects again. Nothing is checked here: what counts is what happens to others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+
+import zmq
+
+from v2v_protocol.messages import Hello, Want
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
+
+PEERS = 8
+IDLE_EACH = 100
+"""Connections of each idle peer."""
+_GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL" + bytes(16 + 1 + 31)
+_READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
+_PART = b"\x01\xff" + bytes(255)
+SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
+SLOW_RECIPE = {"preset": "paper-flow", "voxels_per_clip": 12}
+
+
+def parts(address: str, number: int) -> None:
+    """One life of a peer of this kind; the others likewise."""
+    with _raw(address) as peer:
+        while True:
+            peer.sendall(_PART * 256)
+
+
+def headers(address: str, number: int) -> None:
+    """See the module."""
+    items = LARGEST_REQUEST_BYTES - 5
+    costly = b"\xdd" + items.to_bytes(4, "big") + b"\x90" * MOST_CONTAINERS + bytes(items - MOST_CONTAINERS)
+    with _dealer(address, number) as peer:
+        for _ in range(64):  # the server cuts off whoever goes on like this
+            peer.send(costly)
+
+
+def hello(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, number) as peer:
+        for epoch in itertools.count():
+            peer.send_multipart(encode(Hello(SPEC, ("voxels", "frames"), 2000, number)))
+            peer.send_multipart(encode(Want(epoch, tuple(range(256)))))
+            time.sleep(0.1)
+
+
+def leave(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, None) as peer:
+        peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
+        peer.poll(1000)
+
+
+def idle(address: str, number: int) -> None:
+    """See the module."""
+    links = []
+    try:
+        for count in range(IDLE_EACH):
+            host, _, port = address.removeprefix("tcp://").rpartition(":")
+            links.append(socket.create_connection((host, int(port)), timeout=5.0))
+            if count % 2:
+                links[-1].sendall(_GREETING)
+        time.sleep(2.0)
+    finally:
+        for link in links:
+            link.close()
+
+
+def slow(address: str, number: int) -> None:
+    """See the module."""
+    from v2v_client.dataset import V2VStreamDataset  # PyTorch, which the others do not need
+
+    dataset = V2VStreamDataset(
+        address, 1, ("voxels", "flow"), SLOW_RECIPE, seed=number, rank=0, world_size=1, flow_method="dis-fast"
+    )
+    for _ in dataset:
+        pass
+
+
+KINDS: dict[str, Callable[[str, int], None]] = {
+    each.__name__: each for each in (parts, headers, hello, leave, idle, slow)
+}
+
+
+def attack(address: str, kind: str, told: Callable[[], bool]) -> None:
+    """Sets :data:`PEERS` peers on a server, again when cut off, until told. Threads end with the process."""
+
+    def live(number: int) -> None:
+        while not told():
+            with suppress(OSError, zmq.ZMQError):  # cut off, or the server is gone for now
+                KINDS[kind](address, number)
+            time.sleep(0.01)
+
+    if kind == "slow":
+        live(0)
+        return
+    for number in range(PEERS):
+        threading.Thread(target=live, args=(number,), daemon=True).start()
+    while not told():
+        time.sleep(0.1)
+
+
+@contextmanager
+def _raw(address: str) -> Iterator[socket.socket]:
+    """A peer that speaks ZMTP by hand, past the handshake."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=5.0) as peer:
+        peer.sendall(_GREETING + _READY)
+        yield peer
+
+
+@contextmanager
+def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
+    """A peer under a name of its own, or under a new one; it takes one message and reads none."""
+    peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
+    try:
+        name = b"hostile-%d-%d" % (os.getpid(), number) if number is not None else b"leaver-" + os.urandom(8)
+        peer.setsockopt(zmq.ROUTING_ID, name)
+        peer.setsockopt(zmq.LINGER, 0)
+        peer.setsockopt(zmq.RCVHWM, 1)
+        peer.setsockopt(zmq.SNDTIMEO, 2000)
+        peer.connect(address)
+        yield peer
+    finally:
+        peer.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m v2v_bench.chaos.hostile", description=__doc__)
+    parser.add_argument("--address", required=True)
+    parser.add_argument("--kind", required=True, choices=KINDS)
+    asked = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
+    attack(asked.address, asked.kind, lambda: False)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
