@@ -26,27 +26,37 @@ Column = tuple[str, str, str, float]
 """Key of a record, title, format, and the factor from SI units to what is shown."""
 
 
-def parser_of(doc: str | None, name: str, *, seconds: float, what: str) -> argparse.ArgumentParser:
-    """A parser with the flags that every measuring command has.
+def plain_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
+    """A parser with ``--json``.
 
     Args:
         doc: the module's docstring: its first paragraph describes the command, the rest follows the flags.
-        name: of the module in ``benchmarks``.
-        seconds: default of ``--seconds``.
-        what: is bounded by ``--seconds``.
+        name: of the benchmark.
     """
     first, _, rest = (doc or "").partition("\n\n")
     parser = argparse.ArgumentParser(
-        prog=f"python -m benchmarks.{name}",
+        prog=f"v2v-bench {name}",
         description=first,
         epilog=rest,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
+    return parser
+
+
+def parser_of(doc: str | None, name: str, *, seconds: float, what: str) -> argparse.ArgumentParser:
+    """A parser with the flags of commands that measure for some time.
+
+    Args:
+        doc, name: see :func:`plain_parser`.
+        seconds: default of ``--seconds``.
+        what: is bounded by ``--seconds``.
+    """
+    parser = plain_parser(doc, name)
     parser.add_argument("--seconds", type=float, default=seconds, metavar="S", help=f"of {what} (default {seconds:g})")
     parser.add_argument(
         "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="change a recipe field"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw them")
     return parser
 
@@ -65,11 +75,11 @@ def run(
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        if not 0 < asked.seconds < math.inf:
+        if not 0 < getattr(asked, "seconds", 1.0) < math.inf:
             raise UsageError(f"--seconds {asked.seconds:g}: give more than 0")
         return work(asked)
     except (V2VError, OSError) as error:
-        print(f"{parser.prog.rpartition('.')[2]}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{parser.prog.rpartition(' ')[2]}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
 
 

@@ -31,3 +31,10 @@ def keep_freed_memory(_loader_worker: int = 0, *, most_bytes: int = _EVER_BYTES)
         return False
     # Both: a large block is otherwise mapped by itself and unmapped when freed, or trimmed off the end of the heap.
     return bool(mallopt(_M_MMAP_THRESHOLD, min(most_bytes, 1 << 30))) and bool(mallopt(_M_TRIM_THRESHOLD, most_bytes))
+
+
+def give_back_freed_memory() -> None:
+    """Hands what this process has freed back to the kernel, wherever it lies. Takes milliseconds; only glibc can."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
@@ -39,6 +40,8 @@ _MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
 """Of the loop without any message; also from one look at deadlines and deaths to the next."""
+_GIVE_BACK_SECONDS = 12.0
+"""From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
 _LONGEST_TURN_SECONDS = 1.0
 """What goes beyond is time in which nobody was listened to."""
 
@@ -172,6 +175,7 @@ class Server:
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
+        self._give_back_at = math.inf
 
     def turn(self, longest_wait_seconds: float) -> None:
         """Takes what has come, and does what is due. Waits for a message if none is there.
@@ -190,6 +194,7 @@ class Server:
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now))
                 case ConsumerGone(identity):
                     self._dispatcher.consumer_gone(identity, now)
+                    self._give_back_at = min(self._give_back_at, now + _GIVE_BACK_SECONDS)
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
             for identity, seconds in self._supervisor.stopped(now).items():
@@ -198,6 +203,9 @@ class Server:
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
                 self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
+            if now >= self._give_back_at:
+                self._give_back_at = math.inf
+                give_back_freed_memory()
             self._show(now)
 
     def close(self) -> None:

@@ -11,6 +11,8 @@
     consumer-pause                it is stopped for a few seconds: it must hold up nobody else
     peers-parts, -headers, ...    eight hostile consumers for some seconds, see :mod:`v2v_bench.chaos.hostile`
     peers-slow                    an honest one whose samples take long
+    cache-delete                  with a cache: its folder is deleted
+    cache-flip, -cut              one byte of a piece of it is another, or its end is missing
 
 A SEGV is blamed on the sequence in work, by design, and two of them take that video out of the corpus for good. There
 are fewer than videos, for a long clip may be a video's only sequence.
@@ -21,6 +23,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import shutil
 import signal
 import subprocess
 from dataclasses import dataclass, field
@@ -42,6 +45,9 @@ WEIGHTS = {
     "consumer-kill": 5.0,
     "consumer-pause": 1.0,
     **{f"peers-{kind}": 0.5 for kind in KINDS},
+    "cache-delete": 0.5,
+    "cache-flip": 2.0,
+    "cache-cut": 2.0,
 }
 """How often each kind is chosen, relative to the others."""
 _SIGNALS = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "segv": signal.SIGSEGV, "hang": signal.SIGSTOP}
@@ -140,6 +146,8 @@ class Chaos:
             return self.fleet.server.pid is not None and self.fleet.port_file.exists()
         if who == "peers":
             return not self._peers
+        if who == "cache":
+            return bool(self.fleet.cached_pieces())
         if how == "add":
             return len(self.fleet.further_workers) < _MOST_FURTHER_WORKERS
         places = self.fleet.further_workers if who == "further" else self.fleet.crowd
@@ -153,6 +161,8 @@ class Chaos:
         elif who == "peers":
             until = now + self._random.uniform(0.3, 1.0) * _LONGEST_SIEGE_SECONDS
             self._peers.append((until, self.fleet.peers(how)))
+        elif who == "cache":
+            self._spoil(how)
         elif who == "worker":
             pids = self.fleet.server_workers()
             if not pids:
@@ -167,6 +177,23 @@ class Chaos:
             consumer = crowd.index(place) if who == "consumer" else None
             self._signal(pid, how, now)
         self.done.append(Fault(kind, now, consumer))
+
+    def _spoil(self, how: str) -> None:
+        folder, pieces = self.fleet.clip_cache, self.fleet.cached_pieces()
+        if folder is None or not pieces:
+            return  # a worker removed the last one since we looked
+        if how == "delete":
+            shutil.rmtree(folder, ignore_errors=True)
+            return
+        with contextlib.suppress(OSError), self._random.choice(pieces).open("r+b") as piece:
+            at = self._random.randrange(max(1, os.fstat(piece.fileno()).st_size))
+            if how == "cut":
+                piece.truncate(at)
+                return
+            piece.seek(at)
+            old = piece.read(1)
+            piece.seek(at)
+            piece.write(bytes([old[0] ^ (1 << self._random.randrange(8))]) if old else b"")
 
     def _signal(self, pid: int, how: str, now: float) -> None:
         if how == "pause":

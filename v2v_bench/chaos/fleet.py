@@ -85,6 +85,7 @@ class Fleet:
         lease_deadline_seconds: for the server.
         server_module: what is run as the server.
         server_flags: more of its flags.
+        clip_cache: folder of decoded clips, for the server's own workers; None: they keep none.
 
     Attributes:
         failures: processes that ended unasked.
@@ -98,6 +99,7 @@ class Fleet:
     lease_deadline_seconds: float
     server_module: str = "v2v_server"
     server_flags: tuple[str, ...] = ()
+    clip_cache: Path | None = None
     failures: list[Failure] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
@@ -170,6 +172,7 @@ class Fleet:
             *("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32"),
             *("--parent-pid", str(os.getpid())),
             *self.server_flags,
+            *(() if self.clip_cache is None else ("--cache", str(self.clip_cache), "--cache-gib", "4")),
         ]
 
     # --- living -------------------------------------------------------------------------------------------------------
@@ -235,6 +238,10 @@ class Fleet:
             start_new_session=True,
             preexec_fn=last_in_line,
         )
+
+    def cached_pieces(self) -> list[Path]:
+        """Pieces of decoded clips that are kept."""
+        return [] if self.clip_cache is None else sorted(self.clip_cache.glob("??/*"))
 
     def server_workers(self) -> list[int]:
         """Process ids of the server's own workers."""

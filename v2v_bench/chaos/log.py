@@ -93,8 +93,10 @@ Line = BatchLine | LifeLine
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], provenance: Provenance) -> str:
-    """SHA-256 of all bytes of a sample, and of its provenance."""
-    sha = hashlib.sha256(json.dumps(provenance.to_dict(), sort_keys=True).encode())
+    """SHA-256 of all bytes of a sample, and of its provenance but for where the pixels were read: file, store, cache."""
+    told = provenance.to_dict()
+    told["decoder"] = told["decoder"].partition(", from the ")[0]
+    sha = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
     for name in sorted(arrays):
         sha.update(name.encode())
         sha.update(np.ascontiguousarray(arrays[name]).data)

@@ -7,20 +7,12 @@ after that.
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import sys
 
+from v2v_protocol.allocator import give_back_freed_memory
 from v2v_server.commands.serve import main
 
-
-def _trim(number: int, frame: object) -> None:
-    # glibc's own; other C libraries keep less, and have nothing to call.
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGUSR2, _trim)
+    signal.signal(signal.SIGUSR2, lambda _number, _frame: give_back_freed_memory())
     sys.exit(main())

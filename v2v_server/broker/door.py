@@ -125,7 +125,7 @@ class Door:
                 self._cut(file)
 
     def take_ended(self) -> list[bytes]:
-        """Consumers whose connection has ended since the last call."""
+        """Consumers whose connection has ended since the last call; b"" for some who never said who they were."""
         with self._lock:
             ended, self._ended = self._ended, []
         return ended
@@ -180,8 +180,12 @@ class Door:
 
     def _forget(self, file: int) -> None:
         connection = self._connections.pop(file, None)
-        if connection is not None and connection.identity is not None:
+        if connection is None:
+            return
+        if connection.identity is not None:
             self._leave(connection.identity, file)
+        elif not self._ended:
+            self._ended.append(b"")
 
     def _leave(self, identity: bytes, file: int) -> None:
         if self._files.get(identity) == file:  # otherwise it is here again over another connection

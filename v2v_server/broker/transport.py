@@ -53,7 +53,7 @@ class FromWorker:
 
 @dataclass(frozen=True, slots=True)
 class ConsumerGone:
-    """The connection of a consumer has ended; it may come back over another one."""
+    """The connection of a consumer has ended; it may come back over another one. Empty: of some that never spoke."""
 
     identity: bytes
 

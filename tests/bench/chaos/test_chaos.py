@@ -31,10 +31,11 @@ DEMANDED = (
 )
 
 
-def test_every_kind_of_fault_is_a_kill_but_pauses_additions_and_peers() -> None:
+def test_every_kind_of_fault_is_a_kill_but_pauses_additions_peers_and_spoilt_caches() -> None:
     ended = {kind for kind in WEIGHTS if Fault(kind, 0.0).is_kill}
-    assert set(WEIGHTS) - ended == {"worker-pause", "further-pause", "further-add", "consumer-pause"} | {
-        f"peers-{kind}" for kind in KINDS
+    assert set(WEIGHTS) - ended == {
+        *("worker-pause", "further-pause", "further-add", "consumer-pause", "cache-delete", "cache-flip", "cache-cut"),
+        *(f"peers-{kind}" for kind in KINDS),
     }
 
 
