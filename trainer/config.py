@@ -142,6 +142,9 @@ class RunConfig:
         judge_samples: samples of it, if an epoch has so many.
         preview_every: steps between films of that batch; 0: none.
         preview_samples: how many of its samples they show.
+        validate: recordings (as ``v2v-eval --data``) that are scored at the ends of epochs; the best network so far is
+            kept as best.pt. Empty: none.
+        validate_every: epochs between two scorings.
     """
 
     out: str = ""
@@ -155,6 +158,8 @@ class RunConfig:
     judge_samples: int = limited(4, 1, 64)
     preview_every: int = limited(500, 0, 10**9)
     preview_samples: int = limited(2, 1, 64)
+    validate: str = ""
+    validate_every: int = limited(1, 1, 1_000_000)
 
 
 _SET_ELSEWHERE = {

@@ -9,7 +9,7 @@ from pathlib import Path
 from trainer.config import TrainConfig
 from trainer.feed import Feed, held_out_batch, stream
 from trainer.learner import Learner
-from trainer.run.checkpoint import LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint
+from trainer.run.checkpoint import BEST, LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import Meter, Reporter
@@ -58,6 +58,7 @@ def train(
         batches = islice(batches, max(0, run.steps - step))
     judges = ranks.first and (run.judge_every or run.preview_every)
     held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
+    validate = task.validator(Path(run.validate)) if run.validate and ranks.first else None
 
     meter = Meter(ranks)
     begun, saved, judged = step, None, None
@@ -105,7 +106,8 @@ def train(
             # What is said and kept of it.
             meter.add(values)
             reporter.advance(step, dataset, config)
-            keep = run.keep_epochs and position["epoch"] > epoch
+            ended = position["epoch"] > epoch
+            keep = run.keep_epochs and ended
             if held_out is not None:
                 shown = run.preview_every and step % run.preview_every == 0
                 if shown or (run.judge_every and step % run.judge_every == 0):
@@ -120,6 +122,10 @@ def train(
                 save(epoch_name(epoch))
                 if ranks.first:
                     prune_epochs(out, run.keep_epochs)
+            if validate is not None and ended and (epoch + 1) % run.validate_every == 0:
+                look()
+                if reporter.validated(step, validate(learner.trained)):
+                    save(BEST)
         # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
         if saved != step and (step > begun or stop.failure is None):
             look()

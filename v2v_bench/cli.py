@@ -30,6 +30,7 @@ BENCHMARKS = {
     "scaling": "speed.scaling",
     "gpu_feed": "speed.gpu_feed",
     "released": "speed.released",
+    "step": "step",
     "cache": "cache",
     "store": "tradeoff.store",
     "tradeoff": "tradeoff.tradeoff",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -10,14 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 
 from tests.client.fake_server import FakeServer
+from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.training import arguments, losses, trained
 from trainer.config_file import load_config
+from trainer.evaluation.cli import main as evaluate
 from trainer.models import NETWORKS, FireNet, VoxelNetwork
 from trainer.models.sequence import Guide, Settings
 from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, save_checkpoint
@@ -194,6 +198,52 @@ def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
     assert [record["step"] for record in judged] == [5, 10, 12]
     assert judged[-1]["held_out_total"] < judged[0]["held_out_total"]
     assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
+
+
+def test_the_network_that_does_best_on_recordings_is_kept(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+    """Scored at the ends of epochs, without changing the training; a resumed run knows what was best before."""
+    for seed in range(2):
+        random_recording(tmp_path / "recordings" / f"{seed}.h5", seed=seed)
+    validation = {"run__validate": str(tmp_path / "recordings"), "run__validate_every": 2}
+    run = trained(tmp_path, server.address, "run", run__steps=23, **validation)
+    assert losses(run)[:12] == losses(whole)
+
+    def scored() -> dict[int, float]:
+        return {r["step"]: r["validation_mse"] for r in read_metrics(run / METRICS) if "validation_mse" in r}
+
+    assert list(scored()) == [10, 20]
+    first_best = min(scored(), key=scored().__getitem__)
+    assert load_checkpoint(run / "best.pt").step == first_best
+    record = next(record for record in read_metrics(run / METRICS) if "validation_mse" in record)
+    assert 0 < record["validation_correlation_lacking"] < 2
+    trained(tmp_path, server.address, "run", "run/last.pt", run__steps=43, **validation)
+    assert list(scored()) == [10, 20, 30, 40]
+    assert load_checkpoint(run / "best.pt").step == min(scored(), key=scored().__getitem__)
+    said = trainer_evaluation_means(run / "best.pt", tmp_path / "recordings")
+    assert said["mse"] == pytest.approx(min(scored().values()), rel=1e-6)
+
+
+def trainer_evaluation_means(weights: Path, recordings: Path) -> dict[str, float]:
+    """What ``v2v-eval`` says of the averaged network."""
+    out = weights.with_suffix(".json")
+    assert (
+        evaluate(
+            ["--weights", str(weights), "--ema", "--data", str(recordings), "--metrics", "mse", "--json", str(out)]
+        )
+        == 0
+    )
+    scores = [record["mse"] for record in json.loads(out.read_text("utf-8")) if record.get("sequence") in ("0", "1")]
+    return {"mse": float(np.mean(scores))}
+
+
+@pytest.mark.parametrize("network", ["firenet", "evflownet"])
+def test_recordings_that_cannot_be_scored_are_said_before_the_first_step(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], network: str
+) -> None:
+    flow = {"loss__flow": "stream"} if network == "evflownet" else {}
+    missing = refused(tmp_path, server.address, capsys, run__validate="nowhere", network__name=network, **flow)
+    assert "run.validate = nowhere" in missing
+    assert not (tmp_path / "run" / "last.pt").exists()
 
 
 def test_the_configuration_of_a_run_is_beside_it(

@@ -76,8 +76,8 @@ def _parser() -> Parser:
     )  # fmt: skip
     how.add_argument(
         "--stretch", choices=get_args(Stretch), default="none",
-        help="values of each reconstruction to 0 .. 1 before it is scored: from its least to its greatest, or from its "
-        "1st to its 99th percentile (default: as they are)",
+        help="values of each reconstruction to 0 .. 1 before it is scored: from its least to its greatest, from its "
+        "1st to its 99th percentile, or by its histogram (default: as they are)",
     )  # fmt: skip
     what.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
     how.add_argument(
@@ -193,6 +193,8 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
 
 
 def _device(wanted: str | None) -> str:
+    # Figures are compared to the last digit: no shorter products on a GPU.
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     device = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         torch.zeros(1, device=device).cpu()

@@ -14,13 +14,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 import torch
+from skimage.exposure import equalize_hist
 
 from trainer.evaluation.readers import EventWindow, Image, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
 
-Stretch = Literal["none", "min-max", "robust"]
+Stretch = Literal["none", "min-max", "robust", "equalized"]
 WINDOWS_PER_CALL = 8
 """Bounds the memory of activations; the result does not depend on it."""
 
@@ -59,7 +60,8 @@ def reconstruct(
     """One step for each window, in order.
 
     Events tell nothing of absolute brightness, so some stretch the values of each picture to 0 .. 1 before they score
-    it: ``stretch`` "min-max" from its least to its greatest, "robust" from its 1st to its 99th percentile.
+    it: ``stretch`` "min-max" from its least to its greatest, "robust" from its 1st to its 99th percentile, "equalized"
+    so that each of 256 values is as frequent (histogram equalisation).
 
     Raises:
         UsageError: the network has another number of bins, events lie outside the sensor, or the output is not finite.
@@ -97,6 +99,9 @@ def reconstruct(
 
 def _stretched(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
     """[N, H, W], each stretched by itself, then clamped to 0 .. 1."""
+    if stretch == "equalized":
+        equal = [equalize_hist(picture.clip(0, 1)) for picture in pictures]  # type: ignore[no-untyped-call]
+        return np.stack(equal).astype(np.float32)
     if stretch != "none":
         ends = (0, 100) if stretch == "min-max" else (1, 99)
         low, high = np.percentile(pictures, ends, axis=(1, 2), keepdims=True)

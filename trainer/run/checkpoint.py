@@ -28,6 +28,7 @@ from v2v_protocol.errors import UsageError
 
 FORMAT = 2
 LAST = "last.pt"
+BEST = "best.pt"
 
 MAY_DIFFER = (
     *("stream.address", "stream.videos", "stream.list", "stream.workers"),

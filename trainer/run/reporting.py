@@ -149,6 +149,17 @@ class Reporter:
         self._held_out = values["total"]
         self._write({"step": step} | {f"held_out_{name}": value for name, value in values.items()})
 
+    def validated(self, step: int, scores: Mapping[str, float]) -> bool:
+        """Scores on recordings; whether the first of them is the lowest of this run so far.
+
+        Raises:
+            UsageError: they cannot be written down.
+        """
+        decisive = f"validation_{next(iter(scores))}"
+        before = [record[decisive] for record in read_metrics(self._out / METRICS) if decisive in record]
+        self._write({"step": step} | {f"validation_{name}": value for name, value in scores.items()})
+        return all(scores[decisive.removeprefix("validation_")] < value for value in before)
+
     def configuration(self, config: TrainConfig) -> None:
         """All keys of the run, as a file that ``v2v-train`` takes.
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from trainer import pictures
+from trainer.evaluation.config import folder_config
+from trainer.evaluation.evaluate import Run, evaluate_data_set
+from trainer.evaluation.metrics import make_metrics
+from trainer.evaluation.score import mean_over_sequences
+from trainer.evaluation.voxelise import VoxelSettings
 from trainer.losses.backbones import BACKBONES
 from trainer.losses.lpips import HEADS_FROM, LPIPS
 from trainer.losses.reconstruction import ReconstructionLoss
@@ -104,6 +111,29 @@ class Reconstruction(Task):
         if self._loss.temporal is not None:
             truth["flow"] = self._flow(batch, frames)
         return Work(voxels=batch.arrays["voxels"].to(self.device), truth=truth, guide=self._guide(frames, epoch))
+
+    def validator(self, recordings: Path) -> Callable[[VoxelNetwork], dict[str, float]]:
+        """See :meth:`Task.validator`: LPIPS by the network that the loss names, where its files are given; MSE and how
+        much pictures lack in correlation."""
+        if not recordings.exists():
+            raise UsageError(f"run.validate = {recordings}: no such file or folder")
+        chosen, files = self.settings, {}
+        if chosen.lpips_backbone and chosen.lpips_heads:
+            files[chosen.lpips_network] = (chosen.lpips_backbone, chosen.lpips_heads)
+        metrics = make_metrics([*(f"lpips_{net}" for net in files), "mse", "correlation"], files, str(self.device))
+        (data_set,) = folder_config(recordings).data_sets
+
+        def scores(network: VoxelNetwork) -> dict[str, float]:
+            training = network.training
+            run = Run(network, VoxelSettings(bins=network.bins), metrics, str(self.device))
+            means = mean_over_sequences(evaluate_data_set(run, recordings, data_set))
+            network.train(training)
+            if not means:
+                raise UsageError(f"run.validate = {recordings}: no recording has pictures to compare with")
+            means["correlation_lacking"] = 1 - means.pop("correlation")
+            return means
+
+        return scores
 
     def _flow(self, batch: Batch, frames: Tensor) -> Tensor:
         first = self.settings.temporal_first_step

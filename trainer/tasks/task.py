@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -129,6 +129,20 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> Image:
         """What the network saw of one sample, made of it, and should have made: [T, height, width, 3] uint8 RGB."""
+
+    def validator(self, recordings: Path) -> Callable[[VoxelNetwork], dict[str, float]]:
+        """What scores a network on recordings.
+
+        Args:
+            recordings: a file, or a folder of them, as ``v2v-eval --data`` takes.
+
+        Returns:
+            a function that gives scores by name. The first decides which network is the best; lower is better.
+
+        Raises:
+            UsageError: there are none, or this task has no such scores.
+        """
+        raise UsageError(f"run.validate = {recordings}: {type(self).__name__} has none; v2v-eval scores its networks")
 
     @torch.no_grad()
     def judge(self, network: VoxelNetwork, batch: Batch, films: int) -> tuple[dict[str, float], list[Image]]:

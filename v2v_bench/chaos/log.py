@@ -93,7 +93,7 @@ Line = BatchLine | LifeLine
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], provenance: Provenance) -> str:
-    """SHA-256 of all bytes of a sample, and of its provenance but for where the pixels were read: file, store, cache."""
+    """SHA-256 of all bytes of a sample, and of its provenance but for where its pixels were read."""
     told = provenance.to_dict()
     told["decoder"] = told["decoder"].partition(", from the ")[0]
     sha = hashlib.sha256(json.dumps(told, sort_keys=True).encode())

@@ -43,11 +43,13 @@ class Form:
         clips: the clips; equal indices give equal draws in every form.
         stills: the still scenes.
         nbytes: of the clips.
+        seconds: that the clips last.
     """
 
     clips: Catalogue
     stills: Catalogue
     nbytes: int
+    seconds: float
 
 
 @contextlib.contextmanager
@@ -83,7 +85,7 @@ def forms(
         source = opened(links, rows)
         _make_stills(source, folder / "pictures", scenes)
         stills = opened(scenes, rows)
-        made = {SOURCE: Form(source, stills, _nbytes(source))}
+        made = {SOURCE: Form(source, stills, _nbytes(source), _seconds(source))}
         for name in names:
             print(f"preparing {len(source.videos)} clips as {name}", file=sys.stderr, flush=True)
             into = folder / name.replace(" ", "-")
@@ -92,12 +94,16 @@ def forms(
                 if failed:
                     raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
             clips = opened(into / "clips")
-            made[name] = Form(clips, opened(into / "stills"), _nbytes(clips))
+            made[name] = Form(clips, opened(into / "stills"), _nbytes(clips), _seconds(source))
         yield made
 
 
 def _nbytes(catalogue: Catalogue) -> int:
     return sum(catalogue.path(video.id).stat().st_size for video in catalogue.videos)
+
+
+def _seconds(catalogue: Catalogue) -> float:
+    return sum(video.frames / video.frames_per_second for video in catalogue.videos if video.frames_per_second)
 
 
 def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> None:

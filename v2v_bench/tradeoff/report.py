@@ -38,6 +38,7 @@ _SETTINGS: tuple[Column, ...] = (
     ("cpu_seconds_per_sample", "CPU ms", "{:.1f}", 1e3),
     ("median_cpu_seconds_per_sample", "median", "{:.1f}", 1e3),
     ("bytes_ratio", "size", "{:.2f}", 1),
+    ("bytes_per_video_second", "MB/s", "{:.2f}", 1e-6),
     (ERROR_KEY, f"L1 {ERROR_THRESHOLD:g}", "{:.2f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
@@ -77,11 +78,10 @@ def error_fields(tallies: Mapping[float, Tally]) -> dict[str, Any]:
 
 
 def name_dominated(records: Sequence[dict[str, Any]]) -> None:
-    """Writes into each setting's record which one is at least as fast, as right and as diverse, and better in one."""
-    costs = {
-        record["name"]: (record["cpu_seconds_per_sample"], record[ERROR_KEY], float(record["samples_per_decode"]))
-        for record in records
-    }
+    """Writes into each setting's record which one is at least as fast, as right, as diverse and as small, and better in
+    one."""
+    keys = ("cpu_seconds_per_sample", ERROR_KEY, "samples_per_decode", "bytes_per_video_second")
+    costs = {record["name"]: tuple(float(record[key]) for key in keys) for record in records}
     found = dominators(costs)
     for record in records:
         record["dominated_by"] = found[record["name"]]
@@ -119,7 +119,7 @@ def print_tables(records: Sequence[Record]) -> None:
     print("L1: voxel error; still: events a pixel in 1000 frames of a still scene, no noise")
     print()
     show(of["setting"], _SETTINGS)
-    print("size: of the clips")
+    print("size: of the source's; MB/s: of video")
     print()
     show(of["other"], _OTHERS)
     print("CPU ms: more than what it replaces; compression: on top of a sample")
@@ -128,24 +128,26 @@ def print_tables(records: Sequence[Record]) -> None:
 
 
 def plot(records: Sequence[Record], file: Path) -> None:
-    """Speed against error: a marker for each way to decode, a colour for each number of samples per decode; hollow
-    where dominated."""
+    """Speed against error and against disk: a marker for each form of the corpus, a colour for each number of samples
+    per decode; hollow where dominated."""
     shown = [record for record in records if record["measure"] == "setting"]
     scale = {record["name"]: record[ERROR_KEY] for record in records if record["measure"] == "scale"}
     markers = dict(zip(dict.fromkeys(record["form"] for record in shown), _MARKERS, strict=False))
-    with plots.panels(file, height_inches=5.5) as (axes,):
+    speeds = [record["samples_per_core_second"] for record in shown]
+    with plots.panels(file, 2, height_inches=5.5) as (axes, disk):
         for record in shown:
             color = _COLORS[record["samples_per_decode"]]
-            axes.scatter(
-                record["samples_per_core_second"],
-                100 * record[ERROR_KEY],
-                marker=markers[record["form"]],
-                facecolors=color if record["dominated_by"] is None else "none",
-                edgecolors=color,
-                s=40,
-                zorder=3,
-                clip_on=False,
-            )
+            for into, height in ((axes, 100 * record[ERROR_KEY]), (disk, record["bytes_per_video_second"] / 1e6)):
+                into.scatter(
+                    record["samples_per_core_second"],
+                    height,
+                    marker=markers[record["form"]],
+                    facecolors=color if record["dominated_by"] is None else "none",
+                    edgecolors=color,
+                    s=40,
+                    zorder=3,
+                    clip_on=False,
+                )
         for decoding, marker in markers.items():
             axes.scatter([], [], marker=marker, color="grey", label=decoding)
         for count, color in _COLORS.items():
@@ -157,11 +159,12 @@ def plot(records: Sequence[Record], file: Path) -> None:
                     name, (0, 100 * error), xycoords=("axes fraction", "data"), xytext=(4, 3),
                     textcoords="offset points", fontsize=8, color="grey",
                 )  # fmt: skip
-        axes.set_ylim(bottom=0)
-        speeds = [record["samples_per_core_second"] for record in shown]
-        plots.whole_number_axis(axes, _ticks(min(speeds), max(speeds)), "samples a second of processor time")
         axes.set_ylabel(f"voxel error at c = {ERROR_THRESHOLD:g}, per cent")
-        axes.grid(alpha=0.3)
+        disk.set_ylabel("disk, MB a second of video")
+        for each in (axes, disk):
+            each.set_ylim(bottom=0)
+            plots.whole_number_axis(each, _ticks(min(speeds), max(speeds)), "samples a second of processor time")
+            each.grid(alpha=0.3)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8, title="hollow: dominated")
 
 

@@ -1,12 +1,13 @@
-"""Speed against accuracy: what every knob that buys speed gains, and what it costs against the exact reference.
+"""Speed against accuracy, diversity and disk: what every knob that buys speed gains, and what it costs.
 
     v2v-bench tradeoff --videos CLIPS --json tradeoff.json --plot tradeoff.png
     v2v-bench tradeoff --videos CLIPS --target-rate 10 --preset-out fast.yaml
 
 Speed is samples per second of processor time of a server worker's own work (decoding, view, simulation): the fastest of
 several rounds in which all settings take turns. Errors are those of ``v2v_bench/tradeoff/errors.py``, against the same
-camera with the same noise on exactly decoded frames. A setting is dominated when another one is at least as fast, as
-right and as diverse (samples per decode), and better in one of them.
+camera with the same noise on exactly decoded frames. Disk is bytes a second of video, of the rows that are used where
+a corpus is prepared. A setting is dominated when another one is at least as fast, as right, as diverse (samples per
+decode) and as small, and better in one of them.
 
 With --target-rate or --max-error the best setting is named, and written by --preset-out for ``v2v-serve --config``; the
 exit status is 1 where no setting fulfils the wish.
@@ -92,6 +93,7 @@ def _record(setting: Setting, speed: Speed, exact: Speed, corpus: Mapping[str, F
         "speed_ratio": exact.fastest / speed.fastest,
         "rounds": speed.rounds,
         "bytes_ratio": corpus[setting.form].nbytes / corpus[SOURCE].nbytes,
+        "bytes_per_video_second": corpus[setting.form].nbytes / corpus[setting.form].seconds,
     }
 
 

@@ -325,6 +325,8 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert exact[f"bins_changed_at_{threshold}"] == 0
     assert exact["voxel_error_at_0.2"] == 0 < prepared["voxel_error_at_0.2"]
     assert prepared["bytes_ratio"] > 0
+    per_second = {item["bytes_per_video_second"] for item in by_name.values() if item["form"] == SOURCE}
+    assert prepared["bytes_per_video_second"] / min(per_second) == pytest.approx(prepared["bytes_ratio"])
     scale = {item["name"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
     assert set(scale) == {NOISE_ROW, DRAW_ROW}
     assert min(scale.values()) > 0

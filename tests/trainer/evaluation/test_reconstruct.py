@@ -128,3 +128,14 @@ def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
         load_network(tmp_path / "a.pth", name="firenet")
     with pytest.raises(UsageError, match=r"options of firenet: .*colour"):
         load_network(tmp_path / "a.pth", name="firenet", options={"colour": 1})
+
+
+def test_equalized_pictures_have_every_grey_value_as_often() -> None:
+    """Whatever the order-preserving curve that a network's pictures went through."""
+    ramp = np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(1, 64, 64)
+    (equal,) = _stretched(ramp**1.3, "equalized")
+    counts, _ = np.histogram(equal, 8, (0, 1))
+    assert counts.min() > 0.8 * 512
+    assert counts.max() < 1.2 * 512
+    order = np.argsort(ramp[0].ravel(), kind="stable")
+    assert (np.diff(equal.ravel()[order]) >= 0).all()

@@ -1,0 +1,142 @@
+"""Time and memory of one optimiser step of every network, full width, at a small size.
+
+    v2v-bench step --voxels 10 --side 64 --batch-size 2
+
+Each network in a process of its own: forward through all voxel grids, L1 loss, backward, Adam. Batches are random and
+made before, so that nothing of the stream is timed.
+
+    s a step       median of the steps, and the fastest
+    voxel grids/s  of all samples together
+    MiB            the most that the process held beyond what it held before the network was built; of a GPU, the most
+                   that PyTorch had given out
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from trainer.config import TrainConfig
+from trainer.learner import build
+from trainer.models import NETWORKS
+from trainer.run.distributed import Ranks
+from v2v_bench.records import Column, at_least, plain_parser, run, show, write
+from v2v_client.batch import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import array_layout
+
+_MIB = 1 << 20
+_COLUMNS: tuple[Column, ...] = (
+    ("network", "", "{}", 1.0),
+    ("parameters", "parameters", "{:,}", 1.0),
+    ("seconds", "s a step", "{:.3f}", 1.0),
+    ("fastest_seconds", "fastest", "{:.3f}", 1.0),
+    ("voxel_grids_per_second", "voxel grids/s", "{:.1f}", 1.0),
+    ("memory_mib", "MiB", "{:.0f}", 1.0),
+)
+
+
+def measure(name: str, device: str, side: int, voxels: int, batch_size: int, steps: int) -> dict[str, Any]:
+    """One network, in this process; the first step, which allocates, is left out."""
+    torch.set_num_threads(1)
+    loss = {"flow": "stream"} if NETWORKS[name].task == "flow" else {"lpips_weight": 0.0, "temporal_weight": 0.0}
+    recipe = {"preset": "paper", "voxels_per_clip": voxels, "crop_height_px": side, "crop_width_px": side}
+    compute = {"device": device, "threads": 1}
+    config = TrainConfig.from_dict(
+        {"network": {"name": name}, "stream": {"recipe": recipe}, "loss": loss, "compute": compute}
+    )
+    before = _held(device)
+    learner = build(config, Ranks(0, 1, torch.device(device)))
+    asked = learner.task.asked
+    draw = np.random.default_rng(0)
+    layout = array_layout(asked.recipe(config.stream.resolved_recipe), "int8", asked.arrays)
+    arrays = {
+        array: torch.from_numpy(draw.integers(0, 3, (batch_size, *shape)).astype(dtype))
+        for array, (dtype, shape) in layout.items()
+    }
+    batch = Batch(
+        arrays=arrays, indices=tuple(range(batch_size)), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
+        cpu_seconds=0.0, decodes=batch_size,
+    )  # fmt: skip
+    seconds = []
+    for step in range(steps + 1):
+        began = time.perf_counter()
+        values = learner.step(learner.task.prepare(batch, 0), step, 0)
+        float(values["total"])  # waits for a GPU
+        seconds.append(time.perf_counter() - began)
+    median = statistics.median(seconds[1:])
+    return {
+        "network": name,
+        "device": device,
+        "parameters": sum(parameter.numel() for parameter in learner.trained.parameters()),
+        "side_px": side,
+        "voxels_per_clip": voxels,
+        "batch_size": batch_size,
+        "seconds": median,
+        "fastest_seconds": min(seconds[1:]),
+        "voxel_grids_per_second": batch_size * voxels / median,
+        "memory_mib": (_held(device) - before) / _MIB,
+    }
+
+
+def _held(device: str) -> float:
+    if device == "cuda":
+        return float(torch.cuda.max_memory_allocated())
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+
+
+def _apart(name: str, asked: argparse.Namespace) -> dict[str, Any]:
+    """In a process of its own, whose greatest memory is that of this network.
+
+    Raises:
+        UsageError: it could not be measured; the message quotes what was said.
+    """
+    numbers = {"--side": asked.side, "--voxels": asked.voxels, "--batch-size": asked.batch_size, "--steps": asked.steps}
+    command = [sys.executable, "-m", "v2v_bench.step", "--networks", name, "--device", asked.device, "--here"]
+    command += [str(part) for pair in numbers.items() for part in pair]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise UsageError(f"{name}: {done.stderr.strip()[-500:]}")
+    record: dict[str, Any] = json.loads(done.stdout)
+    return record
+
+
+def _work(asked: argparse.Namespace) -> int:
+    at_least(asked, side=16, voxels=1, batch_size=1, steps=1)
+    names = asked.networks.split(",")
+    if unknown := set(names) - set(NETWORKS):
+        raise UsageError(f"--networks {', '.join(sorted(unknown))}: choose of {', '.join(NETWORKS)}")
+    if asked.here:
+        print(json.dumps(measure(names[0], asked.device, asked.side, asked.voxels, asked.batch_size, asked.steps)))
+        return 0
+    records = [_apart(name, asked) for name in names]
+    show(records, _COLUMNS)
+    write(records, asked.json)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = plain_parser(__doc__, "step")
+    parser.add_argument("--networks", default=",".join(NETWORKS), metavar="A,B", help="default: all")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="default cpu, one thread")
+    parser.add_argument("--side", type=int, default=64, help="pixels of a crop's side (default 64)")
+    parser.add_argument("--voxels", type=int, default=10, help="voxel grids of a sample (default 10)")
+    parser.add_argument("--batch-size", type=int, default=2, help="default 2")
+    parser.add_argument("--steps", type=int, default=3, help="timed (default 3)")
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    return run(parser, _work, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
