@@ -172,12 +172,13 @@ def _metavar(setting: Setting) -> str:
     if setting.kind == "word":
         choices = ",".join(setting.words)
         return f"{{{choices}}}" if len(choices) <= _LONGEST_CHOICE else "NAME"
-    return {"whole": "N", "number": "X", "range": "X", "switch": "", "text": "TEXT"}[setting.kind]
+    return {"whole": "N", "bounds": "N[:MOST]", "number": "X", "range": "X", "switch": "", "text": "TEXT"}[setting.kind]
 
 
 def _help(setting: Setting) -> str:
     words = f": {', '.join(setting.words)}" if _metavar(setting) == "NAME" else ""
     default = ("off", "on")[setting.default] if setting.kind == "switch" else setting.default
+    default = default[0] if setting.kind == "bounds" and default[0] == default[1] else default
     default = f"{default:g}" if isinstance(default, float) else default
     unit = f" {setting.unit}" if setting.unit else ""
     shown = "" if default == "" else f" (default {default}{unit})"

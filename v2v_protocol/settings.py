@@ -29,7 +29,8 @@ class Setting:
     """What is known of one field.
 
     Attributes:
-        kind: "range" is a pair (lowest, highest) of a uniform draw; one number stands for both ends.
+        kind: "range" is a pair (lowest, highest) of a uniform draw; one number stands for both ends. "bounds" is a pair
+            of whole numbers, written LEAST:MOST; one number stands for both.
         default: of the field.
         help: one line for people, without a full stop.
         low, high: limits of a number, both allowed.
@@ -41,7 +42,7 @@ class Setting:
         is_hidden: a program's own business: no line in help or on the reference page.
     """
 
-    kind: Literal["whole", "number", "range", "switch", "word", "text"]
+    kind: Literal["whole", "bounds", "number", "range", "switch", "word", "text"]
     default: Any
     help: str
     low: float = -math.inf
@@ -59,7 +60,8 @@ class Setting:
         if self.kind == "word":
             return f"choose one of {', '.join(self.words)}"
         plain = {
-            "whole": "give a whole number", "number": "give a number", "switch": "give true or false",
+            "whole": "give a whole number", "bounds": "give a whole number, or LEAST:MOST,",
+            "number": "give a number", "switch": "give true or false",
             "range": "give one number, or a pair [lowest, highest],", "text": "give text",
         }[self.kind]  # fmt: skip
         if self.low == -math.inf:
@@ -85,7 +87,7 @@ class Setting:
         checked = self._converted(value)
         if checked is None:
             raise error(f"{name} = {shown(value)}: {self.expected}{self._hint(value)}")
-        if self.kind == "range" and checked[0] > checked[1]:
+        if self.kind in ("range", "bounds") and checked[0] > checked[1]:
             raise error(f"{name} = {shown(value)}: the lowest value comes first")
         return checked
 
@@ -102,11 +104,25 @@ class Setting:
             return value if is_whole and self._allows(value) else None  # type: ignore[arg-type]
         if self.kind == "number":
             return self._number(value)
+        if self.kind == "bounds":
+            return self._bounds(value)
         ends = tuple(value) if isinstance(value, list | tuple) else (value, value)
         low, high = map(self._number, ends) if len(ends) == 2 else (None, None)
         if low is None or high is None or (self.off and low == 0.0 < high):
             return None
         return low, high
+
+    def _bounds(self, value: object) -> tuple[int, int] | None:
+        ends: list[Any] = value.split(":") if isinstance(value, str) else [value]
+        if isinstance(value, list | tuple):
+            ends = list(value)
+        try:
+            wholes = [int(end) if isinstance(end, str) else end for end in ends]
+        except ValueError:
+            return None
+        if len(wholes) not in (1, 2) or any(isinstance(end, bool) or not isinstance(end, int) for end in wholes):
+            return None
+        return (wholes[0], wholes[-1]) if all(self._allows(end) for end in wholes) else None
 
     def _number(self, value: object) -> float | None:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
@@ -131,6 +147,11 @@ class Setting:
 def whole(default: int, low: int, high: int, help: str, **more: Any) -> Any:
     """A field for a whole number. ``more``: other attributes of :class:`Setting`, here and below."""
     return _field(Setting("whole", default, help, low, high, **more))
+
+
+def bounds(default: tuple[int, int], low: int, high: int, help: str, **more: Any) -> Any:
+    """A field for two whole numbers, least and most, or one that is both."""
+    return _field(Setting("bounds", default, help, low, high, **more))
 
 
 def number(default: float, low: float, high: float, help: str, **more: Any) -> Any:

@@ -14,7 +14,7 @@ import yaml
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.settings import check_settings, number, require_known, settings_of, switch, text, whole
+from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_server.video.rows import Rows
 
@@ -46,7 +46,24 @@ class ServeConfig:
     )
     cache_gib: float = number(100.0, 0.0, 1e6, "at most so much lies in --cache", unit="GiB", metavar="N")
     list_refused: bool = switch(False, "name every video that cannot be used at the start, not only the first five")
-    workers: int = whole(2, 0, MOST_WORKERS, "local worker processes", group="Workers")
+    workers: tuple[int, int] = bounds(
+        (2, 2), 0, MOST_WORKERS,
+        "worker processes that the server starts, and starts again when they die; with LEAST:MOST as many as keep "
+        "consumers from waiting",
+        group="Workers",
+    )  # fmt: skip
+    scale_seconds: float = number(
+        60.0, 0.1, 1e6,
+        "with LEAST:MOST workers leave when many were idle for so long; more come when consumers waited for a sixth",
+        unit="s", metavar="S",
+    )  # fmt: skip
+    engine: str = word(
+        "local", ("local", "ray"), "who places them: local is this host, ray a Ray cluster that this host is a node of"
+    )
+    ray_address: str = text("auto", "the cluster; auto: the one of this host", metavar="HOST:PORT")
+    ray_label: str = text(
+        "", "workers go only to nodes with this label: those that have the videos", metavar="KEY=VALUE"
+    )
     expect_workers: int = whole(
         0, 0, MOST_WORKERS,
         "workers that will serve in all, other hosts' too; a consumer's credit is settled for them when it connects, "
@@ -77,6 +94,33 @@ class ServeConfig:
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, self.insecure)
+        if self.engine == "ray" and not self.worker_bind:
+            raise UsageError(
+                "--engine ray: give the workers of other hosts an address of this one, --worker-bind tcp://HOST:5556"
+            )
+        if self.ray_label and not all(self.ray_label.partition("=")):
+            raise UsageError(f"--ray-label {self.ray_label!r}: write KEY=VALUE, as `ray start --labels KEY=VALUE` does")
+
+    @property
+    def least_workers(self) -> int:
+        """Of the server's own."""
+        return self.workers[0]
+
+    @property
+    def most_workers(self) -> int:
+        """Of the server's own."""
+        return self.workers[1]
+
+    @property
+    def workers_in_all(self) -> int:
+        """That may come to serve, other hosts' too, as far as is known."""
+        return max(self.most_workers, self.expect_workers)
+
+    @property
+    def ray_labels(self) -> dict[str, str]:
+        """What nodes for workers must be labelled with."""
+        key, _, value = self.ray_label.partition("=")
+        return {key: value} if key else {}
 
     @classmethod
     def load(cls, file: str | None, flags: Mapping[str, Any], settings: Sequence[str] = ()) -> ServeConfig:
@@ -173,6 +217,14 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
+    """8:32 is text, not 512 as a number of base 60 in YAML 1.1."""
+    return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_or_text)
 
 
 def _check_address(flag: str, address: str, insecure: bool) -> None:

@@ -31,8 +31,9 @@ from v2v_server.console.status import StatusLine, summary, write
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import make_cache
 from v2v_server.store.clips import check_file
-from v2v_server.supervise.local_pool import Pool
+from v2v_server.supervise.engines import make_supervisor
 from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.scaling import Scaling
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.video.rows import Rows
 
@@ -71,7 +72,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             scene=config.spec.scene != "off",
             # A host whose workers are all elsewhere has its cores to itself.
-            processes=min(config.workers or cores, cores),
+            processes=min(config.most_workers or cores, cores),
             progress=progress,
             notice=progress.notice,
         )
@@ -82,7 +83,7 @@ def serve(config: ServeConfig) -> None:
 
     Raises:
         CorpusError: the corpus gives no sequence.
-        UsageError: an address cannot be bound, or the port file not written.
+        UsageError: an address cannot be bound, the port file not written, or the engine not had.
         WorkerCrashLoop: the workers die without finishing anything.
     """
     keep_freed_memory()
@@ -107,7 +108,7 @@ def serve(config: ServeConfig) -> None:
         lease_deadline_seconds=config.lease_deadline_seconds,
         session_idle_seconds=config.session_idle_seconds,
         max_credit_bytes=config.max_credit_bytes,
-        expected_workers=max(config.workers, config.expect_workers),
+        expected_workers=config.workers_in_all,
     )
     cache_flags: list[str] = []
     if config.cache:
@@ -117,19 +118,19 @@ def serve(config: ServeConfig) -> None:
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
+        supervisor = make_supervisor(config, catalogue.root, label, cache_flags)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
-            most_connections=most_connections(_FILES_A_WORKER * max(config.workers, config.expect_workers)),
+            most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
             most_queued_bytes=config.max_credit_bytes,
         )
-        pool = Pool(catalogue.root, label, cache_flags)
-        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file)
+        server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file)
         try:
-            if question := question_workers(config.workers, usable_cores()):
+            if config.engine == "local" and (question := question_workers(config.most_workers, usable_cores())):
                 _say(question)
-            pool.start(sockets.worker_address)
-            pool.scale(config.workers)
+            supervisor.start(sockets.worker_address)
+            supervisor.scale(config.least_workers)
             while not stop.is_set() and config.parent_pid in (0, os.getppid()):
                 server.turn(_TURN_SECONDS)
         finally:
@@ -171,6 +172,8 @@ class Server:
         self._quarantine_file = quarantine_file
         self._clock = clock or Clock()
         self._next_tick = self._clock()
+        is_fixed = config.least_workers == config.most_workers
+        self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._status = StatusLine(sys.stderr, Path(config.cache) if config.cache else None, config.cache_gib)
         self._announced = False
         self._port_file: Path | None = None
@@ -206,6 +209,9 @@ class Server:
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
+            for line in self._supervisor.news():
+                self._say(line)
+            self._scale(now)
             self._show(now)
 
     def close(self) -> None:
@@ -291,9 +297,19 @@ class Server:
             )
         return True
 
+    def _scale(self, now: float) -> None:
+        """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""
+        if self._scaling is None:
+            return
+        seen = self._dispatcher
+        decision = self._scaling.look(now, seen.waiting_share, seen.idle_share, seen.workers)
+        if decision is not None:
+            self._supervisor.scale(decision.workers)
+            self._say(f"workers: {decision.workers} from now on, because {decision.reason}")
+
     def _show(self, now: float) -> None:
         """Says once that the server is ready; after that keeps the status up to date."""
-        if not self._announced and (self._dispatcher.workers or not self._config.workers):
+        if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
             address = self._transport.address
             self._say(f"ready: consumers connect to {address}, workers to {self._transport.worker_address}")

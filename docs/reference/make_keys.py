@@ -65,6 +65,8 @@ def _value(value: Any) -> str:
         return ""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
+    if isinstance(value, tuple) and value[0] == value[1] and isinstance(value[0], int):
+        return f"`{value[0]}`"
     if isinstance(value, tuple):
         return f"`[{value[0]:g}, {value[1]:g}]`"
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"

@@ -109,6 +109,9 @@ class ToySupervisor:
         self.workers.remove(identity)
         return Loss(Cause.HUNG, reason)
 
+    def news(self) -> list[str]:
+        return []
+
     def stop(self) -> None:
         self.scale(0)
 

@@ -33,13 +33,13 @@ def load(tmp_path: Path, text: str | None = None, **flags: Any) -> ServeConfig:
 def test_defaults(tmp_path: Path) -> None:
     config = load(tmp_path, videos="clips", workers=None)
     assert config == ServeConfig(videos="clips")
-    assert (config.workers, config.bind, config.insecure) == (2, DEFAULT_BIND, False)
+    assert (config.workers, config.bind, config.insecure) == ((2, 2), DEFAULT_BIND, False)
     assert config.spec == StreamSpec()
 
 
 def test_a_flag_wins_over_the_file_and_the_file_over_the_default(tmp_path: Path) -> None:
     config = load(tmp_path, "videos: a\nworkers: 5\nrows: top:0.54\nshuffle: false\n", workers=7, rows=None)
-    assert (config.videos, config.workers, config.rows, config.spec.shuffle) == ("a", 7, "top:0.54", False)
+    assert (config.videos, config.workers, config.rows, config.spec.shuffle) == ("a", (7, 7), "top:0.54", False)
     assert config.max_credit_bytes == ServeConfig(videos="a").max_credit_bytes
 
 
@@ -135,10 +135,10 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("workers: 3\nworkers: 4", "--config .*: not YAML: 'workers' is there twice in .*, line 2"),
         ("recipe: {gamma: 2, bins: 3, gamma: 1}", "'gamma' is there twice"),
         ("[a]: 1", "not YAML: .* unhashable key"),
-        ("workers: '2'", "--workers = '2': give a whole number from 0 to 4096"),
+        ("workers: two", "--workers = 'two': give a whole number, or LEAST:MOST, from 0 to 4096"),
         ("workers: true", "--workers = True: give a whole number"),
         ("workers: 2.0", "--workers = 2.0"),
-        ("workers: -1", "--workers = -1: give a whole number from 0 to 4096"),
+        ("workers: -1", "--workers = -1: give a whole number, or LEAST:MOST, from 0 to 4096"),
         ("workers: 4097", "--workers = 4097"),
         ("expect_workers: -1", "--expect-workers = -1: give a whole number from 0 to 4096"),
         ("expect-workers: 4097", "--expect-workers = 4097"),
@@ -341,3 +341,25 @@ def test_settings_that_make_no_sense(setting: str, message: str) -> None:
 def test_an_unknown_preset() -> None:
     with pytest.raises(RecipeError, match="unknown recipe preset 'papr'"):
         recipe_setting("papr", [])
+
+
+@pytest.mark.parametrize(("said", "meant"), [(3, (3, 3)), ("3", (3, 3)), ("8:64", (8, 64)), ([0, 4], (0, 4))])
+def test_workers_are_a_number_or_two(said: object, meant: tuple[int, int]) -> None:
+    config = ServeConfig.load(None, {"videos": "a", "workers": said})
+    assert (config.least_workers, config.most_workers) == meant
+
+
+@pytest.mark.parametrize("said", ["8:", "a", "1:2:3", "-1:4", "8:5000", True, [1.5, 2], []])
+def test_other_workers_are_none(said: object) -> None:
+    with pytest.raises(UsageError, match=r"--workers = .*a whole number, or LEAST:MOST, from 0 to 4096"):
+        ServeConfig.load(None, {"videos": "a", "workers": said})
+
+
+def test_the_least_comes_first() -> None:
+    with pytest.raises(UsageError, match="the lowest value comes first"):
+        ServeConfig.load(None, {"videos": "a", "workers": "8:4"})
+
+
+def test_in_a_file_two_numbers_are_no_number_of_base_sixty(tmp_path: Path) -> None:
+    (tmp_path / "serve.yaml").write_text("videos: a\nworkers: 8:32\n")
+    assert ServeConfig.load(str(tmp_path / "serve.yaml"), {}).workers == (8, 32)

@@ -71,13 +71,17 @@ class Scripted:
 
 
 def served(
-    dispatcher: Scripted, folder: Path, supervisor: ToySupervisor | None = None, transport: Queues | None = None
+    dispatcher: Scripted,
+    folder: Path,
+    supervisor: ToySupervisor | None = None,
+    transport: Queues | None = None,
+    **settings: Any,
 ) -> Server:
     """A server that has made one turn."""
     doubted: list[str] = []
     catalogue = SimpleNamespace(path=lambda video: folder / video, doubted=doubted, doubt=doubted.append)
     server = Server(
-        ServeConfig(videos="videos", workers=0),
+        ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),
         cast(Dispatcher, dispatcher),
         transport or Queues(),
@@ -187,3 +191,29 @@ def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
 def test_more_workers_than_can_be_of_use_are_questioned() -> None:
     assert "--workers 500 on 2 cores" in question_workers(500, 2)
     assert question_workers(8, 2) == ""
+
+
+def test_more_workers_come_while_consumers_wait_and_leave_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dispatcher, supervisor = Scripted(), ToySupervisor(lambda name, address: None)
+    now = [0.0]
+    monkeypatch.setattr(serve_module, "Clock", lambda: lambda: now[0])
+    dispatcher.workers, dispatcher.waiting_share, dispatcher.idle_share = 2, 1.0, 0.0  # type: ignore[attr-defined]
+    server = served(dispatcher, tmp_path, supervisor, workers="2:6", scale_seconds=6.0)
+    supervisor.scale(2)
+
+    def seconds(count: int) -> None:
+        for _ in range(10 * count):
+            now[0] += 0.11
+            server.turn(0.0)
+            dispatcher.workers = len(supervisor.workers)
+
+    seconds(8)
+    assert supervisor.wanted == 6
+    dispatcher.waiting_share, dispatcher.idle_share = 0.0, 0.9  # type: ignore[attr-defined]
+    seconds(20)
+    assert supervisor.wanted == 2
+    said = capsys.readouterr().err
+    assert "workers: 3 from now on, because 100% of consumers waited and 0% of workers were idle in 1 s" in said
+    assert "workers: 2 from now on, because at the busiest 0% of consumers waited and 90%" in said

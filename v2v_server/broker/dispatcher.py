@@ -106,6 +106,16 @@ class Dispatcher:
         """Asked samples that nobody works on yet."""
         return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
 
+    @property
+    def waiting_share(self) -> float:
+        """Consumers that asked for something nobody works on yet, of all that there are: 0 to 1."""
+        return sum(bool(session.waiting) for session in self.sessions) / max(len(self.sessions), 1)
+
+    @property
+    def idle_share(self) -> float:
+        """Workers that hold no lease, of all that there are: 0 to 1."""
+        return max(0.0, 1.0 - self._leases.holders / max(len(self._workers), 1)) if self._workers else 0.0
+
     # --- consumers ---------------------------------------------------------------------------------------------------
 
     def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Action]:

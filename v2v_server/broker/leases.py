@@ -102,6 +102,11 @@ class LeaseBook:
         requests = [self._leases[number].request for number in self._held.get(worker, ())]
         return len({request.clip for request in requests if request is not None}) + requests.count(None)
 
+    @property
+    def holders(self) -> int:
+        """Workers that hold any lease."""
+        return len(self._held)
+
     def take_changed(self) -> set[bytes]:
         """Workers that hold more or less than at the last call, or something that nobody waits for any more."""
         changed, self._changed = self._changed, set()

@@ -1,7 +1,7 @@
 """Supervision: who starts workers, starts those again that die, and says how each of them ended.
 
 The loop (:mod:`v2v_server.serve`) knows only the :class:`Supervisor`. Of this host's processes it is the
-:class:`v2v_server.supervise.local_pool.Pool`; an engine that owns many hosts implements the same few methods.
+:class:`v2v_server.supervise.local_pool.Pool`, of a cluster's :class:`v2v_server.supervise.ray_workers.RayWorkers`.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ class Supervisor(Protocol):
         Returns:
             what its loss means, not to be reported again by :meth:`watch`; None when it is none of this supervisor's.
         """
+
+    def news(self) -> list[str]:
+        """Lines for the operator since the last call: where workers are placed, say."""
 
     def stop(self) -> None:
         """Ends every worker. They have been told to stop; whoever does not is made to."""

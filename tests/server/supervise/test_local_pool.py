@@ -17,6 +17,7 @@ import pytest
 from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server.broker.blame import Cause, Loss
+from v2v_server.supervise import child as child_module
 from v2v_server.supervise import local_pool as pool_module
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Death, Supervisor
@@ -44,7 +45,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
 
     def make(workers: int, program: str) -> Pool:
         monkeypatch.setattr(
-            pool_module, "_command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
+            child_module, "command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
         )
         pools.append(Pool(Path("/corpus"), "label"))
         pools[-1].start("tcp://127.0.0.1:1")
@@ -202,7 +203,7 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
 def test_a_crash_is_told_from_a_kill(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
 ) -> None:
-    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: 5)
+    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: 5)
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
     until(lambda: is_loaded(pool.pids()[0]))
@@ -215,7 +216,7 @@ def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: kills[0])
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
     causes = []
@@ -232,7 +233,7 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(pool_module, "_out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: kills[0])
     pool = start(2, SLEEPS)
 
     def causes_of_deaths_at(now: float) -> list[Cause]:
@@ -256,7 +257,7 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
 
 def test_the_kernels_count_of_such_kills_is_read() -> None:
     said = Path("/proc/vmstat").read_text(encoding="ascii")
-    assert f"\noom_kill {pool_module._out_of_memory_kills()}\n" in said
+    assert f"\noom_kill {child_module.out_of_memory_kills()}\n" in said
 
 
 @pytest.mark.parametrize("status", [0, 1, 3])
@@ -376,7 +377,7 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
         post.start_at = 0.0
     for post in pool._posts[1:]:
         post.start_at = float("inf")
-    pool._deaths_in_a_row = pool.crash_budget - 1
+    pool._restarts._deaths_in_a_row = pool.crash_budget - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
     pool._posts[0].process, pool._posts[0].identity = dead, b"label-0.1"
@@ -450,7 +451,7 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
 
 
 def test_the_programs_of_real_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    command = pool_module._command("tcp://127.0.0.1:5556", Path("/a folder"), "w-0.1")
+    command = child_module.command("tcp://127.0.0.1:5556", Path("/a folder"), "w-0.1")
     assert command[:3] == [sys.executable, "-m", "v2v_server.commands.worker"]
     assert command[3:] == [
         *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),

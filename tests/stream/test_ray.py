@@ -1,0 +1,160 @@
+"""A Ray cluster of two logical nodes on this host places the workers: nothing changes but who restarts what."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from tests.waiting import until
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+
+pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+_STORE_BYTES = 80 << 20
+_EPOCHS = 3
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A head without processors, and two nodes with three each that have the videos."""
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    # A third of what a node is given by default until it is taken for dead.
+    monkeypatch.setenv("RAY_health_check_period_ms", "1000")
+    before = signal.getsignal(signal.SIGTERM)
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 0, "object_store_memory": _STORE_BYTES, "include_dashboard": False},
+    )
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=3, object_store_memory=_STORE_BYTES, memory=4 << 30, labels={"corpus": "clips"})
+        yield cluster
+    finally:
+        cluster.shutdown()
+        signal.signal(signal.SIGTERM, before)
+
+
+def flags_for(cluster: Any) -> list[str]:
+    return [
+        *SMALL_FLAGS, "--engine", "ray", "--ray-address", cluster.address, "--ray-label", "corpus=clips",
+        "--worker-bind", "tcp://127.0.0.1:*",
+    ]  # fmt: skip
+
+
+def workers() -> list[psutil.Process]:
+    """The worker processes below all actors, oldest first."""
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        try:
+            if "v2v_server.commands.worker" in process.cmdline():
+                found.append(process)
+        except psutil.NoSuchProcess:
+            continue
+    return sorted(found, key=lambda process: process.create_time())
+
+
+def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
+    clips: Path, cluster: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
+        reference = [digest(batch) for epoch in range(_EPOCHS) for batch in epoch_of(local.address, epoch=epoch)]
+    started = time.monotonic()
+    with LocalServer(clips, workers=2, flags=flags_for(cluster)) as server:
+        until(lambda: len(workers()) == 2)
+        first = time.monotonic() - started
+        nodes = [raylet_of(process) for process in workers()]
+        assert len(set(nodes)) == 2, "they are not spread"
+        got: list[str] = []
+        took: dict[str, float] = {}
+
+        def back(what: str, gone: list[psutil.Process]) -> None:
+            """Waits until two others than those are at work."""
+            begun = time.monotonic()
+            until(lambda: len(set(workers()) - set(gone)) == 2)
+            took[what] = time.monotonic() - begun
+
+        for epoch in range(_EPOCHS):
+            for number, batch in enumerate(
+                V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3, epoch=epoch, timeout_seconds=120)
+            ):
+                got.append(digest(batch))
+                if number != 1:
+                    continue
+                victim = workers()[0]
+                if epoch == 0:
+                    victim.kill()
+                    back("a worker killed", [victim])
+                elif epoch == 1:
+                    os.kill(victim.ppid(), signal.SIGKILL)  # its actor: the kernel ends the worker along with it
+                    back("an actor killed", [victim])
+                else:
+                    node = raylet_of(victim)
+                    lost = [process for process in workers() if raylet_of(process) == node]
+                    cluster.remove_node(
+                        next(each for each in cluster.worker_nodes if pid_of_raylet(each) == node), allow_graceful=False
+                    )
+                    back("a node killed", lost)
+                    assert {raylet_of(process) for process in workers()} != {node}
+        said = log_of(server)
+    assert got == reference
+    assert "faults 0" not in said.splitlines()[-1]
+    assert "workers have a place on 2 nodes" in said
+    assert "was lost with its actor on" in said
+    until(lambda: not workers())
+    with capsys.disabled():
+        print(f"\nray: two workers up after {first:.1f} s; " + ", ".join(f"{k}: {v:.1f} s" for k, v in took.items()))
+
+
+def log_of(server: LocalServer) -> str:
+    assert server._errors is not None
+    file = server._errors.fileno()
+    return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
+
+
+def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, cluster: Any) -> None:
+    epochs: list[list[str]] = []
+    flags = [*flags_for(cluster), "--scale-seconds", "6", "--workers", "2:6"]
+    with LocalServer(clips, flags=flags) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)
+
+        def until_there_are(count: int, pause: float) -> None:
+            deadline = time.monotonic() + 80.0
+            while len(workers()) != count and time.monotonic() < deadline:
+                epochs.append([])
+                for batch in dataset:
+                    epochs[-1].append(digest(batch))
+                    time.sleep(pause)
+            assert len(workers()) == count
+
+        until_there_are(2, 0.0)
+        until_there_are(6, 0.0)
+        until_there_are(2, 0.4)
+        said = log_of(server)
+    changes = [int(found) for found in re.findall(r"workers: (\d+) from now on, because", said)]
+    assert changes[:3] == [3, 5, 6]
+    assert changes[2:] == sorted(changes[2:], reverse=True)
+    assert " faults 0 " in said.splitlines()[-1]  # who was sent away left in order
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as fixed:
+        for epoch in {0, len(epochs) // 2, len(epochs) - 1}:
+            assert epochs[epoch] == [digest(batch) for batch in epoch_of(fixed.address, epoch=epoch)]
+    assert {len(epoch) for epoch in epochs} == {8}
+
+
+def raylet_of(process: psutil.Process) -> int:
+    return next(parent.pid for parent in process.parents() if parent.name() == "raylet")
+
+
+def pid_of_raylet(node: Any) -> int:
+    return int(node.all_processes["raylet"][0].process.pid)
