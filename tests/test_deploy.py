@@ -52,7 +52,7 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
     assert f"v2v-quarantine --videos /data/webvid --cache-dir {state}\n" in notes
     quarantine(["--videos", str(tmp_path), "--cache-dir", str(tmp_path)])
     written = re.findall(r"^#   (\w+: .*)$", notes, re.MULTILINE)
-    assert ServeConfig.load(None, yaml.safe_load("\n".join(written))).workers == 8
+    assert ServeConfig.load(None, yaml.safe_load("\n".join(written))).workers == (8, 8)
 
 
 def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawConfigParser) -> None:
@@ -64,13 +64,14 @@ def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawCon
 
 
 def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
-    (service,) = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].values()
-    assert service["init"] is True
-    assert "#   docker run --rm --init " in (DEPLOY / "Dockerfile").read_text()
+    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    assert [service["init"] for service in services.values()] == [True, True]
+    for file in ("Dockerfile", "trainer.Dockerfile"):
+        assert "#   docker run --rm --init " in (DEPLOY / file).read_text()
 
 
 def test_a_mistyped_folder_of_videos_is_not_made() -> None:
-    (service,) = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].values()
+    service = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["v2v-server"]
     (videos,) = [volume for volume in service["volumes"] if "VIDEOS" in str(volume)]
     assert (videos["type"], videos["target"], videos["read_only"]) == ("bind", "/videos", True)
     assert videos["bind"] == {"create_host_path": False}

@@ -1,0 +1,246 @@
+"""What `deploy/` has for clusters, as far as it can be checked without one: schemas, what refers to what, real parsers,
+the batch script with programs that only say how they were called."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.waiting import until
+from v2v_server.commands import serve as serve_command
+from v2v_server.commands import worker as worker_command
+from v2v_server.config import ServeConfig
+
+ROOT = Path(__file__).parents[1]
+DEPLOY = ROOT / "deploy"
+KUBERNETES = DEPLOY / "kubernetes"
+KUBERNETES_VERSION = "1.30"
+BATCH = DEPLOY / "slurm" / "train.sbatch"
+
+
+def documents(folder: Path = KUBERNETES) -> list[dict[str, Any]]:
+    """Of all files that the kustomization names."""
+    names = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
+    return [document for name in names for document in yaml.safe_load_all((folder / name).read_text())]
+
+
+def named(kind: str, name: str) -> dict[str, Any]:
+    (found,) = [each for each in documents() if (each["kind"], each["metadata"]["name"]) == (kind, name)]
+    return found
+
+
+def container(deployment: str) -> dict[str, Any]:
+    (found,) = named("Deployment", deployment)["spec"]["template"]["spec"]["containers"]
+    return found
+
+
+# --- Kubernetes -------------------------------------------------------------------------------------------------------
+
+
+def test_every_file_is_named_and_every_document_is_what_its_schema_asks() -> None:
+    validate = pytest.importorskip("kubernetes_validate")
+    assert {path.name for path in KUBERNETES.glob("*.yaml")} == {
+        "kustomization.yaml", *yaml.safe_load((KUBERNETES / "kustomization.yaml").read_text())["resources"],
+    }  # fmt: skip
+    for document in documents():
+        validate.validate(document, KUBERNETES_VERSION, strict=True)
+    with pytest.raises(validate.ValidationError):
+        validate.validate(documents()[1] | {"specification": {}}, KUBERNETES_VERSION, strict=True)
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not here")
+@pytest.mark.parametrize("component", [[], ["autoscale"]])
+def test_the_kustomization_builds(component: list[str], tmp_path: Path) -> None:
+    shutil.copytree(KUBERNETES, tmp_path / "k")
+    file = tmp_path / "k" / "kustomization.yaml"
+    file.write_text(file.read_text() + yaml.safe_dump({"components": component}))
+    built = subprocess.run(["kubectl", "kustomize", tmp_path / "k"], capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    made = list(yaml.safe_load_all(built.stdout))
+    assert len(made) == len(documents()) + len(component)
+    assert {each["metadata"].get("namespace", "v2v") for each in made} == {"v2v"}
+    images = {
+        each["spec"]["template"]["spec"]["containers"][0]["image"] for each in made if each["kind"] == "Deployment"
+    }
+    assert images == {"registry.example/v2v-server:1"}
+
+
+def test_whoever_selects_pods_selects_some() -> None:
+    pods = []
+    for each in documents():
+        if each["kind"] == "Deployment":
+            pods.append(each["spec"]["template"]["metadata"]["labels"])
+            assert each["spec"]["selector"]["matchLabels"] == pods[-1]
+    for each in documents():
+        spec = each.get("spec", {})
+        selector = spec.get("selector" if each["kind"] != "NetworkPolicy" else "podSelector")
+        if selector is not None:
+            assert selector.get("matchLabels", selector) in pods, each["metadata"]["name"]
+    scaled = yaml.safe_load((KUBERNETES / "autoscale" / "scaled-object.yaml").read_text())["spec"]
+    named("Deployment", scaled["scaleTargetRef"]["name"])
+    assert scaled["minReplicaCount"] < scaled["maxReplicaCount"] <= serving().expect_workers
+
+
+def serving() -> ServeConfig:
+    """What the broker's pod is told, as the program itself understands it."""
+    asked: list[ServeConfig] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serve_command, "serve", asked.append)
+        assert serve_command.main(container("v2v-broker")["args"]) == 0
+    return asked[0]
+
+
+def test_the_broker_listens_where_workers_trainers_probes_and_policies_look() -> None:
+    pod, config = container("v2v-broker"), serving()
+    assert pod["command"] == ["v2v-serve"]
+    ports = {port["name"]: port["port"] for port in named("Service", "v2v-broker")["spec"]["ports"]}
+    assert ports == {port["name"]: port["containerPort"] for port in pod["ports"]}
+    assert config.bind.endswith(f":{ports['consumers']}")
+    assert config.worker_bind.endswith(f":{ports['workers']}")
+    assert config.most_workers == 0
+    for probe in ("startupProbe", "readinessProbe"):
+        assert pod[probe]["exec"]["command"] == ["test", "-s", config.port_file]
+    assert pod["livenessProbe"]["tcpSocket"]["port"] in ports
+    policy = named("NetworkPolicy", "v2v-broker")["spec"]["ingress"]
+    assert [rule["ports"][0]["port"] for rule in policy] == [ports["consumers"], ports["workers"]]
+    assert policy[1]["from"][0]["podSelector"] == named("NetworkPolicy", "v2v-workers")["spec"]["podSelector"]
+
+
+def test_workers_connect_to_the_broker_and_have_its_videos(monkeypatch: pytest.MonkeyPatch) -> None:
+    pod, calls = container("v2v-workers"), []
+    assert pod["command"] == ["v2v-worker"]
+    monkeypatch.setattr(worker_command, "corpus_root", lambda path: path)
+    monkeypatch.setattr(worker_command, "run_worker", lambda *arguments: calls.append(arguments))
+    assert worker_command.main(pod["args"]) == 0
+    port = named("Service", "v2v-broker")["spec"]["ports"][1]["port"]
+    assert calls[0][:2] == (f"tcp://v2v-broker:{port}", Path(serving().videos))
+
+
+@pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
+def test_what_is_mounted_is_there_and_the_root_is_not_written(deployment: str) -> None:
+    spec = named("Deployment", deployment)["spec"]["template"]["spec"]
+    mounts = {mount["name"]: mount["mountPath"] for mount in container(deployment)["volumeMounts"]}
+    assert set(mounts) == {volume["name"] for volume in spec["volumes"]}
+    assert container(deployment)["securityContext"]["readOnlyRootFilesystem"] is True
+    cache = "state" if deployment == "v2v-broker" else "cache"
+    assert f"ENV V2V_CACHE_DIR={mounts[cache]}\n" in (DEPLOY / "Dockerfile").read_text()
+    assert f"--uid {spec['securityContext']['runAsUser']} " in (DEPLOY / "Dockerfile").read_text()
+
+
+def test_the_scaler_asks_for_what_the_server_tells() -> None:
+    query = yaml.safe_load((KUBERNETES / "autoscale" / "scaled-object.yaml").read_text())["spec"]["triggers"][0]
+    assert "v2v_waiting_share{" in query["metadata"]["query"]
+    told = [path for path in (ROOT / "v2v_server").rglob("*.py") if "v2v_waiting_share" in path.read_text()]
+    if not told:
+        pytest.skip("the server tells no metrics yet: deploy/kubernetes/autoscale waits for them")
+
+
+# --- systemd, shell ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
+def test_systemd_takes_the_units(tmp_path: Path) -> None:
+    for unit in (DEPLOY / "systemd").glob("*.service"):
+        text = "".join(
+            f"ExecStart={sys.executable}\n" if line.startswith("ExecStart=") else line
+            for line in unit.read_text().splitlines(True)
+        )
+        file = tmp_path / unit.name.replace("@.", "@1.")
+        file.write_text(text)
+        done = subprocess.run(["systemd-analyze", "verify", file], capture_output=True, text=True, check=False)
+        assert (done.returncode, [line for line in done.stderr.splitlines() if unit.stem in line]) == (0, [])
+
+
+def test_the_unit_of_a_worker_is_a_command_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = [
+        line.removeprefix("ExecStart=")
+        for line in (DEPLOY / "systemd" / "v2v-worker@.service").read_text().splitlines()
+        if line.startswith("ExecStart=")
+    ]
+    program, *arguments = shlex.split(line)
+    assert program.endswith("/v2v-worker")
+    monkeypatch.setattr(worker_command, "corpus_root", lambda path: path)
+    monkeypatch.setattr(worker_command, "run_worker", lambda *arguments: None)
+    assert worker_command.main(arguments) == 0
+
+
+def test_shellcheck_finds_nothing() -> None:
+    shellcheck = Path(sys.executable).with_name("shellcheck")
+    if not shellcheck.exists():
+        pytest.skip("shellcheck is not installed")
+    done = subprocess.run([shellcheck, BATCH], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+# --- Slurm ------------------------------------------------------------------------------------------------------------
+
+SAYS = 'echo "$(basename "$0") $*" >> "$LOG"\n'
+PROGRAMS = {
+    "v2v-serve": SAYS
+    + 'while [ $# -gt 0 ]; do [ "$1" = --port-file ] && echo tcp://127.0.0.1:7 > "$2"; shift; done\n'
+    + "exec sleep 600\n",
+    "srun": SAYS + 'while [ "${1#--}" != "$1" ]; do shift; done\nexec "$@"\n',
+    "v2v-worker": SAYS + "exec sleep 600\n",
+    "v2v-train": SAYS + "trap 'touch \"$OUT/last.pt\"; exit 143' TERM\n$TRAINING\n",
+    "scontrol": SAYS,
+}
+
+
+def start_batch(folder: Path, training: str) -> subprocess.Popen[bytes]:
+    """The batch script among programs that only say how they were called."""
+    programs = folder / "bin"
+    programs.mkdir(exist_ok=True)
+    for name, text in PROGRAMS.items():
+        (programs / name).write_text(f"#!/bin/bash\n{text.replace('$TRAINING', training)}")
+        (programs / name).chmod(0o755)
+    given = {
+        "PATH": f"{programs}:{os.environ['PATH']}", "LOG": str(folder / "log"), "OUT": str(folder),
+        "VIDEOS": "/data/my videos", "SLURM_NTASKS_HET_GROUP_1": "128", "SLURM_JOB_ID": "1234567",
+    }  # fmt: skip
+    return subprocess.Popen(["bash", BATCH], env=os.environ | given, start_new_session=True)
+
+
+def said(folder: Path) -> list[str]:
+    return (folder / "log").read_text().splitlines() if (folder / "log").exists() else []
+
+
+def test_the_batch_job_starts_all_three_and_leaves_nothing(tmp_path: Path) -> None:
+    job = start_batch(tmp_path, "exit 0")
+    assert job.wait(timeout=60) == 0
+    serve, *others = said(tmp_path)
+    port = 20000 + 1234567 % 20000
+    assert "--expect-workers 128 " in serve
+    assert f"--worker-bind tcp://0.0.0.0:{port} " in serve
+    assert any(line.startswith("srun --het-group=1 ") for line in others)
+    assert f"v2v-train e2vid --connect tcp://127.0.0.1:7 --out {tmp_path}" in others
+    until(lambda: _is_empty(job.pid))
+
+
+def _is_empty(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.slow
+def test_a_batch_job_whose_time_is_up_saves_and_goes_on_later(tmp_path: Path) -> None:
+    job = start_batch(tmp_path, "while true; do sleep 0.1; done")
+    until(lambda: any(line.startswith("v2v-train") for line in said(tmp_path)))
+    until(lambda: any(line.startswith("v2v-worker") for line in said(tmp_path)))
+    job.send_signal(signal.SIGTERM)
+    assert job.wait(timeout=60) == 143
+    assert said(tmp_path)[-1] == "scontrol requeue 1234567"
+    assert (tmp_path / "last.pt").exists()
+    assert start_batch(tmp_path, "exit 0").wait(timeout=60) == 0
+    assert any(f"--out {tmp_path} --resume {tmp_path}/last.pt" in line for line in said(tmp_path))
