@@ -38,7 +38,7 @@ from v2v_protocol.sample import array_layout
 _MIB = 1 << 20
 _COLUMNS: tuple[Column, ...] = (
     ("network", "", "{}", 1.0),
-    ("parameters", "parameters", "{:,}", 1.0),
+    ("parameters", "parameters", "{:,}", 1),
     ("seconds", "s a step", "{:.3f}", 1.0),
     ("fastest_seconds", "fastest", "{:.3f}", 1.0),
     ("voxel_grids_per_second", "voxel grids/s", "{:.1f}", 1.0),

@@ -28,6 +28,7 @@ from contextlib import contextmanager, suppress
 import zmq
 
 from v2v_protocol.messages import Hello, Want
+from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
 
 PEERS = 8
@@ -37,7 +38,8 @@ _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL" + bytes(16 + 1 + 31)
 _READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
-SLOW_RECIPE = {"preset": "paper-flow", "voxels_per_clip": 12}
+SLOW_RECIPE = "paper-flow"
+SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
 
 
 def parts(address: str, number: int) -> None:
@@ -91,9 +93,8 @@ def slow(address: str, number: int) -> None:
     """See the module."""
     from v2v_client.dataset import V2VStreamDataset  # PyTorch, which the others do not need
 
-    dataset = V2VStreamDataset(
-        address, 1, ("voxels", "flow"), SLOW_RECIPE, seed=number, rank=0, world_size=1, flow_method="dis-fast"
-    )
+    arrays = ("voxels", "flow", "flow_valid")
+    dataset = V2VStreamDataset(address, 1, arrays, SLOW_RECIPE, seed=number, rank=0, world_size=1, **SLOW_SPEC)
     for _ in dataset:
         pass
 
