@@ -22,8 +22,8 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.view import apply_view
+from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
-from v2v_server.video.decode import decode_cuts
 from v2v_server.worker.produce import decode_for, draft_of
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
@@ -118,7 +118,8 @@ def spurious(stills: Catalogue, crop_px: tuple[int, int]) -> dict[float, float]:
     for number, video in enumerate(stills.videos):
         top, bottom = stills.rows.bounds(video.height_px)
         window = (top + (bottom - top - height) // 2, (video.width_px - width) // 2, height, width)
-        (clip,) = decode_cuts(stills.path(video.id), stills.frame_index(video.id), 0, [Cut(video.frames, window)])
+        cuts = [Cut(video.frames, window)]
+        (clip,) = clips_of(stills.path(video.id), video.fingerprint, stills.frame_index(video.id), 0, cuts, 1)
         steps += (len(clip.frames) - 1) * height * width
         for threshold in THRESHOLDS:
             made = simulate(clip.frames, threshold_pos=threshold, bins=1, seed=number, dtype="float32").voxels
