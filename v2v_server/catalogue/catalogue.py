@@ -29,6 +29,7 @@ from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.system.process import without_collections
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -93,7 +94,7 @@ class Catalogue:
     scene_digest: str | None
     _store: Store = field(repr=False, compare=False)
     _fingerprints: dict[str, str] = field(repr=False, compare=False)
-    _files: dict[str, str] = field(repr=False, compare=False)  # by id, the fingerprint of the file that lies here
+    _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
     _looking: Looking | None = field(repr=False, compare=False)
     _unseen: frozenset[str] = field(repr=False, compare=False)
@@ -143,12 +144,12 @@ class Catalogue:
         return self._slices[key]
 
     def _stored_index(self, id: str) -> bytes:
-        self._fingerprint(id)
+        fingerprint = self._fingerprint(id)
         if id in self._absent:
             video = self._absent[id]
             return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
         try:
-            data = self._store.frame_index(id, self._files[id])
+            data = self._store.frame_index(id, self._files.get(id, fingerprint))
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -163,13 +164,13 @@ class Catalogue:
                 longer be read.
             VideoChanged: another process has catalogued a changed file under this id since.
         """
-        self._fingerprint(id)
+        fingerprint = self._fingerprint(id)
         if self._looking is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
         if id in self._unseen:
             return Scene.unknown()
         try:
-            data = self._store.scene(id, self._files[id], self._looking.key)
+            data = self._store.scene(id, self._files.get(id, fingerprint), self._looking.key)
         except sqlite3.Error as error:
             raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
         if data is None:
@@ -257,7 +258,8 @@ def open_catalogue(
     looking = Looking(rows or Rows(), manifest) if scene else None
     store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress, notice)
     try:
-        return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
+        with without_collections():
+            return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
     except BaseException:
         store.close()
         raise
@@ -298,16 +300,17 @@ def _snapshot(
     manifest: Manifest | None,
     looking: Looking | None,
 ) -> Catalogue:
-    by_id = {entry.id: entry for entry in listed}
+    by_id, unlisted = {entry.id: entry for entry in listed}, ListEntry("")
     problems = dict(refused)
     used, files = [], {}
     videos = []
     shorter = []
     absent: dict[str, PreparedVideo] = {}
     for id in sorted(records):
-        record, entry = records[id], by_id.get(id, ListEntry(id))
-        files[id] = record.fingerprint
+        record, entry = records[id], by_id.get(id, unlisted)
+        file = record.fingerprint
         if manifest is not None:
+            files[id] = file
             if not manifest.describes(record):
                 absent[id] = manifest.videos[id]
             record = manifest.as_source(record)
@@ -316,7 +319,7 @@ def _snapshot(
         if record.problem is not None:
             problems[id] = record.problem
             continue
-        used.append(replace(record, fingerprint=files[id]))
+        used.append(record if record.fingerprint == file else replace(record, fingerprint=file))
         videos.append(_entry(record, entry))
         if entry.frames is not None and entry.frames > record.frames:
             shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")

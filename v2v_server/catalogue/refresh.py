@@ -16,6 +16,7 @@ from v2v_server.catalogue.files import Notice, answers
 from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
+from v2v_server.system.process import without_collections
 
 _WRITE_EVERY = 256
 
@@ -91,7 +92,8 @@ def _refreshed(
 ) -> tuple[Store, dict[str, IndexRow]]:
     store = Store(path)
     try:
-        known = store.records()
+        with without_collections():
+            known = store.records()
         stale = _stale(root, ids, known, notice)
         store.forget(_gone(root, known.keys() - set(ids), notice))
         with closing(survey(root, stale, processes)) as found:

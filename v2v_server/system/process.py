@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import math
 import os
 import platform
 import resource
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from v2v_protocol import allocator
@@ -107,6 +109,19 @@ def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/pro
         if quota != "max":
             least = min(least, int(quota) / int(period))
     return least
+
+
+@contextmanager
+def without_collections() -> Iterator[None]:
+    """Python looks for no reference cycles meanwhile. Where a million objects are made that all stay, it would look
+    through them again and again, which takes longer than to make them."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def give_way() -> None:
