@@ -18,7 +18,7 @@ from trainer.loop import Diverged, train
 from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from v2v_client.local_server import LocalServer
+from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
@@ -106,10 +106,13 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
 def _server_flags(stream: StreamConfig, recipe: Recipe) -> list[str]:
     # A server looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what
     # the videos show only if it is told at its start.
-    fields = recipe.to_dict().items()
-    flags = [text for key, value in fields for text in ("--set", f"{key}={json.dumps(value)}")]
     asked = {"--list": stream.list, "--scene": stream.spec.get("scene")}
-    return ["--rows", stream.rows, *flags, *(part for flag, value in asked.items() if value for part in (flag, value))]
+    return [
+        "--rows",
+        stream.rows,
+        *recipe_flags(recipe),
+        *(part for flag, value in asked.items() if value for part in (flag, value)),
+    ]
 
 
 def run(arguments: argparse.Namespace) -> int:

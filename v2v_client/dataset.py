@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import os
 import warnings
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, Unpack
@@ -15,6 +17,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from v2v_client.batch import Batch
 from v2v_client.delivery import deliver
 from v2v_client.loaders import require_epoch_of_ours, require_in_step_with_lightning, send_before_exit
+from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options
 from v2v_client.position.plan import Consumer, EpochPlan
@@ -126,6 +129,44 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._buffers = BatchBuffers()
         self._offered: StreamIdentity | None = None  # what the server said when it was only asked
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
+
+    @classmethod
+    def local(
+        cls,
+        videos: str | os.PathLike[str],
+        batch_size: int = 12,
+        arrays: Sequence[str] = ("voxels", "frames"),
+        recipe: str | Mapping[str, Any] | Recipe | None = "paper",
+        *,
+        workers: int = 4,
+        flags: Sequence[str] = (),
+        seed: int = 0,
+        **options: Unpack[SpecOptions],
+    ) -> V2VStreamDataset:
+        """A stream of a server of its own, which ends with the dataset or with this process, however that ends.
+
+        Args:
+            videos: folder or list, as for ``v2v-serve --videos``.
+            batch_size, arrays, recipe, seed, options: of the dataset.
+            workers: server workers.
+            flags: more flags for ``v2v-serve``, for instance ``["--cache", "clips/"]``.
+
+        Raises:
+            UsageError: what is wrong with the videos or flags; ServerLost: the server does not come up.
+        """
+        named = recipe.to_dict() if isinstance(recipe, Recipe) else recipe
+        named = {"preset": named or "paper"} if named is None or isinstance(named, str) else named
+        resolved = Recipe.from_dict(named)
+        scene = options.get("scene")
+        asked = [*recipe_flags(resolved), *(("--scene", scene) if scene else ()), *flags]
+        server = LocalServer(videos, workers=workers, flags=asked).__enter__()
+        try:
+            dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, **options)
+        except BaseException:
+            server.stop()
+            raise
+        weakref.finalize(dataset, _stop_own, server, os.getpid())
+        return dataset
 
     def __getstate__(self) -> dict[str, Any]:
         # A spawned loader worker knows nothing of the process group. A copy, even a shallow one, moves on by itself.
@@ -306,3 +347,8 @@ def _distributed() -> tuple[int, int] | None:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return None
+
+
+def _stop_own(server: LocalServer, owner: int) -> None:
+    if os.getpid() == owner:  # a forked loader worker has a copy of the dataset, and its server is ours
+        server.stop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import psutil
 
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.programs import environment
+from v2v_protocol.recipe import Recipe
 
 _POLL_SECONDS = 0.05
 _LAST_LINES = 12
@@ -168,6 +170,11 @@ class LocalServer:
             with _gone_is_fine():
                 found[process.pid] = process.memory_info().rss
         return found
+
+
+def recipe_flags(recipe: Recipe) -> list[str]:
+    """The recipe for ``v2v-serve``: at its start it looks which videos are long and large enough for it."""
+    return [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
 
 
 def _tree(pid: int) -> Iterator[psutil.Process]:

@@ -1,0 +1,100 @@
+"""A dataset with a server of its own leaves nothing behind, however it ends."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from tests.clips import panned_luma, write_clip
+from tests.waiting import until
+from v2v_client import V2VStreamDataset
+from v2v_protocol.errors import UsageError
+
+RECIPE = {"preset": "noise-free", "voxels_per_clip": 2, "crop_height_px": 32, "crop_width_px": 32}
+SCRIPT = """
+import os, signal, sys
+from v2v_client import V2VStreamDataset
+if __name__ == "__main__":
+    recipe = {recipe!r}
+    dataset = V2VStreamDataset.local(sys.argv[1], 2, recipe=recipe, workers=1)
+    for batch in dataset:
+        print(batch.voxels.sum().item(), flush=True)
+        {end}
+"""
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("local-clips")
+    for number in range(4):
+        write_clip(folder / f"{number}.mp4", panned_luma(40, 48, 64, step=(1, 1 + number)))
+    return folder
+
+
+@pytest.fixture
+def servers() -> Iterator[set[psutil.Process]]:
+    """Processes that this process has started since."""
+    before = set(psutil.Process().children(recursive=True))
+    started: set[psutil.Process] = set()
+    yield started
+    started |= set(psutil.Process().children(recursive=True)) - before
+    assert not [process for process in started if process.is_running() and "v2v_server" in " ".join(command(process))]
+
+
+def command(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
+def test_it_streams_and_its_server_goes_with_it(clips: Path, servers: set[psutil.Process]) -> None:
+    dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
+    servers.update(psutil.Process().children(recursive=True))
+    whole = [batch.voxels for batch in dataset]
+    assert len(whole) == len(dataset) > 1
+    for batch in dataset:
+        assert batch.epoch == 1
+        break  # in the middle of an epoch
+    loader = DataLoader(V2VStreamDataset(dataset._address, 2, recipe=RECIPE), batch_size=None, num_workers=1)
+    assert all(torch.equal(mine, other.voxels) for mine, other in zip(whole, loader, strict=True))
+    assert any("v2v_server" in " ".join(command(process)) for process in servers)
+    del dataset, loader
+    gc.collect()
+
+
+def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers: set[psutil.Process]) -> None:
+    """It is a fork, and has a copy of all that would stop it."""
+    dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
+    for _ in range(2):
+        assert sum(1 for _ in DataLoader(dataset, batch_size=None, num_workers=1)) == len(dataset)
+    del dataset
+    gc.collect()
+
+
+def test_what_is_wrong_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:
+    with pytest.raises(UsageError, match="no video found"):
+        V2VStreamDataset.local(tmp_path, recipe=RECIPE)
+    del servers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["break", "raise SystemExit(0)", "os.kill(os.getpid(), signal.SIGKILL)"])
+def test_nothing_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end: str) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(recipe=RECIPE, end=end), encoding="utf-8")
+    with subprocess.Popen([sys.executable, str(script), str(clips)], stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline()
+        started = [each for each in psutil.process_iter() if str(clips) in command(each) and each.pid != program.pid]
+        program.wait()
+    assert program.returncode in (0, -9)
+    until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
