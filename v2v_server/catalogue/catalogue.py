@@ -35,6 +35,8 @@ from v2v_server.video.rows import Rows
 
 _KEPT_SLICES = 64
 _SMALL_INDEX_BYTES = 4096
+_KEPT_LONG_FRAMES = 1 << 22
+"""Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
@@ -99,6 +101,7 @@ class Catalogue:
     _looking: Looking | None = field(repr=False, compare=False)
     _unseen: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
+    _long: dict[str, FrameIndex] = field(repr=False, compare=False, default_factory=dict)
 
     def path(self, id: str) -> Path:
         """Where the video lies.
@@ -131,9 +134,11 @@ class Catalogue:
         """
         key = id, start, count
         if key not in self._slices:
-            encoded = self._stored_index(id)
-            if len(encoded) > _SMALL_INDEX_BYTES:
-                index = FrameIndex.from_bytes(encoded)
+            index = self._long.get(id)
+            encoded = b"" if index is not None else self._stored_index(id)
+            if index is None and len(encoded) > _SMALL_INDEX_BYTES:
+                index = self._keep_long(id, FrameIndex.from_bytes(encoded))
+            if index is not None:
                 index.position(start, count)
                 first = start // PIECE_FRAMES * PIECE_FRAMES
                 end = min(-(-(start + count) // PIECE_FRAMES) * PIECE_FRAMES, index.end)
@@ -142,6 +147,13 @@ class Catalogue:
                 del self._slices[next(iter(self._slices))]
             self._slices[key] = encoded
         return self._slices[key]
+
+    def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
+        """Opening the index of a day takes a tenth of a second, in the broker's only thread: a few stay open."""
+        while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
+            del self._long[next(iter(self._long))]
+        self._long[id] = index
+        return index
 
     def _stored_index(self, id: str) -> bytes:
         fingerprint = self._fingerprint(id)

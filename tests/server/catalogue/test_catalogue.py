@@ -26,6 +26,7 @@ from v2v_server.catalogue.manifest import MANIFEST_NAME
 from v2v_server.catalogue.refresh import index_path
 from v2v_server.catalogue.survey import Examine, survey
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
+from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
 
@@ -540,3 +541,30 @@ def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_a
         assert again is not first
         with pytest.raises(UsageError, match="asked of an index"):
             catalogue.frame_index_bytes("a.mp4", 110, 20)
+
+
+def test_the_index_of_a_long_video_is_opened_once(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a day takes a tenth of a second in the broker's only thread, and every lease asked for it."""
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 40)
+    catalogue = opener(corpus)
+    opened: list[int] = []
+    from_bytes = FrameIndex.from_bytes
+
+    def opening(data: bytes) -> FrameIndex:
+        opened.append(len(data))
+        return from_bytes(data)
+
+    monkeypatch.setattr(FrameIndex, "from_bytes", opening)
+    names = ids(catalogue)[:2]
+    for start in (0, 5, 10, 5):
+        for name in names:
+            catalogue.frame_index_bytes(name, start, 3)
+    assert len(opened) == 2
+    monkeypatch.setattr(catalogue_module, "_KEPT_LONG_FRAMES", 1)
+    catalogue._long.clear()
+    for start in (1, 2, 3):
+        for name in names:
+            catalogue.frame_index_bytes(name, start, 3)
+            assert list(catalogue._long) == [name]
