@@ -109,7 +109,6 @@ def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
                     assert {raylet_of(process) for process in workers()} != {node}
         said = log_of(server)
     assert got == reference
-    assert "faults 0" not in said.splitlines()[-1]
     assert "workers have a place on 2 nodes" in said
     assert "was lost with its actor on" in said
     until(lambda: not workers())
@@ -145,7 +144,7 @@ def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, c
     changes = [int(found) for found in re.findall(r"workers: (\d+) from now on, because", said)]
     assert changes[:3] == [3, 5, 6]
     assert changes[2:] == sorted(changes[2:], reverse=True)
-    assert " faults 0 " in said.splitlines()[-1]  # who was sent away left in order
+    assert "its work is given to others" not in said  # who was sent away left in order
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as fixed:
         for epoch in {0, len(epochs) // 2, len(epochs) - 1}:
             assert epochs[epoch] == [digest(batch) for batch in epoch_of(fixed.address, epoch=epoch)]
