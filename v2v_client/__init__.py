@@ -11,7 +11,7 @@ The rooms:
     session/    conversation (pure: states, messages, times), connection (holds it over a link), link (the socket)
     memory/     arena (workers of this host may write there), slots (whose row is whose), buffers (used again)
     position/   plan (which samples are whose), state (what is saved), position (of one copy), shared (of all copies)
-    loaders     what loaders and loops of others need; in_process: samples by index, without a server
+    loaders     what loaders and loops of others need; in_process: samples by index, without a server; look: pictures
     tools/      the load test; local_server: a server of one's own
 """
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +12,13 @@ from typing import Any
 import torch
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from v2v_client import look
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.tables import html_table
+
+_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -49,6 +56,43 @@ class Batch:
         )
         some = ", ".join(map(str, self.indices[:3])) + (", ..." if len(self) > 3 else "")
         return f"Batch({arrays}epoch {self.epoch}, indices {some})"
+
+    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """The first samples as a picture, which a notebook displays.
+
+        Args:
+            path: a PNG to write too.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: voxels or frames were not asked for, or pillow or av is not installed.
+        """
+        return look.shown(self._picture(), path)
+
+    def _picture(self) -> Any:
+        spec = self.resume_state.get("spec")
+        frames_per_bin = None if spec is None else StreamSpec.from_dict(spec).recipe.frames_per_bin
+        count = min(_SHOWN, len(self))
+        samples = [
+            ({name: tensor[place].cpu().numpy() for name, tensor in self.arrays.items()}, self.provenance[place])
+            for place in range(count)
+        ]
+        return look.picture(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
+
+    def _repr_png_(self) -> bytes | None:
+        try:
+            return look.png(self._picture())
+        except UsageError:  # no picture can be made of it: a notebook goes on with the text
+            return None
+
+    def _repr_html_(self) -> str:
+        rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
+        table, image = html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows), self._repr_png_()
+        return (
+            table if image is None else f'{table}<img src="data:image/png;base64,{base64.b64encode(image).decode()}">'
+        )
 
     @property
     def voxels(self) -> torch.Tensor | None:

@@ -173,6 +173,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers()}
         return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 
+    def __repr__(self) -> str:
+        own = f"seed {self._seed}, rank {self.rank} of {self.world_size}"
+        return f"V2VStreamDataset({self._address!r}, batch_size {self._batch_size}, {own})"
+
     # --- what it is ---------------------------------------------------------------------------------------------------
 
     @property

@@ -15,6 +15,7 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from v2v_client import look
 from v2v_client.batch import Batch
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
@@ -92,6 +93,24 @@ class V2VDataset(Dataset[Sample]):
 
     def __repr__(self) -> str:
         return f"V2VDataset({self._source[0]!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
+
+    def show(self, index: int = 0, path: str | os.PathLike[str] | None = None) -> Any:
+        """One sample as a picture, which a notebook displays.
+
+        Args:
+            index: of the sample.
+            path: a PNG to write too.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: voxels or frames were not asked for, or pillow or av is not installed.
+        """
+        sample = self[index]
+        title = f"Sample {sample.provenance.id.index} of {len(self)}"
+        image = look.picture([(sample.arrays, sample.provenance)], self.spec.recipe.frames_per_bin, title)
+        return look.shown(image, path)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}

@@ -15,6 +15,7 @@ from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.settings import require_whole
+from v2v_protocol.tables import html_table
 
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
@@ -151,6 +152,16 @@ class Provenance:
     quarantine: int = 0
     scene: str = ""
 
+    def __repr__(self) -> str:
+        where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
+        return f"Provenance({self.video!r} from frame {self.start_frame}, {where})"
+
+    def _repr_html_(self) -> str:
+        rows = self.to_dict()
+        rows |= {f"id: {name}": value for name, value in rows.pop("id").items()}
+        rows |= {f"drawn: {name}": value for name, value in rows.pop("params").items()}
+        return html_table(f"{self.video}, from frame {self.start_frame}", rows)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in the sample's header; ``scene`` only where there is something to say."""
         values = _fields(self) | {
@@ -257,3 +268,7 @@ class Sample:
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name}: {array.dtype}{list(array.shape)}" for name, array in self.arrays.items())
         return f"Sample({shapes}, {self.provenance.video}@{self.provenance.start_frame})"
+
+    def _repr_html_(self) -> str:
+        rows = {name: f"{array.dtype} {list(array.shape)}" for name, array in self.arrays.items()}
+        return html_table("Sample", rows) + self.provenance._repr_html_()

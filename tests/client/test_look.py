@@ -1,0 +1,87 @@
+"""What a notebook shows of batches, samples, provenance and datasets."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from torch.utils.data import DataLoader
+
+from tests.clips import panned_luma, write_clip
+from v2v_client import UsageError, V2VDataset, V2VStreamDataset, look
+from v2v_client.position.state import ResumeState, StreamIdentity
+
+RECIPE = {"preset": "noise-free", "voxels_per_clip": 4, "crop_height_px": 48, "crop_width_px": 48}
+NAME = "<img src=x>&.mp4"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> V2VDataset:
+    folder = tmp_path_factory.mktemp("look")
+    write_clip(folder / NAME, panned_luma(60, 64, 80, step=(1, 2)))
+    return V2VDataset(folder, RECIPE, cache_dir=str(folder / "cache"))
+
+
+def test_a_dataset_shows_a_sample_and_writes_it(dataset: V2VDataset, tmp_path: Path) -> None:
+    image = dataset.show(0, tmp_path / "sample.png")
+    assert image.width > 500
+    assert np.ptp(np.asarray(image)) == 255
+    with Image.open(tmp_path / "sample.png") as written:
+        assert np.array_equal(np.asarray(written), np.asarray(image))
+
+
+def test_a_batch_shows_itself_as_text_table_and_picture(dataset: V2VDataset) -> None:
+    batch = next(iter(DataLoader(dataset, batch_size=1)))
+    assert batch._repr_png_().startswith(b"\x89PNG")
+    assert "data:image/png;base64," in batch._repr_html_()
+    assert batch.show().width == dataset.show(0).width
+    alone = dataclasses.replace(batch, arrays={"voxels": batch.voxels})
+    assert alone._repr_png_() is None
+    assert "<img" not in alone._repr_html_()
+    with pytest.raises(UsageError, match="voxels,frames"):
+        alone.show()
+
+
+def test_a_file_name_is_no_markup(dataset: V2VDataset) -> None:
+    sample = dataset[0]
+    for shown in (sample._repr_html_(), sample.provenance._repr_html_()):
+        assert "<img" not in shown
+        assert "&lt;img src=x&gt;&amp;.mp4" in shown
+        assert "drawn: threshold_pos" in shown
+
+
+def test_texts_are_short(dataset: V2VDataset) -> None:
+    stream = V2VStreamDataset("tcp://127.0.0.1:1", 3, rank=1, world_size=2)
+    assert repr(stream) == "V2VStreamDataset('tcp://127.0.0.1:1', batch_size 3, seed 0, rank 1 of 2)"
+    start = dataset[0].provenance.start_frame
+    assert repr(dataset[0].provenance) == f"Provenance('{NAME}' from frame {start}, seed 0, epoch 0, index 0)"
+
+
+def test_pauses_of_unknown_length_are_not_marked(dataset: V2VDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample, titles = dataset[0], []
+    params = dataclasses.replace(sample.provenance.params, pauses=((1, 4),))
+    paused = dataclasses.replace(sample.provenance, params=params)
+    sheet = look._drawing("sheet")
+
+    def draw(cameras: list, title: str) -> np.ndarray:
+        titles.append((title, any(camera.paused.any() for camera in cameras)))
+        return np.zeros((1, 1, 3), np.uint8)
+
+    monkeypatch.setattr(sheet, "draw_sheet", draw)
+    look.picture([(sample.arrays, paused)], None, "T")
+    look.picture([(sample.arrays, paused)], 1, "T")
+    assert titles == [("T (pauses are not marked)", False), ("T", True)]
+
+
+def test_a_streamed_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = next(iter(DataLoader(dataset, batch_size=1)))
+    stream = StreamIdentity(dataset.spec.to_dict(), dataset.spec.digest, "", 1, len(dataset))
+    state = ResumeState(stream=stream, seed=0, epoch=0, origin=0, position=1, world_size=1, quarantine=0).to_dict()
+    asked: list[int | None] = []
+    monkeypatch.setattr(look, "picture", lambda samples, frames_per_bin, title: asked.append(frames_per_bin))
+    dataclasses.replace(batch, resume_state=state)._picture()
+    batch._picture()
+    assert asked == [dataset.spec.recipe.frames_per_bin, None]

@@ -1,0 +1,76 @@
+"""Pictures of batches and samples for notebooks. Opens ``v2v_pictures`` when a picture is drawn: it needs more packages
+than a consumer does."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import Provenance
+
+
+def picture(
+    samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], frames_per_bin: int | None, title: str
+) -> npt.NDArray[np.uint8]:
+    """A sheet of samples: frame, bins, flow, and activity over time.
+
+    Args:
+        samples: arrays and provenance of each, at least one.
+        frames_per_bin: of the recipe. None: nobody knows, so pauses cannot be placed; they are not marked, and the
+            title says so.
+        title: of the sheet.
+
+    Returns:
+        [height, width, 3] uint8 RGB.
+
+    Raises:
+        UsageError: voxels or frames are not among the arrays, or a package that draws is not installed.
+    """
+    camera, sheet = _drawing("camera"), _drawing("sheet")
+    cameras = []
+    for arrays, provenance in samples:
+        if frames_per_bin is None and provenance.params.pauses:
+            provenance = dataclasses.replace(provenance, params=dataclasses.replace(provenance.params, pauses=()))
+            title = title.removesuffix(_UNMARKED) + _UNMARKED
+        cameras.append(camera.Camera.of(arrays, provenance, "", frames_per_bin or 1))
+    drawn: npt.NDArray[np.uint8] = sheet.draw_sheet(cameras, title)
+    return drawn
+
+
+_UNMARKED = " (pauses are not marked)"
+
+
+def png(image: npt.NDArray[np.uint8]) -> bytes:
+    """The picture as PNG."""
+    encoded: bytes = _drawing("files").png_bytes(image)
+    return encoded
+
+
+def shown(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
+    """The picture as a PIL image, which a notebook displays; written to ``path`` as PNG where one is given.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    if path is not None:
+        _drawing("files").write_png(Path(path), image)
+    return _imported("PIL.Image").fromarray(image)
+
+
+def _drawing(name: str) -> Any:
+    return _imported(f"v2v_pictures.{name}")
+
+
+def _imported(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise UsageError(f"a picture needs the package {error.name}: pip install pillow av") from error
