@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import os
 import warnings
 import weakref
@@ -24,6 +25,7 @@ from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_client.session.connection import Connection
+from v2v_client.session.link import Link
 from v2v_client.session.liveness import Patience
 from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.messages import Hello
@@ -67,6 +69,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
         shared_memory: whether server workers on this host may put samples into memory of this process, which saves
             most of what moving them costs; where they cannot, samples come in messages by themselves.
+        keys: file of this consumer's key, see `v2v-keys`; None takes what ``V2V_KEYS`` names, which ranks and loader
+            workers inherit; "" takes none.
         timeout_seconds: silence after which the server is taken for lost.
         patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
         options: ``preset`` ("exact", "balanced" or "fast": speed, see :data:`v2v_protocol.spec.SPEED_PRESETS`) and
@@ -88,10 +92,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     Where workers on this host put samples into memory of this process, the first and the third are next to nothing.
 
-    Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses),
-    SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream than the one begun),
-    ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a loader worker they
-    come out as the same kinds, with the worker's trace in their text; one that was killed is a RuntimeError of PyTorch.
+    Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses), KeyRefused
+    (it takes no such key), SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream
+    than the one begun), ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a
+    loader worker they come out as the same kinds, with the worker's trace in their text; one that was killed is a
+    RuntimeError of PyTorch.
 
     Raises:
         UsageError: an argument outside its range.
@@ -109,6 +114,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rank: int | None = None,
         world_size: int | None = None,
         shared_memory: bool = True,
+        keys: str | os.PathLike[str] | None = None,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
         **options: Unpack[SpecOptions],
@@ -123,6 +129,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._options = Options(self._arrays, recipe=recipe, **options)
         self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
         self._shared_memory = shared_memory
+        self._keys = None if keys is None else os.fspath(keys)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
         self._position = Position(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
@@ -343,6 +350,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
             patience=self._patience,
+            transport=functools.partial(Link, keys=self._keys),
         )
 
 

@@ -3,6 +3,7 @@
     V2VError
     |-- UsageError               the caller: an argument, a flag, a configuration file
     |   |-- RecipeError              a recipe key, value or preset
+    |   |-- KeyRefused               a key: missing, readable by others, revoked, or of another side or server
     |   |-- CorpusError              a folder, list file or index that gives no sequence
     |   `-- StateMismatch            a saved position that belongs to another stream
     |-- VideoError               the file: it cannot give what it promised (path, frame, reason)
@@ -35,6 +36,10 @@ class UsageError(V2VError):
 
 class RecipeError(UsageError):
     """A recipe names an unknown key or preset, or a value outside its limits."""
+
+
+class KeyRefused(UsageError):
+    """A key that does not open this server: missing, readable by others, revoked, or of another side or server."""
 
 
 class CorpusError(UsageError):

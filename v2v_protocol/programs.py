@@ -61,6 +61,7 @@ simulate = _program("v2v-simulate", "v2v_server.commands.simulate", "main", "ser
 preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server")
 prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
+keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")
 loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
 train = _program("v2v-train", "trainer.train", "main", "trainer")
 evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")

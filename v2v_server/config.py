@@ -76,6 +76,9 @@ class ServeConfig:
         DEFAULT_BIND, "address for consumers; port * is a free one", metavar="ADDRESS", group="Addresses and consumers"
     )
     worker_bind: str = text("", "address for workers; without it one that is private to this host", metavar="ADDRESS")
+    keys: str = text(
+        "", "folder that v2v-keys init made: every tcp address takes its keys only, and all is encrypted", metavar="DIR"
+    )
     insecure: bool = switch(
         False, "allow addresses that other machines can reach, although nothing is encrypted or authenticated"
     )
@@ -93,7 +96,7 @@ class ServeConfig:
             raise UsageError("--videos is missing: give a folder of videos, one video, or a list file")
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
-            _check_address(flag, address, self.insecure)
+            _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
         if self.engine == "ray" and not self.worker_bind:
             raise UsageError(
                 "--engine ray: give the workers of other hosts an address of this one, --worker-bind tcp://HOST:5556"
@@ -227,7 +230,7 @@ def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole_or_text)
 
 
-def _check_address(flag: str, address: str, insecure: bool) -> None:
+def _check_address(flag: str, address: str, *, is_safe: bool) -> None:
     if not address and flag == "--worker-bind":
         return
     scheme, separator, rest = address.partition("://")
@@ -239,10 +242,11 @@ def _check_address(flag: str, address: str, insecure: bool) -> None:
     is_number = port.isascii() and port.isdecimal()
     if not colon or not host or not (port in ("*", "0") or (is_number and 0 < int(port) < 65536)):
         raise UsageError(f"{flag} {address!r}: write tcp://HOST:PORT with a port from 1 to 65535, or * for a free one")
-    if not insecure and not _is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
+    if not is_safe and not _is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
         raise UsageError(
             f"{flag} {address} is reachable from other machines, and nothing is encrypted or authenticated: "
-            f"bind to 127.0.0.1, or type out --insecure if everyone on that network may use this server"
+            f"bind to 127.0.0.1, give --keys DIR (v2v-keys init makes it), or type out --insecure if everyone on that "
+            "network may use this server"
         )
 
 

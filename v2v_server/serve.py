@@ -28,6 +28,7 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
+from v2v_server.keys.folder import KeyFolder
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import make_cache
 from v2v_server.store.clips import check_file
@@ -110,26 +111,29 @@ def serve(config: ServeConfig) -> None:
         max_credit_bytes=config.max_credit_bytes,
         expected_workers=config.workers_in_all,
     )
-    cache_flags: list[str] = []
+    # Workers of this host come in where no key is asked for.
+    worker_flags = ["--keys", ""] if config.engine == "local" else []
     if config.cache:
         folder = Path(config.cache).absolute()
         make_cache(folder)
-        cache_flags = ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
+        worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
-        supervisor = make_supervisor(config, catalogue.root, label, cache_flags)
+        supervisor = make_supervisor(config, catalogue.root, label, worker_flags)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
             most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
             most_queued_bytes=config.max_credit_bytes,
+            keys=KeyFolder(Path(config.keys)) if config.keys else None,
+            local_bind=_private_address(label),
         )
         server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file)
         try:
             if config.engine == "local" and (question := question_workers(config.most_workers, usable_cores())):
                 _say(question)
-            supervisor.start(sockets.worker_address)
+            supervisor.start(sockets.local_address if config.engine == "local" else sockets.worker_address)
             supervisor.scale(config.least_workers)
             while not stop.is_set() and config.parent_pid in (0, os.getppid()):
                 server.turn(_TURN_SECONDS)

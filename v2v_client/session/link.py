@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import zmq
 
 from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.wire import Frames
 
 _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
@@ -52,19 +53,24 @@ class Link:
 
     Args:
         address: ``tcp://host:port``.
+        keys: file of this consumer's key; None takes what ``V2V_KEYS`` names, "" none.
+
+    Raises:
+        KeyRefused: the key file cannot be used.
 
     Every method raises ServerLost once the link is closed.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, keys: str | None = None) -> None:
         self._address = address
+        self._key = key_for(address, "consumer", keys)
+        self._handshakes = Handshakes(address, self._key, "consumer")
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
         self._routing_id = b""
         self._sockets = 0
-        self._handshakes = 0
         self._ipv6 = "[" in address
         self._torn = False
 
@@ -97,11 +103,14 @@ class Link:
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
             self._sockets += 1
             events = f"inproc://handshakes-{self._sockets}"
-            socket.monitor(events, zmq.EVENT_HANDSHAKE_SUCCEEDED)
+            socket.monitor(events, HANDSHAKE_EVENTS)
+            if self._key is not None:
+                self._key.secure(socket)
             monitor = self._context.socket(zmq.PAIR)
             monitor.setsockopt(zmq.LINGER, 0)
             monitor.connect(events)
-            self._socket, self._monitor, self._handshakes = socket, monitor, 0
+            self._socket, self._monitor = socket, monitor
+            self._handshakes.begin()
             self._poller = zmq.Poller()
             self._poller.register(socket, zmq.POLLIN)
             self._poller.register(monitor, zmq.POLLIN)
@@ -165,17 +174,19 @@ class Link:
 
     def remade(self) -> bool:
         """Whether ZeroMQ has connected again since the last call. To be asked when nothing is left to receive, or what
-        came before the cut would be taken for lost."""
-        before = self._handshakes
+        came before the cut would be taken for lost.
+
+        Raises:
+            KeyRefused: the server takes no such key.
+        """
+        before = self._handshakes.succeeded
         return self._shaken_hands() > max(1, before)
 
     def _shaken_hands(self) -> int:
         """How often the socket has connected."""
         monitor = self._open(self._monitor)
-        while monitor.poll(0):
-            monitor.recv_multipart(flags=zmq.NOBLOCK)
-            self._handshakes += 1
-        return self._handshakes
+        self._handshakes.take(lambda: monitor.poll(0), lambda: monitor.recv_multipart(flags=zmq.NOBLOCK))
+        return self._handshakes.succeeded
 
     def _open(self, socket: zmq.Socket[bytes] | None) -> zmq.Socket[bytes]:
         if socket is None:

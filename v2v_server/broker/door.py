@@ -75,9 +75,17 @@ class Door:
         router: the socket; not bound yet.
         most_connections: at a time.
         most_queued_bytes: of samples that a consumer has asked for and its host has not taken.
+        most_unread_bytes: that may come without a message of them.
     """
 
-    def __init__(self, router: zmq.Socket[bytes], most_connections: int, most_queued_bytes: int) -> None:
+    def __init__(
+        self,
+        router: zmq.Socket[bytes],
+        most_connections: int,
+        most_queued_bytes: int,
+        most_unread_bytes: int = _LARGEST_UNREAD_BYTES,
+    ) -> None:
+        self._most_unread_bytes = most_unread_bytes
         self._most_connections = most_connections
         self._most_queued_bytes = most_queued_bytes + _SLACK_BYTES
         self._connections: dict[int, _Connection] = {}
@@ -203,7 +211,7 @@ class Door:
             connection.heard, connection.delivered = False, connection.consumed
         connection.consumed = consumed
         if (
-            consumed - connection.delivered > _LARGEST_UNREAD_BYTES
+            consumed - connection.delivered > self._most_unread_bytes
             or connection.sent - taken > self._most_queued_bytes
             or (connection.identity is None and now - connection.since > SAYS_NOTHING_SECONDS)
         ):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,12 +26,15 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.door import MOST_CONNECTIONS, Door
+from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys.zap import HANDSHAKE_MS, Gate
 
 MOST_QUEUED = 512
 """Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
 MOST_UNREAD = 4
 """Messages of one peer that wait for this server. After that its connection is not read: it waits, and nobody else."""
 _KEEPALIVE_SECONDS = 300
+_REVIEW_SECONDS = 0.5
 # Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -98,9 +102,12 @@ class Sockets:
         worker_bind: address for workers.
         most_connections: of consumers, at a time.
         most_queued_bytes: that may wait for one consumer.
+        keys: whose ``tcp://`` peers may come in; None lets in everyone.
+        local_bind: address for workers of this host that have no key; used where ``worker_bind`` asks for one.
 
     Raises:
         UsageError: an address that cannot be bound; the message names the flag.
+        KeyRefused: the server's own keys cannot be read.
     """
 
     def __init__(
@@ -110,23 +117,45 @@ class Sockets:
         *,
         most_connections: int = MOST_CONNECTIONS,
         most_queued_bytes: int = 1 << 40,
+        keys: KeyFolder | None = None,
+        local_bind: str = "",
     ) -> None:
         self._context = zmq.Context()
         self._consumers = self._router(LARGEST_REQUEST_BYTES)
         self._workers = self._router(LARGEST_ARRAY_BYTES)
-        self._door = Door(self._consumers, most_connections, most_queued_bytes)
         try:
+            self._gate = None if keys is None else Gate(self._context, keys)
+        except BaseException:
+            self._context.destroy(linger=0)
+            raise
+        self._door = Door(self._consumers, most_connections, most_queued_bytes)
+        # A worker's samples are large, and it has a key: only those that never say who they are matter here.
+        self._worker_door = None if keys is None else Door(self._workers, most_connections, 1 << 40, 1 << 62)
+        self._users: dict[tuple[str, bytes], str] = {}
+        self._look_at_users = 0.0
+        try:
+            self._guard(self._consumers, bind, "consumer")
             _bind(self._consumers, bind, "--bind")
+            self.local_address = ""
+            if self._gate is not None and not worker_bind.startswith("ipc:") and local_bind:
+                _bind(self._workers, local_bind, "--worker-bind")  # before the guard, which is for what follows it
+                self.local_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
+            self._guard(self._workers, worker_bind, "worker")
             _bind(self._workers, worker_bind, "--worker-bind")
         except BaseException:
-            self._door.close()
-            self._context.destroy(linger=0)
+            self.close()
             raise
         self._poller = zmq.Poller()
         self._poller.register(self._consumers, zmq.POLLIN)
         self._poller.register(self._workers, zmq.POLLIN)
         self.address = self._consumers.getsockopt_string(zmq.LAST_ENDPOINT)
         self.worker_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.local_address = self.local_address or self.worker_address
+
+    def _guard(self, router: zmq.Socket[bytes], address: str, side: str) -> None:
+        # An ipc:// address lets in our own user only.
+        if self._gate is not None and not address.startswith("ipc:"):
+            self._gate.guard(router, side)
 
     def _router(self, largest_bytes: int) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
@@ -134,6 +163,7 @@ class Sockets:
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
+        router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         # Unroutable messages raise instead of vanishing; a peer that reconnects takes its name back.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         router.setsockopt(zmq.ROUTER_HANDOVER, 1)
@@ -150,12 +180,56 @@ class Sockets:
         """See :class:`ServerTransport`."""
         ready = dict(self._poller.poll(int(seconds * 1000)))
         arrivals: list[Arrival] = []
-        if self._workers in ready and (message := _receive(self._workers)) is not None:
+        if self._workers in ready and (message := self._receive(self._workers, "worker")) is not None:
             arrivals.append(FromWorker(*message))
-        if self._consumers in ready and (message := _receive(self._consumers, self._door)) is not None:
+        if self._consumers in ready and (message := self._receive(self._consumers, "consumer")) is not None:
             arrivals.append(FromConsumer(*message))
-        arrivals += map(ConsumerGone, self._door.take_ended())
+        gone = self._door.take_ended()
+        if self._gate is not None:
+            self._review(self._gate, gone)
+        arrivals += map(ConsumerGone, gone)
         return arrivals
+
+    def _receive(self, router: zmq.Socket[bytes], side: str) -> tuple[bytes, list[Any]] | None:
+        """A message that is there, and who sent it: somebody whose key was not revoked since it came in.
+
+        The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
+        """
+        frames: list[Any] = []
+        try:
+            identity = frame = router.recv(_NOBLOCK, copy=False)
+            while frame.more:  # recv_multipart asks the socket instead, which takes longer
+                frame = router.recv(_NOBLOCK, copy=False)
+                frames.append(frame if frames else frame.bytes)
+        except zmq.Again:
+            return None  # a connection that just ended took it along
+        door = self._door if side == "consumer" else self._worker_door
+        if door is not None:
+            with suppress(zmq.ZMQError):  # of some messages, whose connection just ended, ZeroMQ does not know
+                door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
+        if self._gate is not None:
+            with suppress(zmq.ZMQError):  # it came over ipc://, and has no key
+                user = str(identity.get("User-Id"))
+                self._users[side, identity.bytes] = user
+                if not self._gate.admits(side, user):
+                    return None  # the next review cuts it off
+        return identity.bytes, frames
+
+    def _review(self, gate: Gate, gone: list[bytes]) -> None:
+        """Cuts off whose key was revoked."""
+        for side, ended in (
+            ("consumer", gone),
+            ("worker", self._worker_door.take_ended() if self._worker_door else []),
+        ):
+            for identity in ended:
+                self._users.pop((side, identity), None)
+        if (now := time.monotonic()) < self._look_at_users:
+            return
+        self._look_at_users = now + _REVIEW_SECONDS
+        for (side, identity), user in self._users.items():
+            door = self._door if side == "consumer" else self._worker_door
+            if door is not None and not gate.admits(side, user):
+                door.cut(identity)
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
         """See :class:`ServerTransport`."""
@@ -182,6 +256,10 @@ class Sockets:
     def close(self) -> None:
         """Closes both sockets; what was not sent is dropped."""
         self._door.close()
+        if self._worker_door is not None:
+            self._worker_door.close()
+        if self._gate is not None:
+            self._gate.close()
         self._context.destroy(linger=0)
 
 
@@ -192,22 +270,3 @@ def _bind(router: zmq.Socket[bytes], address: str, flag: str) -> None:
         router.bind(address)
     except zmq.ZMQError as error:
         raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
-
-
-def _receive(router: zmq.Socket[bytes], door: Door | None = None) -> tuple[bytes, list[Any]] | None:
-    """A message that is there, and who sent it.
-
-    The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
-    """
-    frames: list[Any] = []
-    try:
-        identity = frame = router.recv(_NOBLOCK, copy=False)
-        while frame.more:  # recv_multipart asks the socket instead, which takes longer
-            frame = router.recv(_NOBLOCK, copy=False)
-            frames.append(frame if frames else frame.bytes)
-    except zmq.Again:
-        return None  # a connection that just ended took it along
-    if door is not None:
-        with suppress(zmq.ZMQError):  # of some messages, whose connection just ended, ZeroMQ does not know
-            door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
-    return identity.bytes, frames

@@ -26,6 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument("--name", help="how its name begins in logs (default: host and process id)")
     work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
     work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
+    work.add_argument("--keys", metavar="FILE", help="its key, see v2v-keys (default: what V2V_KEYS names)")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
@@ -43,7 +44,7 @@ def _run(arguments: argparse.Namespace) -> None:
         if arguments.logbook_fd is None:  # for its own workers a server has made it
             make_cache(folder)
         cache = Cache(folder, int(arguments.cache_gib * GIB))
-    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache)
+    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys)
 
 
 if __name__ == "__main__":

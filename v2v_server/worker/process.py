@@ -20,6 +20,7 @@ import zmq
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.simulation.variants import USUAL
@@ -51,14 +52,23 @@ class Worker:
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
+        keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
 
     Raises:
         UsageError: the address cannot be connected to.
+        KeyRefused: the key file cannot be used.
     """
 
     def __init__(
-        self, name: str, root: Path, address: str, logbook: int | None = None, cache: Cache | None = None
+        self,
+        name: str,
+        root: Path,
+        address: str,
+        logbook: int | None = None,
+        cache: Cache | None = None,
+        keys: str | None = None,
     ) -> None:
+        key = key_for(address, "worker", keys)
         self._name = name
         self._logbook = logbook
         self._clips = Clips(root, cache)
@@ -82,6 +92,10 @@ class Worker:
         self._socket.setsockopt(zmq.SNDHWM, 0)
         self._socket.setsockopt(zmq.RCVHWM, 0)
         self._socket.setsockopt(zmq.IPV6, int("[" in address))
+        if key is not None:
+            key.secure(self._socket)
+        self._handshakes = Handshakes(address, key, "worker")
+        self._monitor = self._socket.get_monitor_socket(HANDSHAKE_EVENTS)
         try:
             self._socket.connect(address)
         except zmq.ZMQError as error:
@@ -89,6 +103,7 @@ class Worker:
             raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._monitor, zmq.POLLIN)
 
     def stop(self) -> None:
         """Finishes the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
@@ -100,6 +115,7 @@ class Worker:
         Raises:
             RemoteError: the server does not want this worker (another numerics version).
             VersionMismatch: the server speaks another version of the protocol.
+            KeyRefused: the server takes no such key.
         """
         try:
             actions = self._conversation.start(time.monotonic())
@@ -150,7 +166,13 @@ class Worker:
         """The first frames of all messages that are there."""
         messages: list[bytes] = []
         timeout_ms = math.ceil(wait_seconds * 1000)
-        while self._poller.poll(0 if messages else timeout_ms):
+        while ready := dict(self._poller.poll(0 if messages else timeout_ms)):
+            if self._monitor in ready:
+                self._handshakes.take(
+                    lambda: self._monitor.poll(0), lambda: self._monitor.recv_multipart(flags=zmq.NOBLOCK)
+                )
+            if self._socket not in ready:
+                break  # the conversation looks at the time
             first, *_ = self._socket.recv_multipart()
             messages.append(first)
         return messages
@@ -203,6 +225,7 @@ def run_worker(
     parent_pid: int | None,
     logbook: int | None = None,
     cache: Cache | None = None,
+    keys: str | None = None,
 ) -> None:
     """Runs one worker in this process until the server stops it.
 
@@ -213,13 +236,15 @@ def run_worker(
         parent_pid: the server, when this is one of its own processes: we die with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
+        keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
 
     Raises:
-        UsageError: the address cannot be connected to.
+        UsageError: the address cannot be connected to, or the server takes no such key.
         RemoteError, VersionMismatch: the server refuses this worker.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
+    key_for(address, "worker", keys)  # a wrong one is said at once
     keep_freed_memory()
     # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
@@ -228,7 +253,7 @@ def run_worker(
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    worker = Worker(name or unshared_name(None), root, address, logbook, cache)
+    worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.
     take_long_turns()

@@ -1,0 +1,259 @@
+"""Keys on real sockets: who has none, a revoked one or the other side's gets nothing beyond the handshake."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from tests.server.broker.test_door import next_from
+from tests.waiting import until
+from v2v_client.session.link import Link
+from v2v_protocol.errors import KeyRefused, UsageError, V2VError
+from v2v_protocol.keys import key_for, read_key
+from v2v_protocol.messages import Ping, Pong
+from v2v_protocol.wire import encode
+from v2v_server.broker.actions import ToConsumer
+from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
+from v2v_server.commands.keys import main
+from v2v_server.keys.folder import KeyFolder
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a door")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> KeyFolder:
+    made = KeyFolder(tmp_path / "keys")
+    made.init()
+    made.new("gpu1", "consumer", tmp_path / "gpu1.key")
+    made.new("cpu1", "worker", tmp_path / "cpu1.key")
+    return made
+
+
+@pytest.fixture
+def sockets(folder: KeyFolder) -> Iterator[Sockets]:
+    opened = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=folder, local_bind=f"ipc://@v2v-keys-{os.getpid()}")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def consumer(sockets: Sockets) -> Iterator[Callable[..., Link]]:
+    links: list[Link] = []
+
+    def connect(file: Path | None, address: str = sockets.address) -> Link:
+        links.append(Link(address, "" if file is None else str(file)))
+        links[-1].connect(1 << 16)
+        links[-1].send(encode(Ping()))
+        return links[-1]
+
+    yield connect
+    for link in links:
+        link.close()
+
+
+def refusal(link: Link) -> str:
+    """What the link says when it learns that it may not come in, which takes seconds at most."""
+    ends = time.monotonic() + 10.0
+    while time.monotonic() < ends:
+        try:
+            assert link.receive(0.1) is None
+            link.remade()
+        except KeyRefused as error:
+            return str(error)
+    raise AssertionError("it was not told")
+
+
+def arrivals(sockets: Sockets, seconds: float) -> list[Arrival]:
+    ends = time.monotonic() + seconds
+    found: list[Arrival] = []
+    while time.monotonic() < ends:
+        found += [each for each in sockets.receive(0.05) if isinstance(each, FromConsumer | FromWorker)]
+    return found
+
+
+def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+    link = consumer(tmp_path / "gpu1.key")
+    arrival = next_from(sockets, FromConsumer)
+    assert isinstance(arrival, FromConsumer)
+    assert sockets.send(ToConsumer(arrival.identity, encode(Pong())))
+    until(lambda: link.receive(0.1))
+
+
+def test_who_has_no_key_is_told_what_to_do(sockets: Sockets, consumer: Callable[..., Link]) -> None:
+    said = refusal(consumer(None))
+    assert "asks for a key" in said
+    assert "v2v-keys new NAME --for consumer" in said
+    assert arrivals(sockets, 0.5) == []
+
+
+def test_a_key_of_the_other_side_opens_nothing(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+    """A consumer's key on the worker port: refused by its domain, although it is a good key on the other."""
+    said = refusal(consumer(tmp_path / "gpu1.key", sockets.worker_address))
+    assert f"{sockets.worker_address} refuses consumer key 'gpu1'" in said
+    assert arrivals(sockets, 0.5) == []
+    with pytest.raises(KeyRefused, match=r"'cpu1' .* is a worker's, and this is a consumer.*--for consumer"):
+        Link(sockets.address, str(tmp_path / "cpu1.key"))
+
+
+def test_a_key_of_another_server_opens_nothing(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+    other = KeyFolder(tmp_path / "other")
+    other.init()
+    other.new("gpu1", "consumer", tmp_path / "other.key")
+    assert "not the server that consumer key 'gpu1' was made for" in refusal(consumer(tmp_path / "other.key"))
+    assert arrivals(sockets, 0.5) == []
+
+
+def test_a_revoked_key_loses_its_open_connection(
+    folder: KeyFolder, sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path
+) -> None:
+    folder.new("gpu2", "consumer", tmp_path / "gpu2.key")  # while the server runs
+    link, other = consumer(tmp_path / "gpu1.key"), consumer(tmp_path / "gpu2.key")
+    assert len({next_from(sockets, FromConsumer).identity for _ in range(2)}) == 2  # type: ignore[union-attr]
+    folder.revoke("gpu1")
+    time.sleep(1.2)  # the server looks twice a second
+    link.send(encode(Ping()))
+    other.send(encode(Ping()))
+    assert len(arrivals(sockets, 1.5)) == 1  # the other's
+    said = refusal(link)
+    assert "refuses consumer key 'gpu1': it was revoked" in said
+    assert not other.remade()
+
+
+def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(
+    folder: KeyFolder, sockets: Sockets, tmp_path: Path
+) -> None:
+    context = zmq.Context()
+    try:
+        peers = []
+        for address in (sockets.worker_address, sockets.local_address):
+            peer = context.socket(zmq.DEALER)
+            peers.append(peer)
+            if address == sockets.worker_address:
+                read_key(tmp_path / "cpu1.key").secure(peer)
+            peer.connect(address)
+            peer.send_multipart(encode(Ping()))
+        remote = peers[0].get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        assert len({next_from(sockets, FromWorker).identity for _ in peers}) == 2  # type: ignore[union-attr]
+        folder.revoke("cpu1")
+        arrivals(sockets, 2.0)
+        assert remote.poll(3000)
+        peers[1].send_multipart(encode(Ping()))
+        assert len(arrivals(sockets, 1.0)) == 1  # the local one's
+    finally:
+        context.destroy(linger=0)
+
+
+@pytest.mark.parametrize("half", [b"", b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0CURVE" + bytes(15 + 1 + 31)])
+def test_half_open_connections_end_and_starve_nobody(
+    half: bytes, sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path
+) -> None:
+    port = int(sockets.address.rpartition(":")[2])
+    peers = [socket.create_connection(("127.0.0.1", port)) for _ in range(200)]
+    try:
+        for peer in peers:
+            peer.sendall(half)
+        consumer(tmp_path / "gpu1.key")
+        began = time.monotonic()
+        assert isinstance(next_from(sockets, FromConsumer), FromConsumer)
+        assert time.monotonic() - began < 2.0
+        for peer in peers:
+            peer.settimeout(6.0)
+            while peer.recv(4096):
+                pass
+    finally:
+        for peer in peers:
+            peer.close()
+
+
+def test_a_file_that_others_may_read_is_refused(folder: KeyFolder, tmp_path: Path) -> None:
+    for file in (tmp_path / "gpu1.key", folder.path / "server.key"):
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        file.chmod(0o640)
+    with pytest.raises(KeyRefused, match=r"gpu1.key has mode 0640.*chmod 600"):
+        key_for("tcp://x:1", "consumer", tmp_path / "gpu1.key")
+    with pytest.raises(KeyRefused, match=r"server.key has mode 0640"):
+        Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=folder)
+
+
+def test_the_environment_names_a_key(folder: KeyFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("V2V_KEYS", str(tmp_path / "gpu1.key"))
+    key = key_for("tcp://x:1", "consumer", None)
+    assert key is not None
+    assert key.name == "gpu1"
+    assert key.secret not in f"{key!r} {key}"
+    assert key_for("tcp://x:1", "consumer", "") is None
+    assert key_for("ipc://x", "consumer", None) is None
+    monkeypatch.setenv("V2V_KEYS", str(tmp_path / "none.key"))
+    with pytest.raises(KeyRefused, match=r"none.key cannot be read: No such file"):
+        key_for("tcp://x:1", "consumer", None)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"side": "consumer"}', "\xff"])
+def test_what_is_no_key_file(content: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.key"
+    file.write_text(content)
+    file.chmod(0o600)
+    with pytest.raises(KeyRefused, match=r"a.key is no key file"):
+        read_key(file)
+
+
+def test_no_secret_is_in_an_error(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
+    secret = read_key(tmp_path / "gpu1.key").secret
+    link = Link(sockets.worker_address, str(tmp_path / "gpu1.key"))
+    try:
+        link.connect(1 << 16)
+        assert secret not in refusal(link)
+    finally:
+        link.close()
+    file = tmp_path / "gpu1.key"
+    file.write_text(file.read_text().replace('"side"', '"sides"'))
+    with pytest.raises(V2VError) as raised:
+        read_key(file)
+    assert secret not in str(raised.value)
+    assert raised.value.__cause__ is None
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(["init"]) == 0
+    assert main(["init"]) == 2  # the keys that were given out would end
+    assert main(["new", "gpu1", "--for", "consumer"]) == 0
+    assert main(["new", "gpu1", "--for", "consumer"]) == 2
+    assert main(["new", "../gpu1", "--for", "consumer"]) == 2
+    assert main(["new", "gpu2"]) == 2
+    key = read_key(tmp_path / "gpu1.key")
+    capsys.readouterr()
+    assert main(["list"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.split() == ["consumer", "gpu1", key.public]
+    assert main(["revoke", "gpu1"]) == 0
+    assert main(["revoke", "gpu1"]) == 2
+    captured = capsys.readouterr()
+    assert key.secret not in shown + captured.out + captured.err
+
+
+def test_a_server_without_keys_is_not_talked_to_with_one(tmp_path: Path, folder: KeyFolder) -> None:
+    plain = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    link = Link(plain.address, str(tmp_path / "gpu1.key"))
+    try:
+        link.connect(1 << 16)
+        link.send(encode(Ping()))
+        assert "asks for no key" in refusal(link)
+        assert arrivals(plain, 0.3) == []
+    finally:
+        link.close()
+        plain.close()
+
+
+def test_a_folder_without_keys_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"server.key cannot be read"):
+        Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=KeyFolder(tmp_path))

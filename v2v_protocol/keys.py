@@ -1,0 +1,177 @@
+"""The key of a consumer or a worker: its file, which `v2v-keys new` writes, and what ZeroMQ is told of it.
+
+A key file is JSON: the side it is for, a name, the server's public key, and a pair of its own. It serves one side only:
+the server keeps consumers' and workers' keys apart. ``ipc://`` addresses take no keys: they let in only our own user.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from v2v_protocol.errors import KeyRefused
+
+SIDES = ("consumer", "worker")
+VARIABLE = "V2V_KEYS"
+KEY_LETTERS = 40
+"""Of a CURVE key, in Z85."""
+HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
+"""What a socket's monitor says of handshakes: ended without a word, succeeded, other mechanism, not authenticated."""
+_SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
+_MISMATCH = 0x11000002
+_MOST_SILENT = 5
+"""Handshakes in a row that the server ended without a word; a server that is stopped may end one or two."""
+
+
+@dataclass(frozen=True, slots=True)
+class PeerKey:
+    """What a key file holds. Its secret is in no text that Python makes of it."""
+
+    side: str
+    name: str
+    server: str
+    public: str
+    secret: str = field(repr=False)
+
+    def secure(self, socket: Any) -> None:
+        """To be called before a ZeroMQ socket connects."""
+        socket.curve_serverkey = self.server.encode()
+        socket.curve_publickey = self.public.encode()
+        socket.curve_secretkey = self.secret.encode()
+
+
+def key_for(address: str, side: str, file: str | os.PathLike[str] | None) -> PeerKey | None:
+    """The key to use with an address.
+
+    Args:
+        side: "consumer" or "worker".
+        file: of the key; None takes what ``V2V_KEYS`` names, and "" none at all.
+
+    Returns:
+        None: none was given, or the address needs none.
+
+    Raises:
+        KeyRefused: the file cannot be read, others can read it, or it is for the other side.
+    """
+    named = os.environ.get(VARIABLE, "") if file is None else os.fspath(file)
+    if not named or address.startswith("ipc:"):
+        return None
+    key = read_key(Path(named))
+    if key.side != side:
+        raise KeyRefused(
+            f"key {key.name!r} ({named}) is a {key.side}'s, and this is a {side}: ask for one that "
+            f"`v2v-keys new NAME --for {side}` made"
+        )
+    return key
+
+
+def read_key(file: Path) -> PeerKey:
+    """
+    Raises:
+        KeyRefused: it cannot be read, others can read it, or it is no key file.
+    """
+    try:
+        key = PeerKey(**json.loads(read_private(file)))
+    except (ValueError, TypeError):
+        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made") from None
+    if key.side not in SIDES or any(
+        not isinstance(each, str) or len(each) != KEY_LETTERS for each in (key.server, key.public, key.secret)
+    ):
+        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made")
+    return key
+
+
+def read_private(file: Path) -> str:
+    """The text of a file that holds a secret.
+
+    Raises:
+        KeyRefused: it cannot be read, or others can read it.
+    """
+    try:
+        with file.open("rb") as opened:
+            mode = stat.S_IMODE(os.fstat(opened.fileno()).st_mode)
+            if mode & 0o077:
+                raise KeyRefused(f"key file {file} has mode {mode:04o}, so others may have it: chmod 600 {file}")
+            return opened.read(4096).decode(errors="replace")
+    except OSError as error:
+        raise KeyRefused(f"key file {file} cannot be read: {error.strerror}") from error
+
+
+def write_key(file: Path, key: PeerKey) -> None:
+    """Writes a key file that only its owner can read.
+
+    Raises:
+        FileExistsError: one is there.
+    """
+    write_private(file, json.dumps(asdict(key), indent=1) + "\n")
+
+
+def write_private(file: Path, content: str) -> None:
+    """Makes a file of mode 0600.
+
+    Raises:
+        FileExistsError: one is there.
+    """
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as opened:
+        opened.write(content)
+
+
+class Handshakes:
+    """Counts the handshakes of a socket that connects, by the events of its monitor.
+
+    Args:
+        address, key, side: of the socket, for messages.
+    """
+
+    def __init__(self, address: str, key: PeerKey | None, side: str) -> None:
+        self.succeeded = 0
+        self._is_proven = False  # that the server is the one of the key
+        self._silent = 0
+        self._address, self._side = address, side
+        self._mine = "no key was given" if key is None else f"{side} key {key.name!r}"
+        self._has_key = key is not None
+
+    def begin(self) -> None:
+        """Another socket takes the place of the one before."""
+        self.succeeded = 0
+
+    def take(self, waiting: Callable[[], int], receive: Callable[[], Sequence[bytes]]) -> None:
+        """Takes in the events that are there.
+
+        Args:
+            waiting: whether there is one.
+            receive: it.
+
+        Raises:
+            KeyRefused: the two sides will never agree.
+        """
+        while waiting():
+            event, value = struct.unpack("=Hi", receive()[0])
+            self._silent = self._silent + 1 if event == _SILENT else 0
+            if event == _SUCCEEDED:
+                self.succeeded += 1
+                self._is_proven = True
+            elif event == _AUTHENTICATION:
+                raise KeyRefused(
+                    f"{self._address} refuses {self._mine}: it was revoked, or never was a {self._side} key there; "
+                    f"`v2v-keys list` on the server's host shows those that are"
+                )
+            elif event == _MECHANISM and value == _MISMATCH:
+                raise KeyRefused(
+                    f"{self._address} asks for no key, and this side has one ({self._mine}): nothing was sent; leave "
+                    f"the key out (keys='', or no {VARIABLE}) only if that server is known to be without keys"
+                    if self._has_key
+                    else f"{self._address} asks for a key, and {self._mine}: set {VARIABLE} (or keys=, --keys) to a "
+                    f"file that `v2v-keys new NAME --for {self._side}` made"
+                )
+            elif self._has_key and not self._is_proven and self._silent >= _MOST_SILENT:
+                raise KeyRefused(
+                    f"{self._address} ended {self._silent} handshakes without a word: it is not the server that "
+                    f"{self._mine} was made for, or no server of ours; ask for a new key file"
+                )

@@ -1,0 +1,132 @@
+"""The folder of a server's keys. I/O.
+
+    server.key          the server's own pair, mode 0600
+    consumer/NAME       public key of a consumer
+    worker/NAME         public key of a worker
+
+What is given to a peer (:mod:`v2v_protocol.keys`) is written elsewhere; its secret is not kept here. To revoke a key is
+to remove its file: a running server looks twice a second.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import zmq
+
+from v2v_protocol.errors import KeyRefused, UsageError
+from v2v_protocol.keys import KEY_LETTERS, SIDES, PeerKey, read_private, write_key, write_private
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+class KeyFolder:
+    """A folder that :meth:`init` made.
+
+    Args:
+        path: of the folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._server = path / "server.key"
+
+    def init(self) -> None:
+        """Makes the folder and the server's keys.
+
+        Raises:
+            UsageError: there are keys already, or the folder cannot be made.
+        """
+        public, secret = (key.decode() for key in zmq.curve_keypair())
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for side in SIDES:
+                (self.path / side).mkdir(mode=0o700, exist_ok=True)
+            write_private(self._server, json.dumps({"public": public, "secret": secret}) + "\n")
+        except FileExistsError as error:
+            raise UsageError(f"{self._server} is there: keys that were given out would end with it") from error
+        except OSError as error:
+            raise UsageError(f"--dir {self.path}: {error.strerror}") from error
+
+    def server_keys(self) -> tuple[bytes, bytes]:
+        """The server's public and secret key.
+
+        Raises:
+            KeyRefused: there is none, or others can read it.
+        """
+        text = read_private(self._server)
+        try:
+            keys = json.loads(text)
+            public, secret = keys["public"].encode(), keys["secret"].encode()
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise KeyRefused(f"{self._server} is no key file: v2v-keys init makes one") from None
+        return public, secret
+
+    def new(self, name: str, side: str, out: Path) -> None:
+        """Makes a key for a peer, and lets it in.
+
+        Args:
+            side: "consumer" or "worker".
+            out: the file to be given to it.
+
+        Raises:
+            UsageError: the name is taken or no name, or a file cannot be written.
+            KeyRefused: the server has no keys.
+        """
+        if not _NAME.fullmatch(name):
+            raise UsageError(f"{name!r}: a key's name is up to 64 letters, digits, dots, dashes and underscores")
+        server, _ = self.server_keys()
+        public, secret = (key.decode() for key in zmq.curve_keypair())
+        entry = self.path / side / name
+        if entry.exists():
+            raise UsageError(f"there is a {side} key {name!r}: revoke it first, or take another name")
+        try:
+            write_key(out, PeerKey(side, name, server.decode(), public, secret))
+            write_private(entry, public + "\n")
+        except OSError as error:
+            raise UsageError(f"{error.filename}: {error.strerror}") from error
+
+    def revoke(self, name: str) -> list[str]:
+        """Removes the keys of that name; returns their sides.
+
+        Raises:
+            UsageError: there is none.
+        """
+        sides = [side for side in SIDES if _NAME.fullmatch(name) and (self.path / side / name).exists()]
+        if not sides:
+            raise UsageError(f"no key {name!r} in {self.path}: v2v-keys list shows all")
+        for side in sides:
+            (self.path / side / name).unlink(missing_ok=True)
+        return sides
+
+    def changed(self) -> tuple[int, ...]:
+        """Something that differs once a key was made or removed. A folder that is gone has no keys."""
+        return tuple(self._stamp(self.path / side) for side in SIDES)
+
+    @staticmethod
+    def _stamp(folder: Path) -> int:
+        try:
+            return folder.stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def allowed(self) -> dict[str, dict[str, str]]:
+        """Of each side: names by public key."""
+        return {side: self._of(side) for side in SIDES}
+
+    def _of(self, side: str) -> dict[str, str]:
+        found: dict[str, str] = {}
+        try:
+            entries = sorted((self.path / side).iterdir())
+        except OSError:
+            return found
+        for entry in entries:
+            try:
+                public = entry.read_text(encoding="ascii").strip()
+            except (OSError, ValueError):
+                continue  # revoked at this moment, or none of ours
+            if _NAME.fullmatch(entry.name) and len(public) == KEY_LETTERS:
+                found[public] = entry.name
+        return found
