@@ -5,7 +5,7 @@ worker      v2v-worker
 simulate    v2v-simulate
 preview     v2v-preview
 prepare     v2v-prepare
-keys         who may talk to a server (v2v-keys)
+keys        who may talk to a server (v2v-keys)
 quarantine  v2v-quarantine
 spec_flags  the flags for what a stream is made of
 """
