@@ -1,0 +1,48 @@
+"""What would run what a stranger sent is nowhere, or in the few places that are named here."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer")
+MAY_UNPICKLE = {
+    "v2v_client/position/shared.py",  # a descriptor that only this process and its loader workers have
+    "trainer/unpickle.py",  # weights, by an unpickler that knows a closed list of names
+}
+CALLS = {"eval", "exec", "os.system", "os.popen", "pickle.load", "pickle.loads", "marshal.loads", "yaml.unsafe_load"}
+
+
+def calls() -> list[tuple[str, ast.Call]]:
+    found = []
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            found += [(str(path.relative_to(ROOT)), node) for node in tree if isinstance(node, ast.Call)]
+    return found
+
+
+def test_nothing_that_was_sent_is_run() -> None:
+    found = {path for path, call in calls() if ast.unparse(call.func) in CALLS}
+    assert found == {"v2v_client/position/shared.py"}
+
+
+def test_no_command_goes_through_a_shell() -> None:
+    assert [path for path, call in calls() if any(word.arg == "shell" for word in call.keywords)] == []
+
+
+def test_yaml_is_the_safe_kind() -> None:
+    loads = [(path, call) for path, call in calls() if ast.unparse(call.func) in ("yaml.load", "yaml.full_load")]
+    assert {(path, ast.unparse(call.args[1])) for path, call in loads} == {("v2v_server/config.py", "_Loader")}
+    assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_server/config.py").read_text(encoding="utf-8")
+
+
+def test_pickle_is_known_in_two_places() -> None:
+    found = set()
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Import) and any(alias.name == "pickle" for alias in node.names):
+                    found.add(str(path.relative_to(ROOT)))
+    assert found == MAY_UNPICKLE
