@@ -21,7 +21,6 @@ from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.simulation.variants import Variant
-from v2v_server.store.cache import Cache
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.handover import Room
@@ -124,7 +123,7 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     names: list[str] = []
 
     class Named(Worker):
-        def __init__(self, name: str, root: Path, address: str, logbook: int | None, cache: Cache | None) -> None:
+        def __init__(self, name: str, *more: object) -> None:
             names.append(name)
 
         def run(self) -> None:
