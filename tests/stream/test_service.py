@@ -121,7 +121,7 @@ BAD_SETTINGS = [
     (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
     (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),
     (["--videos", "{clips}", "--rows", "middle"], "rows"),
-    (["--videos", "{clips}", "--workers", "-1"], "--workers: '-1': give a whole number from 0 to 4096"),
+    (["--videos", "{clips}", "--workers", "-1"], "--workers: '-1': give a whole number, or LEAST:MOST, from 0 to 4096"),
 ]
 BAD_SURROUNDINGS = [
     (["--videos", "{clips}/nowhere"], "nowhere: there is no such folder"),
