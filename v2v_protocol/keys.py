@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import stat
 import struct
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x400
 _MISMATCH = 0x11000002
 _MOST_SILENT = 5
 """Handshakes in a row that the server ended without a word; a server that is stopped may end one or two."""
+_ASK_EVERY = 5
+_OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,7 @@ class Handshakes:
                     f"{self._address} refuses {self._mine}: it was revoked, or never was a {self._side} key there; "
                     f"`v2v-keys list` on the server's host shows those that are"
                 )
-            elif event == _MECHANISM and value == _MISMATCH:
+            elif (event == _MECHANISM and value == _MISMATCH) or self._is_lost():
                 raise KeyRefused(
                     f"{self._address} asks for no key, and this side has one ({self._mine}): nothing was sent; leave "
                     f"the key out (keys='', or no {VARIABLE}) only if that server is known to be without keys"
@@ -175,3 +178,28 @@ class Handshakes:
                     f"{self._address} ended {self._silent} handshakes without a word: it is not the server that "
                     f"{self._mine} was made for, or no server of ours; ask for a new key file"
                 )
+
+    def _is_lost(self) -> bool:
+        """Whether the two sides disagree about a key, and what the server said of that was lost: it ends such a
+        handshake as soon as it knows, and its words may go with the connection. So it is asked again, now and then."""
+        if self._is_proven or self._silent % _ASK_EVERY != 1:
+            return False
+        return mechanism_of(self._address) == (b"NULL" if self._has_key else b"CURVE")
+
+
+def mechanism_of(address: str, seconds: float = 2.0) -> bytes:
+    """How the server there wants to be spoken to, by its greeting (ZMTP 3: 64 bytes, of which 20 name the mechanism).
+
+    Returns:
+        ``b"CURVE"`` or ``b"NULL"``; nothing where no such server answers in time.
+    """
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    greeting = b""
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=seconds) as peer:
+            peer.sendall(_OUR_SIGNATURE)  # and no more: who has the whole greeting of the other decides
+            while len(greeting) < 64 and (piece := peer.recv(64 - len(greeting))):
+                greeting += piece
+    except (OSError, ValueError):
+        return b""
+    return greeting[12:32].rstrip(b"\0") if greeting[:1] == b"\xff" else b""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import stat
+import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from tests.server.broker.test_door import next_from
 from tests.waiting import until
 from v2v_client.session.link import Link
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
-from v2v_protocol.keys import key_for, read_key
+from v2v_protocol.keys import Handshakes, key_for, mechanism_of, read_key
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer
@@ -252,6 +253,28 @@ def test_a_server_without_keys_is_not_talked_to_with_one(tmp_path: Path, folder:
     finally:
         link.close()
         plain.close()
+
+
+SILENT = struct.pack("=Hi", 0x0800, 32)
+
+
+@pytest.mark.parametrize("has_key", [True, False])
+def test_a_server_whose_words_were_lost_is_asked_again(tmp_path: Path, sockets: Sockets, has_key: bool) -> None:
+    """It ends the connection as soon as it knows that the two disagree; on a busy host nothing else was ever heard."""
+    plain = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    try:
+        assert mechanism_of(sockets.address) == b"CURVE"
+        assert mechanism_of(plain.address) == b"NULL"
+        address, other = (plain.address, sockets.address) if has_key else (sockets.address, plain.address)
+        key = read_key(tmp_path / "gpu1.key") if has_key else None
+        events = [SILENT]
+        with pytest.raises(KeyRefused, match="asks for no key" if has_key else "asks for a key, and no key was given"):
+            Handshakes(address, key, "consumer").take(lambda: len(events), lambda: [events.pop()])
+        events = [SILENT]
+        Handshakes(other, key, "consumer").take(lambda: len(events), lambda: [events.pop()])
+    finally:
+        plain.close()
+    assert mechanism_of(plain.address) == b""
 
 
 def test_a_folder_without_keys_is_named(tmp_path: Path) -> None:
