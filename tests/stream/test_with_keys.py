@@ -16,6 +16,8 @@ from v2v_protocol.errors import KeyRefused
 from v2v_protocol.keys import read_key
 from v2v_server.keys.folder import KeyFolder
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

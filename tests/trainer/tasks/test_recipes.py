@@ -32,9 +32,10 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
 }  # fmt: skip
 SHIPPED = [
-    pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name else []) for name in shipped()
+    pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name or "e2vid-" in name else [])
+    for name in shipped()
 ]
-"""RAFT and E-RAFT have no reduced size."""
+"""RAFT and E-RAFT have no reduced size; most kinds of E2VID differ in a number."""
 SIDE_PX = 33
 """The least that AlexNet takes, and divides by nothing."""
 
