@@ -39,7 +39,8 @@ test: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "not slow"
 
 test-slow: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "slow and not alone"
+	$(BIN)/python -m pytest -q -m alone
 
 $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLD_NUMPY)

@@ -19,7 +19,7 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.filterwarnings("ignore")]
 _STORE_BYTES = 80 << 20
 _EPOCHS = 3
 

@@ -17,6 +17,7 @@ FAST_SECONDS, SLOW_SECONDS = 40.0, 60.0
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_two_six_two_and_every_sample_once(clips: Path) -> None:
     epochs: list[list[str]] = []
     with LocalServer(clips, flags=[*SMALL_FLAGS, "--scale-seconds", "6", "--workers", "2:6"]) as server:
