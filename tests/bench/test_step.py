@@ -10,6 +10,7 @@ import pytest
 from v2v_bench import step
 
 
+@pytest.mark.slow
 def test_a_step_is_measured_apart(tmp_path: Path) -> None:
     out = tmp_path / "step.json"
     flags = ["--networks", "firenet", "--side", "16", "--voxels", "2", "--steps", "1", "--json", str(out)]

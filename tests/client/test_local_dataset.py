@@ -71,6 +71,7 @@ def test_it_streams_and_its_server_goes_with_it(clips: Path, servers: set[psutil
     gc.collect()
 
 
+@pytest.mark.slow
 def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers: set[psutil.Process]) -> None:
     """It is a fork, and has a copy of all that would stop it."""
     dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)

@@ -27,7 +27,7 @@ FORGETFUL = ("evflownet",)
 """Nothing of a window reaches the next."""
 
 
-@pytest.fixture(params=NETWORKS)
+@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] if name == "eraft" else []) for name in NETWORKS])
 def name(request: pytest.FixtureRequest) -> str:
     chosen: str = request.param
     return chosen

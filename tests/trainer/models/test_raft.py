@@ -115,6 +115,7 @@ def test_small_pictures_are_padded_to_what_the_pyramid_needs(tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(not PUBLISHED.is_file(), reason=f"no {PUBLISHED}; set V2V_TEST_WEIGHTS")
+@pytest.mark.slow
 def test_bfloat16_stays_near() -> None:
     """With weights that estimate flow: those of the formula amplify every rounding."""
     exact = RaftFlow("small", PUBLISHED)(*pictures())

@@ -31,11 +31,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
 }  # fmt: skip
-SHIPPED = [
-    pytest.param(name, marks=[pytest.mark.slow] if "flow" in name or "eraft" in name or "e2vid-" in name else [])
-    for name in shipped()
-]
-"""RAFT and E-RAFT have no reduced size; most kinds of E2VID differ in a number."""
+QUICK = ("e2vid", "firenet-cpu", "tiny-cpu")
+"""RAFT and E-RAFT have no reduced size, and most kinds of E2VID differ in a number."""
+SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in shipped()]
 SIDE_PX = 33
 """The least that AlexNet takes, and divides by nothing."""
 
