@@ -9,6 +9,7 @@ import psutil
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from tests.waiting import until
 from v2v_bench.chaos.fleet import Fleet
 from v2v_bench.chaos.hostile import KINDS
 from v2v_bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
@@ -51,17 +52,12 @@ def test_an_attack_arrives(tmp_path: Path, corpus: Path) -> None:
         server = psutil.Process(fleet.server.pid)
         calm = server.num_fds()
         peers = fleet.peers("idle")
-        most = calm
         try:
-            for _ in range(100):
-                most = max(most, server.num_fds())
-                if most > calm + 50:
-                    break
-                spell(fleet, 0.1)
+            until(lambda: server.num_fds() > calm + 50)
+            assert peers.poll() is None
         finally:
             peers.kill()
             peers.wait()
-        assert most > calm + 50
     finally:
         fleet.kill()
 
