@@ -6,6 +6,7 @@ python -m examples.demo --videos DIR --picture out/demo.png
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -40,6 +41,7 @@ def main() -> int:
     picture = Path(arguments.picture)
     picture.parent.mkdir(parents=True, exist_ok=True)
 
+    os.environ.pop("V2V_KEYS", None)  # a key for servers elsewhere; this one asks for none
     with LocalServer(arguments.videos, workers=arguments.workers) as server:
         _stream(server.address, arguments.seconds, arguments.workers, picture)
         run = picture.parent / "training"

@@ -46,6 +46,7 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
         "flow_direction": asked.flow_direction,
         "flow_from": asked.flow_from,
         "timeout_seconds": settings.timeout_seconds,
+        "keys": None if settings.address else "",  # a server of our own asks for none
         **settings.spec,
     }
     return V2VStreamDataset(address, **(arguments | changes))

@@ -32,7 +32,7 @@ from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 from v2v_protocol.settings import require_whole
-from v2v_protocol.spec import SpecOptions
+from v2v_protocol.spec import SpecOptions, StreamSpec
 
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
@@ -161,14 +161,13 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             UsageError: what is wrong with the videos or flags; ServerLost: the server does not come up.
         """
-        named = recipe.to_dict() if isinstance(recipe, Recipe) else recipe
-        named = {"preset": named or "paper"} if named is None or isinstance(named, str) else named
-        resolved = Recipe.from_dict(named)
+        resolved = recipe if isinstance(recipe, Recipe) else StreamSpec.from_dict({"recipe": recipe}).recipe
         scene = options.get("scene")
         asked = [*recipe_flags(resolved), *(("--scene", scene) if scene else ()), *flags]
         server = LocalServer(videos, workers=workers, flags=asked).__enter__()
         try:
-            dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, **options)
+            # V2V_KEYS may name a key for servers elsewhere.
+            dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, keys="", **options)
         except BaseException:
             server.stop()
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,8 +16,10 @@ from torch.utils.data import DataLoader
 
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
+from v2v_bench.chaos.fleet import abandoned_memory, shared_memory
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import UsageError
+from v2v_server.keys.folder import KeyFolder
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 2, "crop_height_px": 32, "crop_width_px": 32}
 SCRIPT = """
@@ -81,6 +84,20 @@ def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers:
     gc.collect()
 
 
+def test_a_key_for_servers_elsewhere_is_not_used(
+    clips: Path, servers: set[psutil.Process], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = KeyFolder(tmp_path / "keys")
+    folder.init()
+    folder.new("gpu", "consumer", tmp_path / "gpu.key")
+    monkeypatch.setenv("V2V_KEYS", str(tmp_path / "gpu.key"))
+    dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
+    servers.update(psutil.Process().children(recursive=True))
+    assert next(iter(dataset)).voxels is not None
+    del dataset
+    gc.collect()
+
+
 def test_what_is_wrong_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:
     with pytest.raises(UsageError, match="no video found"):
         V2VStreamDataset.local(tmp_path, recipe=RECIPE)
@@ -88,8 +105,17 @@ def test_what_is_wrong_is_the_servers_own_message(tmp_path: Path, servers: set[p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", ["break", "raise SystemExit(0)", "os.kill(os.getpid(), signal.SIGKILL)"])
-def test_nothing_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end: str) -> None:
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [
+        ("break", 0),
+        ("raise SystemExit(0)", 0),
+        ("raise ValueError", 1),
+        ("os.kill(os.getpid(), signal.SIGKILL)", -signal.SIGKILL),
+    ],
+)
+def test_nothing_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end: str, status: int) -> None:
+    memory = shared_memory()
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(recipe=RECIPE, end=end), encoding="utf-8")
     with subprocess.Popen([sys.executable, str(script), str(clips)], stdout=subprocess.PIPE) as program:
@@ -97,5 +123,6 @@ def test_nothing_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end:
         assert program.stdout.readline()
         started = [each for each in psutil.process_iter() if str(clips) in command(each) and each.pid != program.pid]
         program.wait()
-    assert program.returncode in (0, -9)
+    assert program.returncode == status
     until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
+    until(lambda: not abandoned_memory(memory))

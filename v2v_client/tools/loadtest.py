@@ -262,6 +262,7 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
         rank=0,
         world_size=1,
         timeout_seconds=arguments.timeout_seconds,
+        keys=None if arguments.connect else "",  # a server of our own asks for none
     )
 
 
