@@ -58,7 +58,7 @@ def train(
         batches = islice(batches, max(0, run.steps - step))
     judges = ranks.first and (run.judge_every or run.preview_every)
     held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
-    validate = task.validator(Path(run.validate)) if run.validate and ranks.first else None
+    validate = task.validator(learner.trained, Path(run.validate)) if run.validate and ranks.first else None
 
     meter = Meter(ranks)
     begun, saved, judged = step, None, None
@@ -124,7 +124,7 @@ def train(
                     prune_epochs(out, run.keep_epochs)
             if validate is not None and ended and (epoch + 1) % run.validate_every == 0:
                 look()
-                if reporter.validated(step, validate(learner.trained)):
+                if reporter.validated(step, validate()):
                     save(BEST)
         # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
         if saved != step and (step > begun or stop.failure is None):

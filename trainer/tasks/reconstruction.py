@@ -12,7 +12,7 @@ from torch import Tensor
 
 from trainer import pictures
 from trainer.evaluation.config import folder_config
-from trainer.evaluation.evaluate import Run, evaluate_data_set
+from trainer.evaluation.evaluate import Run, check_data_set, evaluate_data_set
 from trainer.evaluation.metrics import make_metrics
 from trainer.evaluation.score import mean_over_sequences
 from trainer.evaluation.voxelise import VoxelSettings
@@ -112,7 +112,7 @@ class Reconstruction(Task):
             truth["flow"] = self._flow(batch, frames)
         return Work(voxels=batch.arrays["voxels"].to(self.device), truth=truth, guide=self._guide(frames, epoch))
 
-    def validator(self, recordings: Path) -> Callable[[VoxelNetwork], dict[str, float]]:
+    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
         """See :meth:`Task.validator`: LPIPS by the network that the loss names, where its files are given; MSE and how
         much pictures lack in correlation."""
         if not recordings.exists():
@@ -122,10 +122,11 @@ class Reconstruction(Task):
             files[chosen.lpips_network] = (chosen.lpips_backbone, chosen.lpips_heads)
         metrics = make_metrics([*(f"lpips_{net}" for net in files), "mse", "correlation"], files, str(self.device))
         (data_set,) = folder_config(recordings).data_sets
+        run = Run(network, VoxelSettings(bins=network.bins), metrics, str(self.device))
+        check_data_set(run, recordings, data_set)
 
-        def scores(network: VoxelNetwork) -> dict[str, float]:
+        def scores() -> dict[str, float]:
             training = network.training
-            run = Run(network, VoxelSettings(bins=network.bins), metrics, str(self.device))
             means = mean_over_sequences(evaluate_data_set(run, recordings, data_set))
             network.train(training)
             if not means:

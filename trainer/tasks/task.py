@@ -130,10 +130,11 @@ class Task(abc.ABC):
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> Image:
         """What the network saw of one sample, made of it, and should have made: [T, height, width, 3] uint8 RGB."""
 
-    def validator(self, recordings: Path) -> Callable[[VoxelNetwork], dict[str, float]]:
+    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
         """What scores a network on recordings.
 
         Args:
+            network: as it is whenever the function is called.
             recordings: a file, or a folder of them, as ``v2v-eval --data`` takes.
 
         Returns:

@@ -24,6 +24,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from typing import NoReturn
 
 import zmq
 
@@ -104,22 +105,18 @@ KINDS: dict[str, Callable[[str, int], None]] = {
 }
 
 
-def attack(address: str, kind: str, told: Callable[[], bool]) -> None:
-    """Sets :data:`PEERS` peers on a server, again when cut off, until told. Threads end with the process."""
+def attack(address: str, kind: str) -> NoReturn:
+    """Sets :data:`PEERS` peers on a server, again when cut off, as long as this process lives."""
 
-    def live(number: int) -> None:
-        while not told():
+    def live(number: int) -> NoReturn:
+        while True:
             with suppress(OSError, zmq.ZMQError):  # cut off, or the server is gone for now
                 KINDS[kind](address, number)
             time.sleep(0.01)
 
-    if kind == "slow":
-        live(0)
-        return
-    for number in range(PEERS):
+    for number in range(1, 1 if kind == "slow" else PEERS):
         threading.Thread(target=live, args=(number,), daemon=True).start()
-    while not told():
-        time.sleep(0.1)
+    live(0)
 
 
 @contextmanager
@@ -147,16 +144,15 @@ def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
         peer.close()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """The command line."""
     parser = argparse.ArgumentParser(prog="python -m v2v_bench.chaos.hostile", description=__doc__)
     parser.add_argument("--address", required=True)
     parser.add_argument("--kind", required=True, choices=KINDS)
     asked = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    attack(asked.address, asked.kind, lambda: False)
-    return 0
+    attack(asked.address, asked.kind)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -119,7 +119,9 @@ def test_a_revoked_key_loses_its_open_connection(
     link, other = consumer(tmp_path / "gpu1.key"), consumer(tmp_path / "gpu2.key")
     assert len({next_from(sockets, FromConsumer).identity for _ in range(2)}) == 2  # type: ignore[union-attr]
     folder.revoke("gpu1")
-    time.sleep(1.2)  # the server looks twice a second
+    gate = sockets._gate
+    assert gate is not None
+    until(lambda: list(gate._allowed["consumer"].values()) == ["gpu2"])  # the server looks twice a second
     link.send(encode(Ping()))
     other.send(encode(Ping()))
     assert len(arrivals(sockets, 1.5)) == 1  # the other's
