@@ -4,8 +4,8 @@
                   ▲                                                                      │
                   └───────────────────── ZeroMQ: leases and samples ─────────────────────┘
 
-Ray carries no sample. The actor only starts the worker's process, looks at it and says how it ended: a decoder that
-crashes ends the process, never the actor. This module is the only one that imports Ray (the extra ``ray``).
+Ray carries no sample. The actor is :mod:`v2v_server.supervise.ray_actor`; it and this module are the only ones that
+import Ray (the extra ``ray``).
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import contextlib
 import math
 import signal
 import socket
-import subprocess
-import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -28,10 +26,10 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from v2v_protocol.errors import UsageError
 from v2v_server.broker.blame import Cause, Loss
-from v2v_server.supervise.child import STOPPED, hung, out_of_memory_kills, post_mortem, start_child, status_of
+from v2v_server.supervise.child import STOPPED, hung
 from v2v_server.supervise.protocol import Death
+from v2v_server.supervise.ray_actor import RayWorker, Sight
 from v2v_server.supervise.restarts import Restarts
-from v2v_server.worker.logbook import Logbook
 
 WORKER_BYTES = 1 << 30
 """Memory that Ray sets aside for a worker, besides one CPU."""
@@ -44,83 +42,6 @@ _NEWS_SECONDS = 10.0
 _CONNECT_SECONDS = 10.0
 _CALLS_AT_ONCE = 4
 """In an actor: to run the process, to look at it, and to signal it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """What an actor sees.
-
-    Attributes:
-        node: where it is.
-        name: of its worker; empty where none runs.
-        status: of the worker's process, in psutil's words.
-        lease: that the worker is at, 0 for none; None when it never said.
-        decodes: whether it decodes a video.
-    """
-
-    node: str
-    name: str = ""
-    status: str = ""
-    lease: int | None = None
-    decodes: bool = False
-
-
-class RayWorker:
-    """The actor.
-
-    Args:
-        root: the corpus folder on its node.
-        flags: more of them for the worker.
-    """
-
-    def __init__(self, root: str, flags: Sequence[str]) -> None:
-        self._root, self._flags = Path(root), list(flags)
-        self._lock = threading.Lock()
-        self._child: tuple[str, subprocess.Popen[bytes], Logbook] | None = None
-        self._memory_kills = out_of_memory_kills()
-
-    def run(self, name: str, address: str) -> tuple[int, Loss]:
-        """One worker, from its start to its end.
-
-        Returns:
-            its exit status, and what that means.
-
-        Raises:
-            OSError: it cannot be started.
-        """
-        with self._lock:
-            if self._child is not None:
-                self._child[1].kill()  # the call that it was started by was lost on the way back
-            logbook = Logbook()
-            with contextlib.ExitStack() as undo:
-                undo.callback(logbook.close)
-                process = start_child(address, self._root, name, self._flags, logbook)
-                undo.pop_all()
-            self._child = name, process, logbook
-        returncode = process.wait()
-        with self._lock:
-            short = out_of_memory_kills() > self._memory_kills
-            said = post_mortem(returncode, short_of_memory=short)
-            loss = Loss(said.cause, f"{said.text} on {node()}", logbook.lease())
-            logbook.close()
-            if self._child is not None and self._child[1] is process:
-                self._child = None
-        return returncode, loss
-
-    def look(self) -> Sight:
-        """What it is at."""
-        with self._lock:
-            self._memory_kills = out_of_memory_kills()
-            if self._child is None:
-                return Sight(node())
-            name, process, logbook = self._child
-            return Sight(node(), name, status_of(process.pid), logbook.lease(), logbook.decodes())
-
-    def signal(self, name: str, number: int) -> None:
-        """Sends the worker of that name a signal, if it still runs."""
-        with self._lock:
-            if self._child is not None and self._child[0] == name:
-                self._child[1].send_signal(number)
 
 
 @dataclass(slots=True, eq=False)
@@ -200,9 +121,8 @@ class RayWorkers:
         for berth in staying[workers:]:
             berth.leaving = True
             if _is_up(berth):
-                berth.actor.signal.remote(
-                    berth.name, signal.SIGTERM
-                )  # it finishes its sample and gives back the others
+                # It finishes its sample and gives back the others.
+                berth.actor.signal.remote(berth.name, signal.SIGTERM)
             else:
                 self._end(berth)
         with contextlib.suppress(RayError, OSError):
@@ -351,12 +271,6 @@ class RayWorkers:
         if text != self._told:
             self._told, self._tell_at = text, now + _NEWS_SECONDS
             self._news.append(text)
-
-
-def node() -> str:
-    """This node, as logs name it."""
-    context = ray.get_runtime_context()
-    return f"{socket.gethostname()} ({context.get_node_id()[:6]})"
 
 
 def _needs() -> dict[str, float]:
