@@ -115,6 +115,11 @@ def _server_flags(stream: StreamConfig, recipe: Recipe) -> list[str]:
     ]
 
 
+def _lacks_bfloat16() -> bool:
+    # PyTorch says it with "AVX512", or for other makes; an x86 processor of this name has neither it nor a fast detour.
+    return torch.backends.cpu.get_cpu_capability() == "AVX2"
+
+
 def run(arguments: argparse.Namespace) -> int:
     """One run; returns the exit status.
 
@@ -140,6 +145,12 @@ def run(arguments: argparse.Namespace) -> int:
     if config.compute.threads:
         torch.set_num_threads(config.compute.threads)
     with ranks(config.compute.device) as mine:
+        if config.compute.precision == "bfloat16" and mine.device.type == "cpu" and _lacks_bfloat16():
+            print(
+                "v2v-train: warning: this processor has bfloat16 in software only, nine times slower than float32: "
+                "--set compute.precision=float32",
+                file=sys.stderr,
+            )
         learner = build(config, mine)
         if mine.first:
             require_writable(out)

@@ -246,6 +246,20 @@ def test_recordings_that_cannot_be_scored_are_said_before_the_first_step(
     assert not (tmp_path / "run" / "last.pt").exists()
 
 
+@pytest.mark.parametrize(("processor", "slow"), [("AVX2", True), ("AVX512", False)])
+def test_bfloat16_in_software_is_said(
+    server: FakeServer,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    processor: str,
+    slow: bool,
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: processor)
+    said = refused(tmp_path, server.address, capsys, compute__precision="bfloat16", run__validate="nowhere")
+    assert ("bfloat16 in software" in said) == slow
+
+
 def test_the_configuration_of_a_run_is_beside_it(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
