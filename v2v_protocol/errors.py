@@ -5,6 +5,7 @@
     |   |-- RecipeError              a recipe key, value or preset
     |   |-- KeyRefused               a key: missing, readable by others, revoked, or of another side or server
     |   |-- CorpusError              a folder, list file or index that gives no sequence
+    |   |   `-- IndexUnreadable          the catalogue's index, just now: no video's fault
     |   `-- StateMismatch            a saved position that belongs to another stream
     |-- VideoError               the file: it cannot give what it promised (path, frame, reason)
     |   |-- VideoChanged             it is not the file that was catalogued
@@ -44,6 +45,10 @@ class KeyRefused(UsageError):
 
 class CorpusError(UsageError):
     """A folder, list file or catalogue index that cannot serve: missing, empty, or admitting nothing."""
+
+
+class IndexUnreadable(CorpusError):
+    """The catalogue's index cannot be read now: another process holds it, or its storage fails. No video's fault."""
 
 
 class StateMismatch(UsageError):

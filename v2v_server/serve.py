@@ -42,6 +42,8 @@ _MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
 """Of the loop without any message; also from one look at deadlines and deaths to the next."""
+_SOON_SECONDS = 5.0
+"""What keeps everybody waiting for longer is said."""
 _GIVE_BACK_SECONDS = 12.0
 """From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
 _LONGEST_TURN_SECONDS = 1.0
@@ -95,6 +97,7 @@ def serve(config: ServeConfig) -> None:
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
     for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
         _say(line)
+    catalogue.wait_no_more()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
     quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
@@ -182,6 +185,7 @@ class Server:
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
+        self._held_up_due: float | None = None
         self._give_back_at = math.inf
 
     def turn(self, longest_wait_seconds: float) -> None:
@@ -215,6 +219,7 @@ class Server:
                 give_back_freed_memory()
             for line in self._supervisor.news():
                 self._say(line)
+            self._look_what_holds_up(now)
             self._scale(now)
             self._show(now)
 
@@ -300,6 +305,16 @@ class Server:
                 "--videos on its host"
             )
         return True
+
+    def _look_what_holds_up(self, now: float) -> None:
+        """Another server that writes holds the index for moments; what lasts is said, once."""
+        if not self._dispatcher.held_up:
+            self._held_up_due = None
+        elif self._held_up_due is None:
+            self._held_up_due = now + _SOON_SECONDS
+        elif now >= self._held_up_due:
+            self._held_up_due = math.inf
+            self._say(f"no sample is begun: {self._dispatcher.held_up}")
 
     def _scale(self, now: float) -> None:
         """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""

@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.errors import IndexUnreadable, ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
@@ -36,6 +36,7 @@ class NamedCorpus:
     root: Path = Path("/corpus")
     digest: str = "c" * 32
     unreadable: frozenset[str] = frozenset()
+    held: set[str] = field(default_factory=set)
     notes: tuple[str, ...] = ()
 
     def digest_under(self, scene: str) -> str:
@@ -50,13 +51,20 @@ class NamedCorpus:
     def frame_index(self, name: str) -> FrameIndex:
         """A regular index with a keyframe at every twelfth frame."""
         if name in self.unreadable:
-            raise CorpusError(f"the index of {name} can no longer be read")
+            raise ProtocolError(f"the index of {name} is damaged")
+        if name in self.held:
+            raise IndexUnreadable("the catalogue's index cannot be read: database is locked")
         entry = next(entry for entry in self.videos if entry.id == name)
         keyframes = np.arange(0, entry.frames, 12, dtype=np.int64)
         pts = np.arange(entry.frames, dtype=np.int64)
         return FrameIndex(0, pts, keyframes, keyframes, (1, 25), entry.height_px, entry.width_px, seekable=True)
 
 
-def corpus(*videos: VideoEntry, rows: str = "full", unreadable: tuple[str, ...] = ()) -> Catalogue:
-    """A catalogue of these videos."""
-    return cast(Catalogue, NamedCorpus(videos, Rows.parse(rows), unreadable=frozenset(unreadable)))
+def corpus(
+    *videos: VideoEntry, rows: str = "full", unreadable: tuple[str, ...] = (), held: set[str] | None = None
+) -> Catalogue:
+    """A catalogue of these videos; ``held`` may change later."""
+    named = NamedCorpus(
+        videos, Rows.parse(rows), unreadable=frozenset(unreadable), held=set() if held is None else held
+    )
+    return cast(Catalogue, named)

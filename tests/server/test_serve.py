@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,6 +34,7 @@ class Scripted:
     """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
 
     workers, sessions, waiting = 0, (), 0
+    held_up = ""
 
     def __init__(self, first: Sequence[Action] = (), after_record: Sequence[Action] = ()) -> None:
         self.first: list[Action] = list(first)
@@ -75,6 +76,7 @@ def served(
     folder: Path,
     supervisor: ToySupervisor | None = None,
     transport: Queues | None = None,
+    clock: Callable[[], float] | None = None,
     **settings: Any,
 ) -> Server:
     """A server that has made one turn."""
@@ -88,6 +90,7 @@ def served(
         supervisor or ToySupervisor(lambda name, address: None),
         Quarantine(),
         folder / "quarantine.jsonl",
+        clock,
     )
     server.turn(0.0)
     return server
@@ -129,6 +132,17 @@ def test_what_is_looked_for_is_reported(
     assert cast(Any, server)._catalogue.doubted == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
     assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
+
+
+def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dispatcher = Scripted([])
+    now = [0.0]
+    server = served(dispatcher, tmp_path, clock=lambda: now[0])
+    for held_up, seconds in (("locked", 1.0), ("", 1.0), ("locked", 1.0), ("locked", 6.0), ("locked", 60.0)):
+        dispatcher.held_up = held_up
+        now[0] += seconds
+        server.turn(0.0)
+    assert capsys.readouterr().err.count("no sample is begun: locked") == 1
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:

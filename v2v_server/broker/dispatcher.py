@@ -13,7 +13,15 @@ from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
-from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError, V2VError, VersionMismatch
+from v2v_protocol.errors import (
+    CorpusError,
+    IndexUnreadable,
+    LimitExceeded,
+    ProtocolError,
+    UsageError,
+    V2VError,
+    VersionMismatch,
+)
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -70,6 +78,7 @@ class Dispatcher:
     Attributes:
         counters: what happened so far.
         sessions: the consumers.
+        held_up: why no lease can be made just now, whoever asks; empty where they can.
     """
 
     def __init__(
@@ -94,6 +103,7 @@ class Dispatcher:
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self._workers = Workers(self._leases)
         self._lone: deque[Request] = deque()
+        self.held_up = ""
         self._faults: dict[bytes, int] = {}  # of consumers that are connected
 
     @property
@@ -131,7 +141,9 @@ class Dispatcher:
             case Hello():
                 return [self._hello(identity, message, now)]
             case Ping():
-                return [ToConsumer(identity, encode(Pong(self._workers.trouble(self._expected_workers))))]
+                return [
+                    ToConsumer(identity, encode(Pong(self.held_up or self._workers.trouble(self._expected_workers))))
+                ]
             case Goodbye():
                 self.consumer_lost(identity)
                 return []
@@ -279,6 +291,7 @@ class Dispatcher:
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
+        self.held_up = ""  # to try again
         self._workers.wake(now)
         for identity in self._workers.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self._leases.limit_seconds(identity):g} s"))
@@ -383,7 +396,7 @@ class Dispatcher:
     def _assign(self, now: float) -> list[Action]:
         """Gives waiting requests to workers, until there is no request or no room."""
         actions: list[Action] = []
-        while True:
+        while not self.held_up:
             if self._lone:
                 empty = self._workers.for_lone_request()
                 if empty is not None:
@@ -397,6 +410,7 @@ class Dispatcher:
                 self._lone.append(request)
             else:
                 actions += self._give([request, *self.sessions.take_siblings(request)], worker, now)
+        return actions
 
     def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
         """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
@@ -435,6 +449,12 @@ class Dispatcher:
                 siblings=siblings,
             )
             return [ToWorker(worker, encode(lease))]
+        except IndexUnreadable as error:
+            self.held_up = f"{error}; it is tried again ten times a second"
+            returned = self._leases.finished(number, worker, now)
+            if returned is not None:
+                self.sessions.put_back(returned)
+            return []
         except V2VError as error:
             # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
             returned = self._leases.finished(number, worker, now)

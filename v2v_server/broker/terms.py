@@ -45,7 +45,8 @@ def lease_for(
         siblings: indices that are made from the same clip and follow in leases of their own.
 
     Raises:
-        CorpusError: the catalogue's index can no longer be read.
+        IndexUnreadable: of the catalogue, just now.
+        V2VError: what the index says of this video is damaged, another file's, or too large to send.
     """
     video = sequence.video
     thresholds: tuple[float, ...] = ()

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_server.catalogue.files import (
     UNPRINTABLE,
@@ -116,7 +116,8 @@ class Catalogue:
         """The frames of a video, read from the index on disk.
 
         Raises:
-            CorpusError: no such id in this catalogue, or the index can no longer be read.
+            CorpusError: no such id in this catalogue.
+            IndexUnreadable: another process holds the index, or its storage fails.
             VideoChanged: another process has catalogued a changed file under this id since.
             ProtocolError: what the index says of this video is damaged.
         """
@@ -130,7 +131,8 @@ class Catalogue:
         kept, because siblings ask for the same one after the other.
 
         Raises:
-            CorpusError, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and :meth:`FrameIndex.slice`.
+            CorpusError, IndexUnreadable, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and
+                :meth:`FrameIndex.slice`.
         """
         key = id, start, count
         if key not in self._slices:
@@ -163,7 +165,7 @@ class Catalogue:
         try:
             data = self._store.frame_index(id, self._files.get(id, fingerprint))
         except sqlite3.Error as error:
-            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return data
@@ -172,8 +174,8 @@ class Catalogue:
         """The statistics of a video, read from the index on disk.
 
         Raises:
-            CorpusError: no such id in this catalogue, the catalogue was opened without ``scene``, or the index can no
-                longer be read.
+            CorpusError: no such id in this catalogue, or it was opened without ``scene``.
+            IndexUnreadable: another process holds the index, or its storage fails.
             VideoChanged: another process has catalogued a changed file under this id since.
         """
         fingerprint = self._fingerprint(id)
@@ -184,7 +186,7 @@ class Catalogue:
         try:
             data = self._store.scene(id, self._files.get(id, fingerprint), self._looking.key)
         except sqlite3.Error as error:
-            raise CorpusError(f"the catalogue's index can no longer be read ({error}); start again") from error
+            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return Scene.from_bytes(data)
@@ -206,6 +208,10 @@ class Catalogue:
                 "server with --scene auto"
             )
         return self.scene_digest
+
+    def wait_no_more(self) -> None:
+        """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
+        self._store.wait_no_more()
 
     def doubt(self, id: str) -> None:
         """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times

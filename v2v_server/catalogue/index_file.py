@@ -182,16 +182,16 @@ class Store:
         self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
 
     def doubt(self, id: str) -> None:
-        """Let the next start probe a file again. Gives up at once where another process is writing.
+        """Let the next start probe a file again.
 
         Raises:
             sqlite3.Error: as for :meth:`put`.
         """
+        self._change("UPDATE video SET size_bytes = -1 WHERE id = ?", [(id,)])
+
+    def wait_no_more(self) -> None:
+        """From now on an index that another process holds is an error at once."""
         self._database.execute("PRAGMA busy_timeout = 0")
-        try:
-            self._change("UPDATE video SET size_bytes = -1 WHERE id = ?", [(id,)])
-        finally:
-            self._database.execute(f"PRAGMA busy_timeout = {1000 * _BUSY_SECONDS:.0f}")
 
     def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
         if not rows:

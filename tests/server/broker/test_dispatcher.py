@@ -399,29 +399,29 @@ def test_a_video_that_only_the_workers_host_lacks_is_made_elsewhere() -> None:
     assert (counters.missing_videos, counters.refused_candidates, counters.faults) == (1, 0, 1)
 
 
+def trouble(at: Peers) -> str:
+    (pong,) = at.consumer_says(b"c", Ping())
+    assert isinstance(pong, Pong)
+    return pong.trouble
+
+
 def test_who_waits_is_told_that_nobody_can_make_a_sample() -> None:
     at = peers()
-
-    def trouble() -> str:
-        (pong,) = at.consumer_says(b"c", Ping())
-        assert isinstance(pong, Pong)
-        return pong.trouble
-
-    assert "no worker is connected" in trouble()
+    assert "no worker is connected" in trouble(at)
     at.join(b"w1", credit=1)
     at.hello()
     at.want(3)
-    assert not trouble()
+    assert not trouble(at)
     at.fail(b"w1", reason="No such file or directory", frame=None, here=True)
-    assert "can read its videos" in trouble()
-    assert "No such file or directory" in trouble()
+    assert "can read its videos" in trouble(at)
+    assert "No such file or directory" in trouble(at)
     at.tick(REST_SECONDS)  # it tries again, and there is no news
-    assert "No such file or directory" in trouble()
+    assert "No such file or directory" in trouble(at)
     at.join(b"w2", credit=1)
-    assert not trouble()
+    assert not trouble(at)
     at.die(b"w2")
     at.work_off(b"w1")
-    assert not trouble()
+    assert not trouble(at)
 
 
 def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:
@@ -527,6 +527,24 @@ def test_a_corpus_that_cannot_be_read_at_all_answers_everything() -> None:
     at.want(*range(8))
     assert sorted(message.index for message in at.unavailable()) == list(range(8))
     assert not at.leases[b"w"]
+
+
+def test_an_index_that_another_process_holds_is_no_videos_fault() -> None:
+    held = {"a.mp4", "b.mp4"}
+    at = peers(corpus(video("a.mp4"), video("b.mp4"), held=held))
+    at.join(credit=8)
+    at.hello()
+    at.want(*range(8))
+    assert not at.leases[b"w"]
+    at.tick(0.1)
+    assert not at.leases[b"w"]
+    assert "database is locked" in trouble(at)
+    held.clear()
+    at.tick(0.1)
+    assert sorted(lease.indices[0] for lease in at.leases[b"w"]) == list(range(8))
+    assert not any(lease.candidate for lease in at.leases[b"w"])
+    assert not trouble(at)
+    assert not at.dispatcher.counters.refused_candidates
 
 
 def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:

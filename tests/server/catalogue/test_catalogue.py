@@ -18,7 +18,7 @@ import pytest
 from tests.clips import panned_luma, truncated, write_clip
 from tests.server.catalogue.failing_storage import failing_opens
 from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
 from v2v_server.catalogue import catalogue as catalogue_module
 from v2v_server.catalogue import survey as survey_module
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
@@ -541,6 +541,22 @@ def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_a
         assert again is not first
         with pytest.raises(UsageError, match="asked of an index"):
             catalogue.frame_index_bytes("a.mp4", 110, 20)
+
+
+def test_an_index_that_another_process_holds_is_said_at_once(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalogue = opener(corpus)
+    catalogue.wait_no_more()
+    assert catalogue._store._database.execute("PRAGMA busy_timeout").fetchone() == (0,)
+    name = ids(catalogue)[0]
+    (file,) = (file for _, _, file in catalogue._store._database.execute("PRAGMA database_list"))
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(IndexUnreadable, match="locked"):
+            catalogue.frame_index_bytes(name, 0, 3)
+        other.execute("ROLLBACK")
+    assert catalogue.frame_index_bytes(name, 0, 3)
 
 
 def test_the_index_of_a_long_video_is_opened_once(
