@@ -154,6 +154,8 @@ class Link:
         socket = self._open(self._socket)
         try:
             socket.send_multipart(frames, flags=zmq.NOBLOCK)
+        except zmq.Again:
+            pass  # the handshake has failed already, and ended the connection for good: who receives hears why
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot send: {error}") from error
 
