@@ -129,8 +129,10 @@ class Sockets:
             self._context.destroy(linger=0)
             raise
         self._door = Door(self._consumers, most_connections, most_queued_bytes)
-        # A worker's samples are large, and it has a key: only those that never say who they are matter here.
-        self._worker_door = None if keys is None else Door(self._workers, most_connections, 1 << 40, 1 << 62)
+        # A worker's samples are large: only the number of its kind and those that never say who they are matter here.
+        # An ipc:// address is our own user's.
+        is_private = worker_bind.startswith("ipc:")
+        self._worker_door = None if is_private else Door(self._workers, most_connections, 1 << 40, 1 << 62)
         self._users: dict[tuple[str, bytes], str] = {}
         self._look_at_users = 0.0
         try:
@@ -185,8 +187,9 @@ class Sockets:
         if self._consumers in ready and (message := self._receive(self._consumers, "consumer")) is not None:
             arrivals.append(FromConsumer(*message))
         gone = self._door.take_ended()
+        workers_gone = [] if self._worker_door is None else self._worker_door.take_ended()
         if self._gate is not None:
-            self._review(self._gate, gone)
+            self._review(self._gate, gone, workers_gone)
         arrivals += map(ConsumerGone, gone)
         return arrivals
 
@@ -215,13 +218,10 @@ class Sockets:
                     return None  # the next review cuts it off
         return identity.bytes, frames
 
-    def _review(self, gate: Gate, gone: list[bytes]) -> None:
-        """Cuts off whose key was revoked."""
-        for side, ended in (
-            ("consumer", gone),
-            ("worker", self._worker_door.take_ended() if self._worker_door else []),
-        ):
-            for identity in ended:
+    def _review(self, gate: Gate, consumers: list[bytes], workers: list[bytes]) -> None:
+        """Forgets those that are gone, and cuts off whose key was revoked."""
+        for side, identities in (("consumer", consumers), ("worker", workers)):
+            for identity in identities:
                 self._users.pop((side, identity), None)
         if (now := time.monotonic()) < self._look_at_users:
             return

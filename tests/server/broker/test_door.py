@@ -15,8 +15,8 @@ from tests.waiting import until
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker import door
-from v2v_server.broker.actions import ToConsumer
-from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, Sockets
+from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, Sockets
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
 
@@ -43,21 +43,21 @@ def consumer() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
     context = zmq.Context()
     peers: list[zmq.Socket[bytes]] = []
 
-    def connect(sockets: Sockets, name: bytes) -> zmq.Socket[bytes]:
+    def connect(sockets: Sockets, name: bytes, address: str = "") -> zmq.Socket[bytes]:
         peer = context.socket(zmq.DEALER)
         peers.append(peer)
         peer.setsockopt(zmq.ROUTING_ID, name)
         peer.setsockopt(zmq.RECONNECT_IVL, -1)
-        peer.connect(sockets.address)
+        peer.connect(address or sockets.address)
         return peer
 
     yield connect
     context.destroy(linger=0)
 
 
-def raw(sockets: Sockets) -> socket.socket:
+def raw(address: str) -> socket.socket:
     """A peer that speaks ZMTP by hand, up to the end of the handshake."""
-    peer = socket.create_connection(("127.0.0.1", int(sockets.address.rpartition(":")[2])))
+    peer = socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2])))
     peer.sendall(GREETING + ROUTER_READY)
     return peer
 
@@ -97,7 +97,7 @@ def test_parts_without_end_are_cut_off_before_they_are_collected(
     honest = consumer(sockets, b"honest")
     before = psutil.Process().memory_info().rss
     cut: list[bool] = []
-    hostile = [raw(sockets) for _ in range(8)]
+    hostile = [raw(sockets.address) for _ in range(8)]
     threads = [
         threading.Thread(target=lambda peer: cut.append(is_cut_off(peer, part)), args=(each,)) for each in hostile
     ]
@@ -159,22 +159,26 @@ def test_who_asks_for_more_than_it_takes_is_cut_off(
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"deaf")
 
 
+@pytest.mark.parametrize(("kind", "to"), [(FromConsumer, ToConsumer), (FromWorker, ToWorker)])
 def test_connections_are_bounded_and_those_that_say_nothing_make_room(
-    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], kind: type, to: type
 ) -> None:
     """Idle ones took every file that the process may open, and ended it."""
     sockets = serve(most_connections=4)
-    honest = consumer(sockets, b"honest")
+    address = sockets.address if kind is FromConsumer else sockets.worker_address
+    at_the_door = sockets._door if kind is FromConsumer else sockets._worker_door
+    assert at_the_door is not None
+    honest = consumer(sockets, b"honest", address)
     honest.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
-    idle = [raw(sockets) for _ in range(20)]
-    until(lambda: len(sockets._door._connections) <= 4)
-    newcomer = consumer(sockets, b"newcomer")
+    next_from(sockets, kind)
+    idle = [raw(address) for _ in range(20)]
+    until(lambda: len(at_the_door._connections) <= 4)
+    newcomer = consumer(sockets, b"newcomer", address)
     newcomer.send_multipart(encode(Ping()))
-    arrival = next_from(sockets, FromConsumer)
-    assert isinstance(arrival, FromConsumer)
+    arrival = next_from(sockets, kind)
+    assert isinstance(arrival, kind)
     assert arrival.identity == b"newcomer"
-    assert sockets.send(ToConsumer(b"honest", encode(Pong())))
+    assert sockets.send(to(b"honest", encode(Pong())))
     for each in idle:
         each.close()
 
