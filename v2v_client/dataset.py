@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import functools
 import os
+import platform
 import warnings
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
@@ -332,6 +333,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 yield batch
         self._position.finish(begun, consumer)
 
+    def _name(self, loader_workers: int) -> str:
+        """What people shall read of this consumer."""
+        loader = get_worker_info()
+        of_loader = "" if loader is None else f", loader worker {loader.id} of {loader_workers}"
+        return f"rank {self.rank} of {self.world_size}{of_loader}"
+
     def _connection(self, epoch: int, state: ResumeState | None = None, loader_workers: int = 1) -> Connection:
         pinned = self.stream
         hello = Hello(
@@ -341,6 +348,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             self._seed,
             quarantine=None if state is None else state.quarantine,
             stride=self._batch_size * self.world_size * loader_workers,
+            name=self._name(loader_workers),
+            host=platform.node(),
         )
         return Connection(
             self._address,

@@ -5,6 +5,8 @@
     server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Denied, Pong
     worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), LeaseFailed, Ping, Goodbye
     server -> worker       Lease, Stop, Denied, Pong
+    anybody -> server      See
+    server -> anybody      Seen
 
 Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
 float or str, and Mapping (plain values, checked by whoever knows its form).
@@ -45,6 +47,7 @@ class Hello:
         quarantine: number of the quarantine snapshot to go on under; None: the newest.
         stride: samples from the beginning of one batch of this consumer to that of its next: batch size x ranks x
             loader workers. It settles a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
+        name, host: what people shall read of this consumer, "rank 0 of 2" on "gpu-1" for instance.
     """
 
     spec: Mapping[str, Any]
@@ -53,6 +56,8 @@ class Hello:
     seed: int
     quarantine: int | None = None
     stride: int = 0
+    name: str = ""
+    host: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +70,15 @@ class Want:
         epoch, indices: which samples.
         arenas, slots: for each index, memory that a worker of the same host may put its sample into, see
             :mod:`v2v_protocol.arena`; "" and 0 where there is none. Empty: none for any.
+        waited_seconds: for how long the consumer has waited for batches in all since its Hello. For people to read;
+            nothing goes by it.
     """
 
     epoch: int
     indices: tuple[int, ...]
     arenas: tuple[str, ...] = ()
     slots: tuple[int, ...] = ()
+    waited_seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +89,12 @@ class Ping:
 @dataclass(frozen=True, slots=True)
 class Goodbye:
     """The sender leaves in peace: forget its session, or give its leases to others."""
+
+
+@dataclass(frozen=True, slots=True)
+class See:
+    """Asks for the state of the service. Needs no session, and may be said on the workers' side too. The answer is the
+    next state that is made, a few times a second; several before it get one answer."""
 
 
 # --- server -> consumer -----------------------------------------------------------------------------------------------
@@ -169,16 +183,28 @@ class Pong:
     trouble: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Answers See.
+
+    Attributes:
+        json: ``v2v_server.console.state.ServiceState.to_dict()`` as JSON, UTF-8.
+    """
+
+    json: bytes
+
+
 # --- worker -> server -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerHello:
-    """A worker offers itself, with room for ``credit`` leases at a time."""
+    """A worker offers itself, with room for ``credit`` leases at a time. ``host`` is for people to read."""
 
     name: str
     numerics_version: int
     credit: int
+    host: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,10 +221,20 @@ class Result:
     Attributes:
         lease: number of the lease.
         begins: number of the lease that the worker starts on next, as :class:`Begun` says it; 0: it has none at hand.
+        decode_seconds: that its clip took to be decoded, or read; 0 where that of a sibling was at hand.
+        simulate_seconds: from the clip to the arrays.
+        handover_seconds: of finding the sample's memory, and of packing and sending the one before.
+        memory_bytes: of the worker's process; 0: not known.
+
+    The last four are for people to read; nothing goes by them.
     """
 
     lease: int
     begins: int = 0
+    decode_seconds: float = 0.0
+    simulate_seconds: float = 0.0
+    handover_seconds: float = 0.0
+    memory_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +312,6 @@ class Stop:
 
 
 Message = (
-    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Denied | Pong
+    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Denied | Pong | See | Seen
     | WorkerHello | Begun | Result | LeaseFailed | Lease | Stop
 )  # fmt: skip

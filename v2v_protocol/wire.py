@@ -34,6 +34,8 @@ from v2v_protocol.messages import (
     Pong,
     Result,
     SampleHeader,
+    See,
+    Seen,
     Stop,
     Unavailable,
     Want,
@@ -75,6 +77,8 @@ _TYPES: dict[str, type[Any]] = {
     "lease-failed": LeaseFailed,
     "lease": Lease,
     "stop": Stop,
+    "see": See,
+    "seen": Seen,
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, Show, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
@@ -28,6 +28,7 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
+from v2v_server.console.watch import make_watch
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import make_cache
@@ -181,7 +182,10 @@ class Server:
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
-        self._status = StatusLine(sys.stderr, Path(config.cache) if config.cache else None, config.cache_gib)
+        self._status = StatusLine(sys.stderr)
+        self._watch = make_watch(
+            config, catalogue, dispatcher, supervisor, quarantine, transport, self._clock(), _utc_now
+        )
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
@@ -221,6 +225,7 @@ class Server:
                 self._say(line)
             self._look_what_holds_up(now)
             self._scale(now)
+            self._carry_out([*self._watch.tick(now)])
             self._show(now)
 
     def close(self) -> None:
@@ -257,6 +262,8 @@ class Server:
                     todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
                 case PassOver(refusal):
                     self._say(f"passed over {refusal}")
+                case Show() as show:
+                    todo.extend(self._watch.ask(show))
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """Ends the process of a worker that hangs, if it is one of ours."""
@@ -335,8 +342,9 @@ class Server:
             if self._config.port_file:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
-        if self._announced:
-            self._status.update(now, self._dispatcher, self._supervisor.running)
+            self._watch.is_ready = True
+        if self._announced and self._status.is_due(now):
+            self._status.show(now, self._watch.state(now))
 
     def _say(self, text: str) -> None:
         self._status.interrupt()

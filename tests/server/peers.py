@@ -140,7 +140,7 @@ class Peers:
                     self.sent.append(("to worker", message))
                     if isinstance(message, Lease):
                         self.leases.setdefault(identity, deque()).append(message)
-                        asked = self.dispatcher._leases.request(message.lease, identity)
+                        asked = self.dispatcher.leases.request(message.lease, identity)
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)

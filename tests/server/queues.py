@@ -26,6 +26,7 @@ class Queues:
 
     address: str = "queue://consumers"
     worker_address: str = "queue://workers"
+    waited_seconds: float = 0.0
     arrived: deque[Arrival] = field(default_factory=deque)
     sent: dict[bytes, deque[Sequence[Any]]] = field(default_factory=dict)
 
@@ -81,6 +82,10 @@ class ToySupervisor:
     @property
     def running(self) -> int:
         return len(self.workers)
+
+    @property
+    def restarts(self) -> dict[bytes, int]:
+        return dict.fromkeys(self.workers, 0)
 
     def start(self, address: str) -> None:
         self._address = address

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import pytest
 
+from tests.server.peers import peers
 from tests.server.queues import Queues, ToySupervisor
 from v2v_protocol.errors import VideoChanged
 from v2v_protocol.messages import Pong, Stop
@@ -33,15 +34,16 @@ RECORD = Condemn(VERDICT, Request(b"c", 0, 0))
 class Scripted:
     """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
 
-    workers, sessions, waiting = 0, (), 0
-    held_up = ""
-
     def __init__(self, first: Sequence[Action] = (), after_record: Sequence[Action] = ()) -> None:
         self.first: list[Action] = list(first)
         self.after_record = after_record
         self.told: list[tuple[Any, ...]] = []
         self.times: list[float] = []
         self.counters = Counters()
+        self._there = peers().dispatcher
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._there, name)  # what there is to look at
 
     def tick(self, now: float) -> list[Action]:
         self.times.append(now)
@@ -81,7 +83,9 @@ def served(
 ) -> Server:
     """A server that has made one turn."""
     doubted: list[str] = []
-    catalogue = SimpleNamespace(path=lambda video: folder / video, doubted=doubted, doubt=doubted.append)
+    catalogue = SimpleNamespace(
+        path=lambda video: folder / video, doubted=doubted, doubt=doubted.append, root=folder, videos=(), refusals=()
+    )
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),

@@ -161,6 +161,10 @@ class Connection:
         self._conversation.want(indices, slots)
         self._send(link)
 
+    def waited(self, seconds: float) -> None:
+        """Batches were waited for so long in all; the server is told with the next request."""
+        self._conversation.waited_seconds = seconds
+
     def receive(self, *, wait: bool = True) -> Arrival | None:
         """The next sample to arrive, whichever it is.
 

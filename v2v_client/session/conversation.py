@@ -130,6 +130,7 @@ class Conversation:
         layout: dtype and shape of each array of one sample, once welcomed.
         credit: most samples asked for and not received.
         strays: samples of another epoch, dropped.
+        waited_seconds: for how long batches were waited for so far; the server is told with each request.
     """
 
     stream: StreamIdentity
@@ -176,6 +177,7 @@ class Conversation:
         self.outbox: list[Message] = []
         self.credit = 0
         self.strays = 0
+        self.waited_seconds = 0.0
         if pinned is not None:
             self._pin(pinned)
 
@@ -234,7 +236,7 @@ class Conversation:
             if self._owed:
                 self._want_again()
             # A server answers anybody's Ping; that it forgot us shows only when something is asked, be it nothing.
-            self.outbox += [Want(self._epoch, ()), Ping()]
+            self.outbox += [Want(self._epoch, (), waited_seconds=self.waited_seconds), Ping()]
         return False
 
     def next_due(self, now: float) -> float:
@@ -275,7 +277,7 @@ class Conversation:
         if now:
             self._asked.update(dict.fromkeys(now))
             # In one message: siblings are decoded together only if they are asked for together.
-            self.outbox.append(self._slots.want(self._epoch, now))
+            self.outbox.append(replace(self._slots.want(self._epoch, now), waited_seconds=self.waited_seconds))
 
     def _want_again(self) -> None:
         # In the order they were asked; after a Welcome with less credit, the rest waits its turn.

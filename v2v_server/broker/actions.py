@@ -87,7 +87,20 @@ class PassOver:
     refusal: Refusal
 
 
-Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | Condemn | LookFor | PassOver
+@dataclass(frozen=True, slots=True)
+class Show:
+    """This peer looks at the service: send it the next state that is made.
+
+    Attributes:
+        identity: of the peer.
+        is_worker_side: it is connected where workers are.
+    """
+
+    identity: bytes
+    is_worker_side: bool = False
+
+
+Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | Condemn | LookFor | PassOver | Show
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

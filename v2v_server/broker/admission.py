@@ -13,6 +13,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
+from v2v_server.broker.worker_registry import shown
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -111,6 +112,8 @@ class Admission:
             credit=min(suggested, MOST_CREDIT, self._max_credit_bytes // layout_bytes(layout)),
             liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
             quarantine=quarantine,
+            name=shown(hello.name),
+            host=shown(hello.host),
         )
         return session, Welcome(
             spec=spec.to_dict(),

@@ -6,6 +6,7 @@ or because the quarantine has a verdict already. What was refused travels with t
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,12 +21,17 @@ from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import Sequence
 
+MOST_LATEST = 20
+"""Refusals that are remembered for people to read."""
 LONGEST_REASON = 500
 """Characters that a refusal's reason keeps."""
 
 
 class Candidates:
     """Moves requests from candidate to candidate.
+
+    Attributes:
+        latest: the last few refusals, oldest first, each with the time of day it fell at, ISO 8601.
 
     Args:
         sessions: the consumers; a request of one that is gone needs nothing more.
@@ -41,6 +47,7 @@ class Candidates:
         self._quarantine = quarantine
         self._counters = counters
         self._wall_clock = wall_clock
+        self.latest: deque[tuple[str, Refusal]] = deque(maxlen=MOST_LATEST)
 
     def current(self, request: Request, session: Session) -> Request:
         """The request under its session's snapshot.
@@ -104,6 +111,7 @@ class Candidates:
         self._counters.refused_candidates += 1
         refusal = Refusal(self.sequence(session, request).video.id, frame, reason, kind)
         passed_over = next_candidate(request, refusal)
+        self.latest.append((self._wall_clock(), passed_over.refusals[-1]))
         # What the quarantine refuses is no news to the operator.
         actions: list[Action] = [PassOver(passed_over.refusals[-1])] if kind != RefusalKind.QUARANTINED else []
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":

@@ -2,9 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from v2v_protocol.messages import Result
 
 _LONGEST_TROUBLE = 120
+_MOST_SECONDS = 86_400.0
+
+
+@dataclass(slots=True)
+class WorkDone:
+    """What samples took, as their workers say.
+
+    Attributes:
+        samples: how many.
+        cpu_seconds: processor time.
+        decode_seconds, simulate_seconds, handover_seconds: by the clock: what went into clips, into arrays made of
+            them, and into getting those to their consumers.
+    """
+
+    samples: int = 0
+    cpu_seconds: float = 0.0
+    decode_seconds: float = 0.0
+    simulate_seconds: float = 0.0
+    handover_seconds: float = 0.0
+
+    def add(self, result: Result, cpu_seconds: float) -> None:
+        """One sample more."""
+        self.samples += 1
+        self.cpu_seconds += bounded_seconds(cpu_seconds)
+        self.decode_seconds += bounded_seconds(result.decode_seconds)
+        self.simulate_seconds += bounded_seconds(result.simulate_seconds)
+        self.handover_seconds += bounded_seconds(result.handover_seconds)
+
+    @property
+    def busy_seconds(self) -> float:
+        """By the clock, all of it."""
+        return self.decode_seconds + self.simulate_seconds + self.handover_seconds
+
+
+def bounded_seconds(said: float) -> float:
+    """What a worker says that something took, within reason."""
+    return min(max(said, 0.0), _MOST_SECONDS)
 
 
 @dataclass(slots=True)
@@ -19,7 +58,7 @@ class Counters:
         cache_trouble: why a worker's cache keeps no more, when last heard of; empty where it does.
         bytes: of the arrays of those samples.
         in_slots: samples put into memory shared with their consumer; the others travelled in messages.
-        worker_cpu_seconds: processor time the workers took for them.
+        work: what the workers took for them.
         refused_candidates: videos passed over because they could not give what they promised.
         unavailable: samples that no candidate could give.
         returned_leases: leases taken back from workers that died, hung or left.
@@ -38,7 +77,7 @@ class Counters:
     cache_trouble: str = ""
     bytes: int = 0
     in_slots: int = 0
-    worker_cpu_seconds: float = 0.0
+    work: WorkDone = field(default_factory=WorkDone)
     refused_candidates: int = 0
     unavailable: int = 0
     returned_leases: int = 0

@@ -34,6 +34,7 @@ from v2v_protocol.messages import (
     Pong,
     Result,
     SampleHeader,
+    See,
     Stop,
     Want,
     WorkerHello,
@@ -42,11 +43,11 @@ from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, Show, ToConsumer, ToWorker, denial
 from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
-from v2v_server.broker.counters import Counters
+from v2v_server.broker.counters import Counters, bounded_seconds
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.quarantine import Quarantine, Verdict
 from v2v_server.broker.session import Session, Sessions
@@ -57,7 +58,6 @@ from v2v_server.catalogue.catalogue import Catalogue
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
 """Malformed messages after which a consumer is cut off: to answer each costs as much as a sample."""
-_MOST_CPU_SECONDS = 86_400.0
 
 
 class Dispatcher:
@@ -79,6 +79,9 @@ class Dispatcher:
         counters: what happened so far.
         sessions: the consumers.
         held_up: why no lease can be made just now, whoever asks; empty where they can.
+        registry: the workers.
+        leases: who makes what.
+        candidates: what was refused.
     """
 
     def __init__(
@@ -94,14 +97,14 @@ class Dispatcher:
         expected_workers: int = 0,
     ) -> None:
         self.counters = Counters()
-        self._leases = LeaseBook(lease_deadline_seconds)
-        self.sessions = Sessions(self._leases.abandoned)
+        self.leases = LeaseBook(lease_deadline_seconds)
+        self.sessions = Sessions(self.leases.abandoned)
         self._expected_workers = expected_workers
         self._catalogue = catalogue
         self._quarantine = quarantine
-        self._candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
+        self.candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
-        self._workers = Workers(self._leases)
+        self.registry = Workers(self.leases)
         self._lone: deque[Request] = deque()
         self.held_up = ""
         self._faults: dict[bytes, int] = {}  # of consumers that are connected
@@ -109,7 +112,7 @@ class Dispatcher:
     @property
     def workers(self) -> int:
         """Workers that said hello and are alive as far as is known."""
-        return len(self._workers)
+        return len(self.registry)
 
     @property
     def waiting(self) -> int:
@@ -118,13 +121,27 @@ class Dispatcher:
 
     @property
     def waiting_share(self) -> float:
-        """Consumers that asked for something nobody works on yet, of all that there are: 0 to 1."""
-        return sum(bool(session.waiting) for session in self.sessions) / max(len(self.sessions), 1)
+        """Consumers that asked for something nobody works on yet, of all that are connected: 0 to 1."""
+        connected = [session for session in self.sessions if session.left_at is None]
+        return sum(bool(session.waiting) for session in connected) / max(len(connected), 1)
+
+    @property
+    def consumers(self) -> int:
+        """Consumers that are connected, as far as is known."""
+        return sum(session.left_at is None for session in self.sessions)
+
+    def clip_of(self, request: Request) -> tuple[str, int] | None:
+        """Video and first frame that a request is made from now; None when its consumer is gone."""
+        session = self.sessions.get(request.session)
+        if session is None:
+            return None
+        sequence = self.candidates.sequence(session, request)
+        return sequence.video.id, sequence.start_frame
 
     @property
     def idle_share(self) -> float:
         """Workers that hold no lease, of all that there are: 0 to 1."""
-        return max(0.0, 1.0 - self._leases.holders / max(len(self._workers), 1)) if self._workers else 0.0
+        return max(0.0, 1.0 - self.leases.holders / max(len(self.registry), 1)) if self.registry else 0.0
 
     # --- consumers ---------------------------------------------------------------------------------------------------
 
@@ -142,8 +159,10 @@ class Dispatcher:
                 return [self._hello(identity, message, now)]
             case Ping():
                 return [
-                    ToConsumer(identity, encode(Pong(self.held_up or self._workers.trouble(self._expected_workers))))
+                    ToConsumer(identity, encode(Pong(self.held_up or self.registry.trouble(self._expected_workers))))
                 ]
+            case See():
+                return [Show(identity)]
             case Goodbye():
                 self.consumer_lost(identity)
                 return []
@@ -165,7 +184,7 @@ class Dispatcher:
     def consumer_lost(self, identity: bytes) -> None:
         """The consumer left, or cannot be reached any more."""
         self.sessions.forget(identity)
-        self._leases.forget_session(identity)
+        self.leases.forget_session(identity)
         self._lone = deque(request for request in self._lone if request.session != identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float) -> Action:
@@ -175,7 +194,7 @@ class Dispatcher:
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
             return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
-            workers = max(len(self._workers), self._expected_workers)
+            workers = max(len(self.registry), self._expected_workers)
             session, welcome = self._admission.admit(identity, hello, workers, now)
         except (UsageError, CorpusError) as error:
             return _deny(identity, ErrorCode.SPEC, str(error))
@@ -192,6 +211,7 @@ class Dispatcher:
             for index in want.indices[:1]:
                 SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
             self.sessions.want(session, want.epoch, want.indices, slots)
+            session.waited_seconds = max(session.waited_seconds, want.waited_seconds)
         except LimitExceeded as error:
             return [_deny(session.identity, ErrorCode.CREDIT, str(error))]
         except (IndexError, UsageError) as error:
@@ -221,11 +241,13 @@ class Dispatcher:
             return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now)
-        if not self._workers.heard(identity, now):
+        if isinstance(message, See):
+            return [Show(identity, is_worker_side=True)]
+        if not self.registry.heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
             case Begun(lease):
-                self._leases.begun(lease, identity, now)
+                self.leases.begun(lease, identity, now)
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
@@ -246,11 +268,11 @@ class Dispatcher:
 
     def worker_stopped(self, identity: bytes, seconds: float) -> None:
         """A worker's process was stopped from outside for so long; no deadline runs meanwhile."""
-        self._leases.put_off(identity, seconds)
+        self.leases.put_off(identity, seconds)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
         """Something sent to a worker did not go out, and nobody will say what became of its process."""
-        if identity not in self._workers:
+        if identity not in self.registry:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
@@ -269,7 +291,7 @@ class Dispatcher:
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self._candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
+        return [*self.candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
 
     def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
         """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
@@ -280,9 +302,9 @@ class Dispatcher:
             now: the time.
         """
         if not found:
-            return [*self._candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
+            return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
         self.counters.missing_videos += 1
-        self._workers.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
+        self.registry.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)
         return self._assign(now)
 
@@ -292,13 +314,13 @@ class Dispatcher:
             self.consumer_lost(identity)
         actions: list[Action] = []
         self.held_up = ""  # to try again
-        self._workers.wake(now)
-        for identity in self._workers.hanging(now):
-            actions.append(GiveUp(identity, f"gave no answer for {self._leases.limit_seconds(identity):g} s"))
-        for identity in self._workers.vanished(now):
+        self.registry.wake(now)
+        for identity in self.registry.hanging(now):
+            actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
+        for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
-        for request, worker in self._leases.slow(now):
-            second = self._workers.for_request(keep_one_empty=bool(self._lone), other_than=worker)
+        for request, worker in self.leases.slow(now):
+            second = self.registry.for_request(keep_one_empty=bool(self._lone), other_than=worker)
             if second is not None and not runs_alone(request):
                 self.counters.second_leases += 1
                 actions += self._grant(replace(request, slot=None), second, now)
@@ -307,22 +329,22 @@ class Dispatcher:
 
     def stop_workers(self) -> list[ToWorker]:
         """Tells every worker to finish and leave."""
-        return [ToWorker(identity, encode(Stop())) for identity in self._workers.identities()]
+        return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
         again = Loss(Cause.KILLED, "started again")
-        actions = self._take_back(identity, again, now) if identity in self._workers else []
+        actions = self._take_back(identity, again, now) if identity in self.registry else []
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
             return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *actions]
-        if len(self._workers) >= MOST_WORKERS:
+        if len(self.registry) >= MOST_WORKERS:
             text = f"this server has {MOST_WORKERS} workers, its limit"
             return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
-        self._workers.add(identity, hello.credit, now)
+        self.registry.add(identity, hello.credit, now, hello.host)
         return actions + self._assign(now)
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Action]:
-        request = self._leases.request(result.lease, identity)
+        request = self.leases.request(result.lease, identity)
         session = None if request is None else self.sessions.get(request.session)
         actions: list[Action] = []
         decoded = True
@@ -338,57 +360,57 @@ class Dispatcher:
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
+                self.counters.work.add(result, header.cpu_seconds)
+                self.registry.worked(identity, result, header.cpu_seconds)
                 actions.append(ToConsumer(request.session, payload))
-        self._workers.can_work(identity)
-        self._leases.finished(result.lease, identity, now, decoded=decoded)
-        self._leases.begun(result.begins, identity, now)
+        self.registry.can_work(identity)
+        self.leases.finished(result.lease, identity, now, decoded=decoded)
+        self.leases.begun(result.begins, identity, now)
         return actions + self._assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
         self._charge(failed.lease, identity, now)
-        request = self._leases.finished(failed.lease, identity, now)
+        request = self.leases.finished(failed.lease, identity, now)
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
             return self._assign(now)
         if not failed.here:
-            self._workers.can_work(identity)
-            return [*self._candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
+            self.registry.can_work(identity)
+            return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
         # The catalogue is of this host's files: if the video is here, other workers can have it too.
-        video = self._candidates.sequence(session, request).video
+        video = self.candidates.sequence(session, request).video
         return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
         """Who asked for it and waits no more pays for it all the same."""
-        debt = self._leases.debt(lease, worker, now)
+        debt = self.leases.debt(lease, worker, now)
         if debt is not None:
             self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""
-        cpu_seconds = min(max(header.cpu_seconds, 0.0), _MOST_CPU_SECONDS)
-        if not self.sessions.answered(request, cpu_seconds):
+        if not self.sessions.answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
         self.counters.samples += 1
         self.counters.decodes += header.decoded
         self.counters.count_cache(header.cache)
-        self.counters.worker_cpu_seconds += cpu_seconds
         self.counters.batches += 1 / session.batch_size
         self.counters.bytes += sum(session.form.sizes)
         self.counters.in_slots += in_slot
         return True
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
-        self._workers.remove(identity)
+        self.registry.remove(identity)
         actions: list[Action] = []
-        returned = self._leases.lost(identity, loss.lease)
+        returned = self.leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
             verdict = judged(request, loss) if begun else request
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                actions += self._candidates.condemn(request, verdict, for_all=loss.for_all)
+                actions += self.candidates.condemn(request, verdict, for_all=loss.for_all)
         return actions + self._assign(now)
 
     # --- requests ----------------------------------------------------------------------------------------------------
@@ -398,11 +420,11 @@ class Dispatcher:
         actions: list[Action] = []
         while not self.held_up:
             if self._lone:
-                empty = self._workers.for_lone_request()
+                empty = self.registry.for_lone_request()
                 if empty is not None:
                     actions += self._give([self._lone.popleft()], empty, now)
                     continue
-            worker = self._workers.for_request(keep_one_empty=bool(self._lone))
+            worker = self.registry.for_request(keep_one_empty=bool(self._lone))
             request = self.sessions.next_request() if worker is not None else None
             if worker is None or request is None:
                 return actions
@@ -420,12 +442,12 @@ class Dispatcher:
         actions: list[Action] = []
         good: list[Request] = []
         for request in requests:
-            current = self._candidates.current(request, session)
-            quarantined = self._candidates.quarantined(session, current, session.quarantine)
+            current = self.candidates.current(request, session)
+            quarantined = self.candidates.quarantined(session, current, session.quarantine)
             if quarantined is None:
                 good.append(current)
             else:
-                actions += self._candidates.refuse(current, None, quarantined, RefusalKind.QUARANTINED)
+                actions += self.candidates.refuse(current, None, quarantined, RefusalKind.QUARANTINED)
         for place, request in enumerate(good):
             actions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
         return actions
@@ -434,9 +456,9 @@ class Dispatcher:
         session = self.sessions.get(request.session)
         if session is None:
             return []
-        sequence = self._candidates.sequence(session, request)
+        sequence = self.candidates.sequence(session, request)
         seconds = work_seconds(session.spec, session.arrays, sequence.video)
-        number = self._leases.grant(request, worker, now, seconds)
+        number = self.leases.grant(request, worker, now, seconds)
         try:
             lease = lease_for(
                 request,
@@ -451,14 +473,14 @@ class Dispatcher:
             return [ToWorker(worker, encode(lease))]
         except IndexUnreadable as error:
             self.held_up = f"{error}; it is tried again ten times a second"
-            returned = self._leases.finished(number, worker, now)
+            returned = self.leases.finished(number, worker, now)
             if returned is not None:
                 self.sessions.put_back(returned)
             return []
         except V2VError as error:
             # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
-            returned = self._leases.finished(number, worker, now)
-            return [] if returned is None else self._candidates.refuse(returned, None, str(error))
+            returned = self.leases.finished(number, worker, now)
+            return [] if returned is None else self.candidates.refuse(returned, None, str(error))
 
 
 def _only(frames: Sequence[Buffer]) -> Message:

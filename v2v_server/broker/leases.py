@@ -102,6 +102,10 @@ class LeaseBook:
         requests = [self._leases[number].request for number in self._held.get(worker, ())]
         return len({request.clip for request in requests if request is not None}) + requests.count(None)
 
+    def holds(self, worker: bytes) -> bool:
+        """Whether this worker holds any lease."""
+        return worker in self._held
+
     @property
     def holders(self) -> int:
         """Workers that hold any lease."""
@@ -118,6 +122,15 @@ class LeaseBook:
             request = self._leases[number].request
             if request is not None:
                 yield request
+
+    def in_work(self, worker: bytes) -> tuple[Request | None, float] | None:
+        """What this worker is at, as far as it said, and since when. The request is None where nobody waits for it any
+        more; None where the worker has begun nothing."""
+        for number in self._held.get(worker, ()):
+            lease = self._leases[number]
+            if lease.begun_at is not None:
+                return lease.request, lease.begun_at
+        return None
 
     def request(self, number: int, worker: bytes) -> Request | None:
         """What this worker's lease asks for; None when nobody waits for its answer."""

@@ -53,6 +53,10 @@ class Session:
         served: samples sent.
         quarantine: number of the quarantine snapshot its samples are made under.
         left_at: when its connection ended; None while it has one, as far as is known.
+        name, host: what it calls itself.
+        epoch: that it last asked for samples of.
+        position: index after the highest of that epoch that was answered.
+        waited_seconds: for how long it has waited for batches since its Hello, as it says.
         form: of one of its samples.
     """
 
@@ -70,6 +74,11 @@ class Session:
     served: int = 0
     quarantine: int = 0
     left_at: float | None = None
+    name: str = ""
+    host: str = ""
+    epoch: int = 0
+    position: int = 0
+    waited_seconds: float = 0.0
 
     form: Form = field(init=False)
 
@@ -152,6 +161,8 @@ class Sessions:
                 f"{len(new)} more samples asked while {len(session.unanswered)} are unanswered; "
                 f"the credit is {session.credit}"
             )
+        if new and epoch != session.epoch:
+            session.epoch, session.position = epoch, 0
         for index in new:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
@@ -202,6 +213,8 @@ class Sessions:
         if session is None or (request.epoch, request.index) not in session.unanswered:
             return False
         session.unanswered.remove((request.epoch, request.index))
+        if request.epoch == session.epoch:
+            session.position = max(session.position, request.index + 1)
         session.balance_seconds -= worker_seconds
         if not session.unanswered:
             # Nothing is saved up while idle. A debt stays, or asking for one sample at a time would be free of charge;

@@ -76,6 +76,10 @@ class ServerTransport(Protocol):
     def worker_address(self) -> str:
         """Where workers connect."""
 
+    @property
+    def waited_seconds(self) -> float:
+        """For how long :meth:`receive` has waited in all: nobody had said anything."""
+
     def receive(self, seconds: float) -> list[Arrival]:
         """At most one message of each side, so that neither can shut the other out; the workers' first. Last of all who
         has gone.
@@ -120,6 +124,7 @@ class Sockets:
         keys: KeyFolder | None = None,
         local_bind: str = "",
     ) -> None:
+        self.waited_seconds = 0.0
         self._context = zmq.Context()
         self._consumers = self._router(LARGEST_REQUEST_BYTES)
         self._workers = self._router(LARGEST_ARRAY_BYTES)
@@ -180,7 +185,9 @@ class Sockets:
 
     def receive(self, seconds: float) -> list[Arrival]:
         """See :class:`ServerTransport`."""
+        began = time.monotonic()
         ready = dict(self._poller.poll(int(seconds * 1000)))
+        self.waited_seconds += time.monotonic() - began
         arrivals: list[Arrival] = []
         if self._workers in ready and (message := self._receive(self._workers, "worker")) is not None:
             arrivals.append(FromWorker(*message))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
+from v2v_protocol.messages import Result
 from v2v_server.broker.blame import runs_alone
+from v2v_server.broker.counters import WorkDone
 from v2v_server.broker.leases import LeaseBook
 
 MOST_WORKERS = 4096
@@ -16,16 +18,38 @@ SILENCE_SECONDS = 30.0
 """A worker without work says so every five seconds; after this long without a word it is taken for gone."""
 REST_SECONDS = 10.0
 """A worker whose host cannot read what the server's can gets no work for so long: storage may come back."""
+LONGEST_NAME = 100
+"""Characters that are kept of what a peer calls itself or its host."""
 _MOST_STALE = 64
 """Entries out of date that the heap may hold, besides one for each worker with room, before it is made anew."""
 
 
 @dataclass(slots=True)
-class _Member:
+class Member:
+    """A worker that said hello.
+
+    Attributes:
+        credit: leases it takes at a time.
+        liveness: when it was last heard.
+        host: where it says it is.
+        given_up: it hangs or is silent, and gets no more work.
+        unreadable: what its host could not read last; empty since it has done anything.
+        work: what its samples took that were waited for.
+        memory_bytes: of its process when it last said so; 0: not known.
+    """
+
     credit: int
     liveness: Liveness
+    host: str = ""
     given_up: bool = False
-    unreadable: str = ""  # what its host could not read last; empty since it has done anything
+    unreadable: str = ""
+    work: WorkDone = field(default_factory=WorkDone)
+    memory_bytes: int = 0
+
+
+def shown(text: str) -> str:
+    """What a peer calls itself, fit for a person's eyes: short, and without control characters."""
+    return "".join(filter(str.isprintable, text[:LONGEST_NAME]))
 
 
 class Workers:
@@ -37,7 +61,7 @@ class Workers:
 
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
-        self._workers: dict[bytes, _Member] = {}
+        self._workers: dict[bytes, Member] = {}
         self._resting: dict[bytes, float] = {}  # until when
         # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
         self._changed: set[bytes] = set()
@@ -55,11 +79,18 @@ class Workers:
         """All of them."""
         return list(self._workers)
 
-    def add(self, identity: bytes, credit: int, now: float) -> None:
+    def members(self) -> Mapping[bytes, Member]:
+        """All of them, and what is known of each."""
+        return self._workers
+
+    def is_resting(self, identity: bytes) -> bool:
+        """Whether it gets no work for a while."""
+        return identity in self._resting
+
+    def add(self, identity: bytes, credit: int, now: float, host: str = "") -> None:
         """A worker said hello."""
-        self._workers[identity] = _Member(
-            max(1, min(credit, MOST_WORKER_CREDIT)), Liveness(now, gone_seconds=SILENCE_SECONDS)
-        )
+        room = max(1, min(credit, MOST_WORKER_CREDIT))
+        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), shown(host))
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
@@ -75,6 +106,13 @@ class Workers:
             return False
         worker.liveness.heard(now)
         return True
+
+    def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:
+        """It made a sample that was waited for."""
+        worker = self._workers.get(identity)
+        if worker is not None:
+            worker.work.add(result, cpu_seconds)
+            worker.memory_bytes = result.memory_bytes
 
     def can_work(self, identity: bytes) -> None:
         """It has done something: its host can read videos."""

@@ -2,4 +2,9 @@
 
 status     the summary at the start, and one live line
 progress   how far the catalogue is
+state      the one model of the service, which terminal, page and metrics read
+history    totals of the last ten seconds, from which rates and shares follow
+waiting    who waits for whom, in one sentence
+watch      makes the state when somebody looks, and answers
+asking     the other end: asks a server for its state
 """

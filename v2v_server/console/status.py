@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import TextIO
 
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.counters import Counters
-from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.console.state import CacheState, ServiceState
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.store.cache import GIB, used_bytes
 
 _SHOWN = 5
 _LIVE_SECONDS = 0.5
@@ -73,51 +69,28 @@ def write(stream: TextIO, text: str) -> None:
         stream.flush()
 
 
-class Rate:
-    """Events a second over the last few seconds.
-
-    Args:
-        window_seconds: how far back it looks.
-    """
-
-    def __init__(self, window_seconds: float) -> None:
-        self._window_seconds = window_seconds
-        self._points: deque[tuple[float, float]] = deque()
-
-    def update(self, now: float, total: float) -> float:
-        """Notes the running total and returns the rate since the window's beginning (0.0 before two notes)."""
-        self._points.append((now, total))
-        while len(self._points) > 2 and now - self._points[0][0] > self._window_seconds:
-            self._points.popleft()
-        (then, before), (_, after) = self._points[0], self._points[-1]
-        return (after - before) / (now - then) if now > then else 0.0
-
-
 class StatusLine:
     """One line that is kept up to date on a terminal, or printed every ten seconds into a log.
 
     Args:
         stream: where to.
-        cache: folder of the cache; None: there is none on this host.
-        cache_gib: how much it may hold.
     """
 
-    def __init__(self, stream: TextIO = sys.stderr, cache: Path | None = None, cache_gib: float = 0.0) -> None:
+    def __init__(self, stream: TextIO = sys.stderr) -> None:
         self._stream = stream
-        self._cache, self._cache_gib = cache, cache_gib
         self._live = stream.isatty()
         self._period = _LIVE_SECONDS if self._live else _LOG_SECONDS
         self._next = 0.0
-        self._batches = Rate(window_seconds=5.0)
-        self._samples = Rate(window_seconds=5.0)
         self._width = 0
 
-    def update(self, now: float, dispatcher: Dispatcher, running: int) -> None:
-        """Shows the state if it is time to."""
-        if now < self._next:
-            return
+    def is_due(self, now: float) -> bool:
+        """Whether it is time to show the state again."""
+        return now >= self._next
+
+    def show(self, now: float, state: ServiceState) -> None:
+        """Shows the state."""
         self._next = now + self._period
-        self._show(self._text(now, dispatcher, running))
+        self._show(_text(state))
 
     def interrupt(self) -> None:
         """Clears the live line, because something else is about to be printed."""
@@ -130,33 +103,34 @@ class StatusLine:
         if self._live and self._width:
             write(self._stream, "\n")
 
-    def _text(self, now: float, dispatcher: Dispatcher, running: int) -> str:
-        counters = dispatcher.counters
-        achieved = ""
-        if 0 < counters.decodes < counters.samples:
-            achieved = f"{counters.samples / counters.decodes:.1f} a decode  "
-        # Nothing where all come in messages: consumers elsewhere, or a container between worker and consumer.
-        share = counters.in_slots / counters.samples if counters.samples else 0.0
-        shared = f"{share:.0%} by shared memory  " if share else ""
-        return (
-            f"{self._batches.update(now, counters.batches):.2f} batches/s  "
-            f"{self._samples.update(now, counters.samples):.1f} samples/s  "
-            f"{achieved}{shared}{self._of_cache(counters)}"
-            f"workers {dispatcher.workers}/{max(running, dispatcher.workers)}  consumers {len(dispatcher.sessions)}  "
-            f"queue {dispatcher.waiting}  faults {counters.faults}  total {counters.samples} samples"
-        )
-
-    def _of_cache(self, counters: Counters) -> str:
-        read = counters.cache_hits + counters.cache_misses
-        if not read:
-            return ""
-        held = "" if self._cache is None else f", {used_bytes(self._cache) / GIB:.2f} of {self._cache_gib:g} GiB"
-        trouble = f" ({counters.cache_trouble})" if counters.cache_trouble else ""
-        return f"cache {counters.cache_hits / read:.0%} hits{held}{trouble}  "
-
     def _show(self, text: str) -> None:
         if self._live:
             write(self._stream, "\r" + text.ljust(self._width))
             self._width = len(text)
         else:
             write(self._stream, text + "\n")
+
+
+def _text(state: ServiceState) -> str:
+    totals = state.totals
+    achieved = ""
+    if 0 < totals.decodes < totals.samples:
+        achieved = f"{totals.samples / totals.decodes:.1f} a decode  "
+    # Nothing where all come in messages: consumers elsewhere, or a container between worker and consumer.
+    share = totals.in_slots / totals.samples if totals.samples else 0.0
+    shared = f"{share:.0%} by shared memory  " if share else ""
+    return (
+        f"{state.batches_per_second:.2f} batches/s  {state.samples_per_second:.1f} samples/s  "
+        f"{achieved}{shared}{_of_cache(state.cache)}"
+        f"workers {state.worker_count}/{max(state.worker_processes, state.worker_count)}  "
+        f"consumers {state.consumer_count}  queue {state.queue}  faults {totals.faults}  total {totals.samples} samples"
+    )
+
+
+def _of_cache(cache: CacheState | None) -> str:
+    read = 0 if cache is None else cache.hits + cache.misses
+    if cache is None or not read:
+        return ""
+    held = f", {cache.held_gib:.2f} of {cache.most_gib:g} GiB" if cache.folder else ""
+    trouble = f" ({cache.trouble})" if cache.trouble else ""
+    return f"cache {cache.hits / read:.0%} hits{held}{trouble}  "

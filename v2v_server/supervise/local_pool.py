@@ -82,6 +82,11 @@ class Pool:
         """Processes that are alive."""
         return len(self.pids())
 
+    @property
+    def restarts(self) -> dict[bytes, int]:
+        """How often the place of each worker was filled before."""
+        return {post.identity: post.generation - 1 for post in self._all() if post.process is not None}
+
     def start(self, address: str) -> None:
         """Workers that :meth:`watch` starts connect to ``address``."""
         self._address = address

@@ -6,6 +6,7 @@ The loop (:mod:`v2v_server.serve`) knows only the :class:`Supervisor`. Of this h
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -31,6 +32,10 @@ class Supervisor(Protocol):
     @property
     def running(self) -> int:
         """Workers that are alive."""
+
+    @property
+    def restarts(self) -> Mapping[bytes, int]:
+        """Of each worker that is its, how often its place was filled before, because the process in it had ended."""
 
     def start(self, address: str) -> None:
         """From now on workers may be started; they connect to ``address``."""

@@ -106,6 +106,11 @@ class RayWorkers:
         """Workers whose process was seen and has not ended."""
         return sum(_is_up(berth) for berth in self._berths)
 
+    @property
+    def restarts(self) -> dict[bytes, int]:
+        """How often the place of each worker was filled before."""
+        return {berth.name.encode(): berth.generation - 1 for berth in self._berths if berth.run is not None}
+
     def start(self, address: str) -> None:
         """Workers that :meth:`watch` starts connect to ``address``; for one of all interfaces, to this node's own."""
         for everywhere in ("//0.0.0.0:", "//[::]:"):

@@ -98,6 +98,16 @@ Action: TypeAlias = Send | Say | Listen | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
+class Spent:
+    """What a sample took, as its :class:`v2v_protocol.messages.Result` says it."""
+
+    decode_seconds: float = 0.0
+    simulate_seconds: float = 0.0
+    handover_seconds: float = 0.0
+    memory_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Tools:
     """What the conversation asks about its process. An answer changes nothing.
 
@@ -134,7 +144,8 @@ class WorkerConversation:
         self._away = False  # we said goodbye to compile
         self._silence = Liveness(0.0)
         self._told = False
-        self._unsent: list[tuple[int, Frames]] = []  # leases that are done, and what is to be said of their samples
+        # Leases that are done, what is to be said of their samples, and what these took.
+        self._unsent: list[tuple[int, Frames, Spent]] = []
         self._unsent_since = 0.0
         self._stopping = False
 
@@ -174,15 +185,16 @@ class WorkerConversation:
         self._listens_from(now)
         return [Listen(0.0)] if self._away else self._go_on(now)
 
-    def made(self, frames: Frames, now: float) -> list[Action]:
+    def made(self, frames: Frames, now: float, spent: Spent = Spent()) -> list[Action]:
         """The sample is made.
 
         Args:
             frames: its SampleHeader message.
             now: the time.
+            spent: what it took.
         """
         lease = self._done(now)
-        self._unsent.append((lease.lease, frames))
+        self._unsent.append((lease.lease, frames, spent))
         may_wait = (
             len(frames) == 1  # arrays that travel with it had better be on their way
             and self._is_watched  # elsewhere the server blames what was begun to its knowledge
@@ -292,10 +304,16 @@ class WorkerConversation:
             return []
         may_go_on = self._leases and not self._stopping and self._tools.is_ready(self._leases[0])
         self._begun = self._leases[0].lease if may_go_on else 0
-        begun = [*(number for number, _ in self._unsent[1:]), self._begun]
+        begun = [*(number for number, *_ in self._unsent[1:]), self._begun]
         results = [
-            Send([*encode(Result(number, next_one)), *frames])
-            for (number, frames), next_one in zip(self._unsent, begun, strict=True)
+            Send([*encode(_result(number, next_one, spent)), *frames])
+            for (number, frames, spent), next_one in zip(self._unsent, begun, strict=True)
         ]
         self._unsent.clear()
         return list(results)
+
+
+def _result(lease: int, begins: int, spent: Spent) -> Result:
+    return Result(
+        lease, begins, spent.decode_seconds, spent.simulate_seconds, spent.handover_seconds, spent.memory_bytes
+    )

@@ -25,8 +25,25 @@ from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
-from v2v_server.system.process import die_with_parent, give_way, keep_freed_memory, take_long_turns
-from v2v_server.worker.conversation import CREDIT, Action, Listen, Load, Make, Say, Send, Tools, WorkerConversation
+from v2v_server.system.process import (
+    die_with_parent,
+    give_way,
+    keep_freed_memory,
+    resident_bytes,
+    take_long_turns,
+)
+from v2v_server.worker.conversation import (
+    CREDIT,
+    Action,
+    Listen,
+    Load,
+    Make,
+    Say,
+    Send,
+    Spent,
+    Tools,
+    WorkerConversation,
+)
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.handover import room_for, sample_message
 from v2v_server.worker.logbook import IDLE, note
@@ -73,8 +90,10 @@ class Worker:
         self._logbook = logbook
         self._clips = Clips(root, cache)
         self._kernels = set(USUAL)  # that are loaded
+        self._handover_seconds = 0.0  # that no result has named yet
+        self._memory_bytes, self._weigh_at = 0, -math.inf
         self._conversation = WorkerConversation(
-            WorkerHello(name, NUMERICS_VERSION, CREDIT),
+            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
             address,
             Tools(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels,
@@ -129,10 +148,12 @@ class Worker:
 
     def _do(self, action: Action) -> None:
         if isinstance(action, Send):
+            began = time.monotonic()
             *first, last = action.frames
             for frame in first:
                 self._socket.send(frame, _MORE, copy=False)
             self._socket.send(last, copy=False)
+            self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Say):
             print(f"{self._name}: {action.text}", file=sys.stderr)
 
@@ -153,12 +174,15 @@ class Worker:
                     give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
                 note(self._logbook, lease.lease, decodes=True)
                 try:
-                    made: Frames | VideoError = self._made(lease)
+                    made: tuple[Frames, Spent] | VideoError = self._made(lease)
                 except VideoError as error:
                     made = error
                 note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
                 now = time.monotonic()
-                return conversation.failed(made, now) if isinstance(made, VideoError) else conversation.made(made, now)
+                if isinstance(made, VideoError):
+                    return conversation.failed(made, now)
+                frames, spent = made
+                return conversation.made(frames, now, spent)
             case _:
                 return []  # Leave
 
@@ -177,13 +201,15 @@ class Worker:
             messages.append(first)
         return messages
 
-    def _made(self, lease: Lease) -> Frames:
-        """The message of a lease's sample.
+    def _made(self, lease: Lease) -> tuple[Frames, Spent]:
+        """The message of a lease's sample, and what it took.
 
         Raises:
             VideoError: its video cannot give it.
         """
+        began = time.monotonic()
         room = room_for(lease, sample_layout(lease))
+        has_room = time.monotonic()
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
         note(self._logbook, lease.lease)
@@ -191,8 +217,10 @@ class Worker:
             # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
             # Python's collector, which waits for many, but each holds pictures.
             gc.collect()
+        has_clip = time.monotonic()
         sample = make_sample(lease, clip, room.arrays)
-        return sample_message(
+        has_sample = time.monotonic()
+        frames = sample_message(
             lease,
             room,
             provenance=sample.provenance.to_dict(),
@@ -201,6 +229,20 @@ class Worker:
             decoded=decoded,
             cache=self._clips.said_of_cache(clip) if decoded else "",
         )
+        spent = Spent(
+            decode_seconds=has_clip - has_room,
+            simulate_seconds=has_sample - has_clip,
+            handover_seconds=self._handover_seconds + has_room - began,
+            memory_bytes=self._memory(has_sample),
+        )
+        self._handover_seconds = time.monotonic() - has_sample
+        return frames, spent
+
+    def _memory(self, now: float) -> int:
+        """Bytes of this process in memory, looked at once a second."""
+        if now >= self._weigh_at:
+            self._weigh_at, self._memory_bytes = now + 1.0, resident_bytes()
+        return self._memory_bytes
 
 
 def unshared_name(beginning: str | None) -> str:

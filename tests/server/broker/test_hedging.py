@@ -60,7 +60,7 @@ def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes
     at.finish(order[1])
     assert at.samples() == [*before, (0, 20)]
     assert at.dispatcher.counters.late_results == 1
-    assert len(at.dispatcher._leases) == 0
+    assert len(at.dispatcher.leases) == 0
     # And the room of both is free again.
     at.want(21, 22, 23, 24)
     assert (len(at.leases[b"slow"]), len(at.leases[b"fast"])) == (1, 2)
@@ -79,7 +79,7 @@ def test_a_failure_answers_for_both() -> None:
     at.worker_says(b"slow", LeaseFailed(first.lease, None, "late"))
     at.worker_says(b"slow", Result(first.lease), b"late")
     assert at.samples() == [*before, (0, 20)]
-    assert len(at.dispatcher._leases) == 0
+    assert len(at.dispatcher.leases) == 0
 
 
 @pytest.mark.parametrize("cause", list(Cause))

@@ -281,8 +281,8 @@ class Interleaving(RuleBasedStateMachine):
         at = getattr(self, "at", None)
         if at is None:
             return
-        book = at.dispatcher._leases
-        for identity in at.dispatcher._workers.identities():
+        book = at.dispatcher.leases
+        for identity in at.dispatcher.registry.identities():
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 
@@ -306,10 +306,10 @@ class Interleaving(RuleBasedStateMachine):
         assert not any(self.owed.values())
         assert self.at.dispatcher.waiting == 0
         assert not self.at.dispatcher._lone
-        assert len(self.at.dispatcher._leases) == 0
-        assert not self.at.dispatcher._leases._held
-        assert not self.at.dispatcher._leases._out
-        assert set(self.at.dispatcher._leases._durations) <= set(self.owed)
+        assert len(self.at.dispatcher.leases) == 0
+        assert not self.at.dispatcher.leases._held
+        assert not self.at.dispatcher.leases._out
+        assert set(self.at.dispatcher.leases._durations) <= set(self.owed)
 
 
 TestInterleaving = Interleaving.TestCase
@@ -467,7 +467,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         move()
         model.bounded()
         model.a_lone_request_is_alone()
-        book = model.at.dispatcher._leases
+        book = model.at.dispatcher.leases
         seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
         seen["lone waiting"] += bool(model.at.dispatcher._lone)
     seen["twins"] = model.at.dispatcher.counters.second_leases

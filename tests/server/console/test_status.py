@@ -6,15 +6,15 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
+from tests.server.console.watched import service
 from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from tests.server.peers import peers
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.counters import Counters
 from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
-from v2v_server.console.status import Rate, StatusLine, summary
+from v2v_server.console.state import CacheState, ServiceState
+from v2v_server.console.status import StatusLine, summary
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 
@@ -79,34 +79,59 @@ def test_files_that_cannot_be_used_are_named() -> None:
 # --- the live line ----------------------------------------------------------------------------------------------------
 
 
+def said(state: ServiceState, out: io.StringIO | None = None) -> str:
+    """What the line says of a state, in a log."""
+    stream = io.StringIO() if out is None else out
+    StatusLine(stream).show(0.0, state)
+    return stream.getvalue().removesuffix("\n")
+
+
 def test_the_line_counts_what_happened() -> None:
     at = peers()
-    out = io.StringIO()
-    line = StatusLine(out)
-    line.update(100.0, at.dispatcher, running=2)
+    seen = service(at)
+    before = seen.state()
     at.join()
     at.hello(batch_size=2)
     at.want(0, 1, 2, 3)
     at.finish()
     at.finish()
-    line.update(105.0, at.dispatcher, running=2)
-    assert len(out.getvalue().splitlines()) == 1
-    line.update(110.0, at.dispatcher, running=2)
-    first, second = out.getvalue().splitlines()
-    assert first == "0.00 batches/s  0.0 samples/s  workers 0/2  consumers 0  queue 0  faults 0  total 0 samples"
-    assert second == "0.10 batches/s  0.2 samples/s  workers 1/2  consumers 1  queue 0  faults 0  total 2 samples"
+    at.now = 10.0
+    assert said(before) == (
+        "0.00 batches/s  0.0 samples/s  workers 0/0  consumers 0  queue 0  faults 0  total 0 samples"
+    )
+    assert said(seen.state()) == (
+        "0.10 batches/s  0.2 samples/s  workers 1/1  consumers 1  queue 0  faults 0  total 2 samples"
+    )
+
+
+def test_a_log_gets_a_line_every_ten_seconds_and_none_of_a_terminals_signs() -> None:
+    out, state = io.StringIO(), service(peers()).state()
+    line = StatusLine(out)
+    assert line.is_due(100.0)
+    line.show(100.0, state)
+    assert not line.is_due(109.9)
+    assert line.is_due(110.0)
+    line.interrupt()
     line.close()
-    assert out.getvalue().endswith("samples\n")
-    assert "\r" not in out.getvalue()
+    assert out.getvalue() == said(state) + "\n"
 
 
-def test_workers_from_other_hosts_are_counted_too() -> None:
+def test_workers_that_start_and_those_of_other_hosts_are_counted() -> None:
     at = peers()
     for number in range(3):
         at.join(b"remote%d" % number)
-    out = io.StringIO()
-    StatusLine(out).update(0.0, at.dispatcher, running=1)
-    assert "workers 3/3" in out.getvalue()
+    assert "workers 3/3" in said(service(at).state())
+    assert "workers 3/7" in said(replace(service(at).state(), worker_processes=7))
+
+
+def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_any() -> None:
+    at = peers()
+    at.dispatcher.counters.samples, at.dispatcher.counters.decodes = 30, 12
+    at.dispatcher.counters.in_slots, at.dispatcher.counters.cache_hits, at.dispatcher.counters.cache_misses = 15, 9, 3
+    text = said(service(at).state())
+    assert "2.5 a decode  50% by shared memory  cache 75% hits  workers" in text
+    cache = CacheState("/cache", 1.5, 4.0, 9, 3, "no room")
+    assert "cache 75% hits, 1.50 of 4 GiB (no room)  workers" in said(replace(service(at).state(), cache=cache))
 
 
 def test_a_terminal_shows_one_line_that_leaves_no_rest_of_the_one_before() -> None:
@@ -114,10 +139,11 @@ def test_a_terminal_shows_one_line_that_leaves_no_rest_of_the_one_before() -> No
     out = Terminal()
     line = StatusLine(out)
     at.dispatcher.counters.samples = 123456
-    line.update(0.0, at.dispatcher, running=0)
+    line.show(0.0, service(at).state())
+    assert not line.is_due(0.4)
+    assert line.is_due(0.5)
     at.dispatcher.counters.samples = 7
-    line.update(0.4, at.dispatcher, running=0)
-    line.update(0.6, at.dispatcher, running=0)
+    line.show(0.6, service(at).state())
     _, long, short = out.getvalue().split("\r")
     assert len(long) <= len(short)
     assert short.rstrip().endswith("total 7 samples")
@@ -132,23 +158,6 @@ def test_closing_before_anything_was_shown_prints_nothing() -> None:
 
 
 # --- metrics ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_rate_looks_back_over_its_window() -> None:
-    rate = Rate(window_seconds=5.0)
-    assert rate.update(10.0, 100.0) == 0.0
-    assert rate.update(10.0, 100.0) == 0.0
-    assert rate.update(12.0, 104.0) == 2.0
-    assert rate.update(20.0, 104.0) == 0.0
-    assert rate.update(21.0, 134.0) == pytest.approx(30.0)
-
-
-def test_a_steady_rate_is_exact_and_costs_no_memory() -> None:
-    rate = Rate(window_seconds=5.0)
-    for second in range(100):
-        measured = rate.update(float(second), 3.0 * second)
-    assert measured == pytest.approx(3.0)
-    assert len(rate._points) <= 7
 
 
 def test_faults_are_all_that_went_wrong() -> None:

@@ -1,0 +1,168 @@
+"""Who waits for whom, in one sentence, and what to do about it. Pure: computed from shares of time, nothing guessed.
+
+    consumers wait     they say so themselves: time in which they stood still for want of a batch
+    workers wait       time in which they held nothing to make
+    workers work       decoding, simulating, handing over: each result says how long
+    the broker works   time in which its loop did not wait for a message
+
+Where consumers hardly wait, they are the slow part themselves. Where they do, it is for workers that have no time left,
+and then for what takes most of it; or for the broker, if that has no time left; or else for what is on its way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from v2v_server.console.history import Moment
+
+NOTICEABLE_SHARE = 0.1
+"""Of its time that a consumer may wait without a word about it."""
+_IDLE_SHARE = 0.3
+"""Of the workers' time: with more to spare they are not what consumers wait for."""
+_FULL_SHARE = 0.85
+"""Of the broker's time: with so little to spare it is."""
+_LEAST_SECONDS = 2.0
+"""Of a window that says anything."""
+_SPARE_SHARE = 0.5
+"""Of the workers' time, in which they are idle, for fewer of them to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """Shares of time, each 0 to 1.
+
+    Attributes:
+        seconds: of the window.
+        consumers: of all consumers' time, in which they waited for batches.
+        idle: of all workers' time, in which they held nothing to make.
+        broker: of the server's loop, in which it did not wait for a message.
+        decode, simulate, handover: of all workers' time.
+    """
+
+    seconds: float = 0.0
+    consumers: float = 0.0
+    idle: float = 0.0
+    broker: float = 0.0
+    decode: float = 0.0
+    simulate: float = 0.0
+    handover: float = 0.0
+
+    @classmethod
+    def of(cls, before: Moment, last: Moment) -> Shares:
+        """Those of the time between two moments."""
+        waited = sum(max(0.0, total - before.waited.get(name, 0.0)) for name, total in last.waited.items())
+        workers = last.worker_seconds - before.worker_seconds
+        return cls(
+            seconds=last.now - before.now,
+            consumers=_share(waited, last.consumer_seconds - before.consumer_seconds),
+            idle=_share(last.idle_seconds - before.idle_seconds, workers),
+            broker=_share(last.broker_seconds - before.broker_seconds, last.now - before.now),
+            decode=_share(last.decode_seconds - before.decode_seconds, workers),
+            simulate=_share(last.simulate_seconds - before.simulate_seconds, workers),
+            handover=_share(last.handover_seconds - before.handover_seconds, workers),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """The verdict.
+
+    Attributes:
+        part: the slow one: "nobody" is there to take anything, "start" (too early to say), "workers" (none that can
+            work), "consumers", "decode", "simulate", "handover", "broker", "way" (neither: what is asked and what is
+            made is on its way for long), "even" (nobody waits to speak of).
+        sentence: who waits for whom.
+        remedy: what to do about it; empty where nothing need be done.
+        shares: that it follows from.
+    """
+
+    part: str
+    sentence: str
+    remedy: str
+    shares: Shares
+
+
+def who_waits(
+    shares: Shares,
+    *,
+    consumers: int,
+    workers: int,
+    starting: int = 0,
+    trouble: str = "",
+    has_cache: bool = False,
+) -> Waiting:
+    """The slow part of the service.
+
+    Args:
+        shares: of the last seconds.
+        consumers: that are connected.
+        workers: that have said hello.
+        starting: processes of the server's own that have not said hello yet.
+        trouble: why no worker can make a sample; empty where one can.
+        has_cache: whether the server's workers keep what was decoded.
+    """
+    part, sentence, remedy = _verdict(shares, consumers, workers, starting, trouble, has_cache)
+    return Waiting(part, sentence, remedy, shares)
+
+
+def _verdict(
+    shares: Shares, consumers: int, workers: int, starting: int, trouble: str, has_cache: bool
+) -> tuple[str, str, str]:
+    if not consumers:
+        return "nobody", "Nobody is connected: the service waits for consumers.", ""
+    if trouble:
+        if starting and not workers:
+            return "workers", f"Consumers wait for workers: {starting} are starting.", ""
+        return "workers", f"Consumers wait for workers: {trouble}.", ""
+    if shares.seconds < _LEAST_SECONDS:
+        return "start", "It is too early to say who waits: samples have just begun to flow.", ""
+    wait = f"{shares.consumers:.0%}"
+    if shares.consumers < NOTICEABLE_SHARE:
+        if shares.idle < _IDLE_SHARE:
+            return "even", f"Nobody waits to speak of: consumers {wait} of their time, workers {shares.idle:.0%}.", ""
+        spare = "fewer workers would do" if shares.idle >= _SPARE_SHARE else ""
+        return (
+            "consumers",
+            f"Workers wait for consumers: these take samples as fast as they can use them (they wait {wait} of their "
+            f"time), and workers are idle {shares.idle:.0%} of theirs.",
+            spare,
+        )
+    if shares.broker >= _FULL_SHARE:
+        return (
+            "broker",
+            f"Consumers wait {wait} of their time for the server's own loop, which is busy {shares.broker:.0%} of its.",
+            "give its host a free core, let consumers on this host use shared memory, or split the consumers between "
+            "two servers",
+        )
+    if shares.idle >= _IDLE_SHARE:
+        return (
+            "way",
+            f"Consumers wait {wait} of their time although workers are idle {shares.idle:.0%} of theirs: samples are "
+            "on their way for long, or too few are asked ahead.",
+            "look at the network between them, and raise --max-credit-bytes or --expect-workers so that more is asked "
+            "ahead",
+        )
+    part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
+    doing, remedy = {
+        "decode": (
+            "decode",
+            "start more workers (--workers, v2v-worker on other hosts)"
+            + ("" if has_cache else ", keep what is decoded (--cache)")
+            + ", prepare the videos once (v2v-prepare), or take more samples of each clip (samples_per_decode)",
+        ),
+        "simulate": (
+            "simulate",
+            "start more workers (--workers, v2v-worker on other hosts), or ask for less: a smaller crop, fewer "
+            "voxels_per_clip, fewer effects, no flow",
+        ),
+        "handover": (
+            "hand over",
+            "run consumers on the workers' host, where samples lie in shared memory, or give the network more room",
+        ),
+    }[part]
+    share = {"decode": shares.decode, "simulate": shares.simulate, "handover": shares.handover}[part]
+    return part, f"Consumers wait {wait} of their time for workers, which {doing} {share:.0%} of theirs.", remedy
+
+
+def _share(part: float, whole: float) -> float:
+    return min(1.0, max(0.0, part / whole)) if whole > 0.0 else 0.0
