@@ -72,8 +72,9 @@ class Parser(argparse.ArgumentParser):
                     flag, action=argparse.BooleanOptionalAction, default=None, help=_help(setting)
                 )
             else:
+                bare = {} if setting.bare is None else {"nargs": "?", "const": setting.bare}
                 self.group(setting.group).add_argument(
-                    flag, type=_reader(setting), metavar=_metavar(setting), help=_help(setting)
+                    flag, type=_reader(setting), metavar=_metavar(setting), help=_help(setting), **bare
                 )
 
     def format_help(self) -> str:

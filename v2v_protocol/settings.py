@@ -39,6 +39,7 @@ class Setting:
         unit: of a number, as in "px" or "Hz".
         group: heading under which help and the reference page show it.
         metavar: what stands for the value in help.
+        bare: what a flag without a value stands for; None: it must have one.
         is_hidden: a program's own business: no line in help or on the reference page.
     """
 
@@ -52,6 +53,7 @@ class Setting:
     unit: str = ""
     group: str = ""
     metavar: str = ""
+    bare: Any = None
     is_hidden: bool = False
 
     @property

@@ -87,6 +87,15 @@ class ServeConfig:
         600.0, 0.001, 1e6, "a consumer silent for longer is forgotten; it can come back", unit="s", metavar="S"
     )
     max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "bound on the bytes in flight to one consumer")
+    page: int = whole(
+        0, 0, 65535, "port of a page to watch the service by, and of its metrics; without a PORT 5580, 0 is none",
+        bare=5580, metavar="PORT", group="Watching",
+    )  # fmt: skip
+    page_host: str = text("127.0.0.1", "address of this host that the page listens at", metavar="HOST")
+    page_names: str = text(
+        "", "names that the page may be asked by besides addresses and this host's own, with commas between",
+        metavar="NAMES",
+    )  # fmt: skip
     parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
     spec: StreamSpec = field(default_factory=StreamSpec)
 
@@ -97,6 +106,12 @@ class ServeConfig:
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
+        if self.page and not self.insecure and not _is_loopback(self.page_host):
+            raise UsageError(
+                f"--page-host {self.page_host} can be reached from other machines, and the page asks nobody for a key: "
+                "let it listen at 127.0.0.1 and reach it by `ssh -L`, or type out --insecure if everyone on that "
+                "network may watch this service"
+            )
         if self.engine == "ray" and not self.worker_bind:
             raise UsageError(
                 "--engine ray: give the workers of other hosts an address of this one, --worker-bind tcp://HOST:5556"

@@ -30,6 +30,7 @@ from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import StatusLine, summary, write
 from v2v_server.console.watch import make_watch
 from v2v_server.keys.folder import KeyFolder
+from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import make_cache
 from v2v_server.store.clips import check_file
@@ -133,12 +134,16 @@ def serve(config: ServeConfig) -> None:
             keys=KeyFolder(Path(config.keys)) if config.keys else None,
             local_bind=_private_address(label),
         )
-        server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file)
+        page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
+        server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file, page=page)
         try:
             if config.engine == "local" and (question := question_workers(config.most_workers, usable_cores())):
                 _say(question)
             supervisor.start(sockets.local_address if config.engine == "local" else sockets.worker_address)
             supervisor.scale(config.least_workers)
+            if page is not None:
+                page.start(sockets.local_address)
+                _say(f"page: {page.url}")
             while not stop.is_set() and config.parent_pid in (0, os.getppid()):
                 server.turn(_TURN_SECONDS)
         finally:
@@ -158,6 +163,7 @@ class Server:
         quarantine: the snapshots.
         quarantine_file: where verdicts are written down.
         clock: gives the time, seconds.
+        page: to watch the service by.
     """
 
     def __init__(
@@ -170,7 +176,9 @@ class Server:
         quarantine: Quarantine,
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
+        page: PageProcess | None = None,
     ) -> None:
+        self._page = page
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
@@ -221,7 +229,7 @@ class Server:
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
-            for line in self._supervisor.news():
+            for line in [*self._supervisor.news(), *(self._page.watch(now) if self._page is not None else [])]:
                 self._say(line)
             self._look_what_holds_up(now)
             self._scale(now)
@@ -234,6 +242,8 @@ class Server:
         for farewell in self._dispatcher.stop_workers():
             self._transport.send(farewell)
         self._supervisor.stop()
+        if self._page is not None:
+            self._page.stop()
         self._transport.close()
         if self._port_file is not None:
             with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend

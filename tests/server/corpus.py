@@ -39,6 +39,9 @@ class NamedCorpus:
     held: set[str] = field(default_factory=set)
     notes: tuple[str, ...] = ()
 
+    def wait_no_more(self) -> None:
+        """There is no index to wait for."""
+
     def digest_under(self, scene: str) -> str:
         """The digest; these videos have no statistics."""
         if scene != "off":

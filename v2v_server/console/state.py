@@ -369,7 +369,7 @@ def _waiting(service: Service, before: Moment, last: Moment) -> Waiting:
         consumers=dispatcher.consumers,
         workers=dispatcher.workers,
         starting=max(0, service.supervisor.running - dispatcher.workers),
-        trouble=dispatcher.registry.trouble(service.config.workers_in_all),
+        trouble=dispatcher.held_up or dispatcher.registry.trouble(service.config.workers_in_all),
         has_cache=bool(service.config.cache),
     )
 

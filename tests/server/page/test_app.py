@@ -1,0 +1,151 @@
+"""What is answered to which path, to whom, and how often the server is asked for it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import platform
+
+import pytest
+
+from tests.server.console.watched import Watched, service
+from tests.server.page.asked import Answer, LookerAt, ask, asked
+from tests.server.peers import peers
+from v2v_server.page.app import MOST_STREAMS, make_app
+from v2v_server.page.guard import App
+from v2v_server.page.source import FRESH_SECONDS, Source
+
+
+def app_of(watched: Watched | None) -> App:
+    return make_app(Source(LookerAt(watched)), ["watch.example"])
+
+
+@pytest.fixture
+def watched() -> Watched:
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0, 1, 2)
+    at.work_off()
+    seen = service(at)
+    seen.watch.is_ready = True
+    return seen
+
+
+# --- paths ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_service_that_answers_is_healthy_and_with_workers_it_is_ready(watched: Watched) -> None:
+    assert (ask(app_of(watched), "/healthz").status, ask(app_of(watched), "/readyz").status) == (200, 200)
+
+
+def test_a_service_without_workers_is_healthy_and_not_ready() -> None:
+    watched = service(peers())
+    watched.watch.is_ready = True
+    assert ask(app_of(watched), "/healthz").status == 200
+    answer = ask(app_of(watched), "/readyz")
+    assert (answer.status, answer.text) == (503, "no worker is connected\n")
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/state"])
+def test_a_server_that_does_not_answer_is_said(path: str) -> None:
+    answer = ask(app_of(None), path)
+    assert answer.status == 503
+    assert "is v2v-serve running there?" in answer.text
+
+
+def test_the_state_is_the_servers(watched: Watched) -> None:
+    answer = ask(app_of(watched), "/state")
+    assert answer.headers["content-type"] == "application/json"
+    assert json.loads(answer.body) == json.loads(watched.state().to_json())
+
+
+def events(answer: Answer) -> list[tuple[str, object]]:
+    found = []
+    for event in answer.text.split("\n\n")[:-1]:
+        kind, data = event.split("\n")
+        found.append((kind.removeprefix("event: "), json.loads(data.removeprefix("data: "))))
+    return found
+
+
+def test_events_are_states_as_they_come(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v2v_server.page.app.EVENT_SECONDS", 0.0)
+    answer = ask(app_of(watched), "/events", most_parts=3)
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    (first, state), *_ = events(answer)
+    assert first == "state"
+    assert state == json.loads(watched.state().to_json())
+
+
+def test_events_say_that_the_server_is_gone() -> None:
+    ((kind, said), *_) = events(ask(app_of(None), "/events", most_parts=1))
+    assert kind == "trouble"
+    assert "no answer" in str(said)
+
+
+def test_a_crowd_of_browsers_is_sent_away_and_those_that_leave_make_room(watched: Watched) -> None:
+    async def crowd() -> tuple[int, int]:
+        app = app_of(watched)
+        many = [asyncio.create_task(asked(app, "/events", most_parts=10**6)) for _ in range(MOST_STREAMS)]
+        await asyncio.sleep(0.2)
+        refused = (await asked(app, "/events", most_parts=1)).status
+        for one in many:
+            one.cancel()
+        await asyncio.gather(*many, return_exceptions=True)
+        return refused, (await asked(app, "/events", most_parts=1)).status
+
+    assert asyncio.run(crowd()) == (503, 200)
+
+
+def test_nothing_else_is_there_and_nothing_can_be_changed(watched: Watched) -> None:
+    assert ask(app_of(watched), "/../etc/passwd").status == 404
+    assert ask(app_of(watched), "/state", method="POST").status == 405
+
+
+# --- who may ask ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1:5580", "localhost:5580", "LOCALHOST", "[::1]:5580", "10.1.2.3", platform.node(), "watch.example:80"],
+)
+def test_addresses_and_names_of_this_host_may_be_asked_by(watched: Watched, host: str) -> None:
+    assert ask(app_of(watched), "/healthz", {"host": host}).status == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:5580", "127.0.0.1.evil.example", "", "[::1", "[]", "localhost.evil"]
+)
+def test_a_name_that_others_can_have_is_not_answered(watched: Watched, host: str) -> None:
+    answer = ask(app_of(watched), "/state", {"host": host})
+    assert answer.status == 421
+    assert "--page-names" in answer.text
+
+
+def test_a_browser_runs_nothing_of_strangers_and_sends_nothing_elsewhere(watched: Watched) -> None:
+    for path in ("/state", "/metrics", "/nowhere"):
+        headers = ask(app_of(watched), path).headers
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert "frame-ancestors 'none'" in policy
+        assert headers["x-content-type-options"] == "nosniff"
+
+
+# --- how often --------------------------------------------------------------------------------------------------------
+
+
+def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(watched: Watched) -> None:
+    looker, now = LookerAt(watched), [0.0]
+    source = Source(looker, lambda: now[0])
+    app = make_app(source)
+    assert looker.looks == 0
+
+    async def many() -> None:
+        await asyncio.gather(*(asked(app, "/state") for _ in range(20)))
+
+    asyncio.run(many())
+    assert looker.looks == 1
+    now[0] = FRESH_SECONDS
+    ask(make_app(source), "/state")
+    assert looker.looks == 2

@@ -1,0 +1,136 @@
+"""The page's process as the server has it. Needs none of the packages that the page needs.
+
+The server binds the port and passes it on, so that a port which is taken is said at the start, and nothing that asks is
+turned away while the process is started again. The process asks the server over ZeroMQ where the server's own workers
+do: that address is private to this host and user (the kernel says whose process connects), so that it needs no key of a
+consumer, which somebody would have to make, keep and revoke for a program that only looks.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+
+from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import environment
+
+_PACKAGES = ("starlette", "uvicorn", "prometheus_client")
+_FIRST_PAUSE_SECONDS, _LONGEST_PAUSE_SECONDS = 1.0, 60.0
+_LONG_LIFE_SECONDS = 60.0
+"""After so long a life the pauses begin small again."""
+_STOP_SECONDS = 3.0
+
+
+class PageProcess:
+    """A port that listens, and the process that answers there.
+
+    Args:
+        host, port: where to listen.
+        names: that it may be asked by, with commas between.
+
+    Raises:
+        UsageError: that cannot be had, or a package is missing.
+    """
+
+    def __init__(self, host: str, port: int, names: str = "") -> None:
+        missing = [name for name in _PACKAGES if find_spec(name) is None]
+        if missing:
+            raise UsageError(
+                f"--page needs the Python package {missing[0]}, which is not installed; the extra 'page' brings it: "
+                "pip install '.[server,page]' in a checkout of v2v-stream"
+            )
+        self._socket = _listening(host, port)
+        self._names = names
+        self._address = ""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._start_at = 0.0
+        self._started_at = 0.0
+        self._pause = _FIRST_PAUSE_SECONDS
+
+    @property
+    def url(self) -> str:
+        """Where it is."""
+        host, port = self._socket.getsockname()[:2]
+        return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process; None while there is none."""
+        return None if self._process is None else self._process.pid
+
+    def start(self, address: str) -> None:
+        """From now on :meth:`watch` keeps a process running, which asks the server at ``address``."""
+        self._address = address
+
+    def watch(self, now: float) -> list[str]:
+        """Starts the process where there is none, and says how one ended. To be called a few times a second."""
+        if self._process is not None and (status := self._process.poll()) is not None:
+            if now - self._started_at >= _LONG_LIFE_SECONDS:
+                self._pause = _FIRST_PAUSE_SECONDS
+            self._process, self._start_at = None, now + self._pause
+            text = f"the page's process {_ended(status)}; samples are not affected, and it is started again in "
+            said = [f"{text}{self._pause:g} s"]
+            self._pause = min(2 * self._pause, _LONGEST_PAUSE_SECONDS)
+            return said
+        if self._process is None and self._address and now >= self._start_at:
+            try:
+                self._process, self._started_at = self._started(), now
+            except OSError as error:
+                self._start_at = now + _LONGEST_PAUSE_SECONDS
+                return [f"the page's process could not be started: {error.strerror or error}"]
+        return []
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        descriptor = self._socket.fileno()
+        return subprocess.Popen(
+            [
+                *(sys.executable, "-m", "v2v_server.page", "--connect", self._address, "--fd", str(descriptor)),
+                *("--parent-pid", str(os.getpid()), "--names", self._names),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            pass_fds=(descriptor,),
+            env=environment(),
+            process_group=0,
+        )
+
+    def stop(self) -> None:
+        """Ends the process, and listens no more."""
+        self._address = ""
+        process, self._process = self._process, None
+        if process is not None:
+            process.terminate()
+            try:
+                process.wait(_STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._socket.close()
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """
+    Raises:
+        UsageError: it cannot be bound.
+    """
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
+    except OSError as error:
+        is_port = error.errno in (errno.EADDRINUSE, errno.EACCES) and not isinstance(error, socket.gaierror)
+        # Python adds a sentence of its own to the system's.
+        text = os.strerror(error.errno) if is_port and error.errno else error.strerror or str(error)
+        remedy = "give another port with --page PORT" if is_port else "give an address of this host with --page-host"
+        raise UsageError(f"--page {port} at {host}: {text}; {remedy}") from error
+
+
+def _ended(status: int) -> str:
+    if status >= 0:
+        return f"ended with status {status}"
+    number = -status
+    return f"was ended by {signal.Signals(number).name if number in set(signal.Signals) else f'signal {number}'}"
