@@ -16,7 +16,7 @@ from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import shown
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.sequences import Columns, SequenceTable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
@@ -64,6 +64,7 @@ class Admission:
         self._max_credit_bytes = max_credit_bytes
         self._session_idle_seconds = session_idle_seconds
         self._quarantine = quarantine
+        self._columns = Columns(catalogue.videos)
         self._tables: dict[tuple[object, ...], SequenceTable] = {}
 
     def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
@@ -145,6 +146,7 @@ class Admission:
         # Only this of a spec decides which sequences there are; many specs share a table.
         geometry = (
             recipe.frames_needed,
+            spec.samples_per_decode,
             recipe.frames_per_sequence,
             recipe.frame_stride,
             recipe.crop_height_px,
@@ -155,7 +157,7 @@ class Admission:
         )
         table = self._tables.get(geometry)
         if table is None:
-            table = SequenceTable(self._catalogue.videos, self._catalogue.rows, spec)
+            table = SequenceTable(self._catalogue.videos, self._catalogue.rows, spec, self._columns)
             if not table.count:
                 raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
             while len(self._tables) >= MOST_TABLES:

@@ -8,10 +8,13 @@ scene "auto" the same holds of each stretch of the video between its cuts and wh
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Iterable
+from collections import abc
 from dataclasses import dataclass
-from itertools import accumulate, islice
+from itertools import islice
+from typing import overload
+
+import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
@@ -25,12 +28,40 @@ MOST_CLIP_BYTES = 2 << 30
 """What a worker may have to hold of decoded frames for one lease."""
 
 
+Videos = abc.Sequence[VideoEntry]
+
+
 @dataclass(frozen=True, slots=True)
 class Sequence:
     """One run of frames: the video and its first frame."""
 
     video: VideoEntry
     start_frame: int
+
+
+class Columns:
+    """What decides how many sequences each video gives, side by side: a table for another spec costs no look at each.
+
+    Args:
+        videos: the catalogue's entries, in its order.
+
+    Attributes:
+        frames: int64 [N], of each video.
+        size: int32 [N], which of ``first_of_size``.
+        first_of_size: for each size of picture, the first video that has it.
+        cut: int64, the videos whose one run is not the whole of them; None where a video's runs are not known.
+    """
+
+    def __init__(self, videos: Videos) -> None:
+        numbers: dict[tuple[int, int], int] = {}
+        self.frames = np.fromiter((video.frames for video in videos), np.int64, len(videos))
+        sizes = (numbers.setdefault((video.height_px, video.width_px), len(numbers)) for video in videos)
+        self.size = np.fromiter(sizes, np.int32, len(videos))
+        self.first_of_size = tuple(np.unique(self.size, return_index=True)[1].tolist())
+        self.cut: npt.NDArray[np.int64] | None = None
+        if all(video.runs is not None for video in videos):
+            cut = [place for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
+            self.cut = np.array(cut, np.int64)
 
 
 class SequenceTable:
@@ -40,57 +71,50 @@ class SequenceTable:
         videos: the catalogue's entries, in its order.
         rows: the rows of each picture that may be used.
         spec: says how many frames a sequence needs, how large the crop is, and whether cuts count.
+        columns: of the videos; None makes them.
 
     Attributes:
         count: N, sequences in all.
-        refusals: the videos that give none.
-        longest_clips: of those that are too short, the ``voxels_per_clip`` that each is long enough for.
+        videos: how many give at least one.
+        refusals: the videos that give none; each is made when it is looked at.
         spoilt: sequences of the places 0, L, 2L ... that are left out or moved because of what they show.
 
     Raises:
         UsageError: the spec asks for scenes and the catalogue has none.
     """
 
-    def __init__(self, videos: Iterable[VideoEntry], rows: Rows, spec: StreamSpec) -> None:
-        self._stride = spec.recipe.frames_per_sequence
+    def __init__(self, videos: Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
+        columns = columns or Columns(videos)
+        recipe = spec.recipe
+        self._all, self._recipe, self._stride = videos, recipe, recipe.frames_per_sequence
+        self._frames = columns.frames
         self._starts: dict[int, tuple[int, ...]] = {}
         self.spoilt = 0
-        admitted: list[VideoEntry] = []
-        counts: list[int] = []
-        refusals: list[Refusal] = []
-        longest: list[int] = []
-        for video in videos:
-            if video.frames < spec.recipe.frames_needed:
-                longest.append(_longest_clip(video.frames, spec.recipe))
-                refusals.append(_too_short(video, spec.recipe))
-                continue
-            if (refusal := _too_small(video, rows, spec.recipe) or _too_large(video, rows, spec)) is not None:
-                refusals.append(refusal)
-                continue
-            fit = (video.frames - spec.recipe.frames_needed) // self._stride + 1
-            count = min(fit, spec.max_sequences_per_video)
-            if spec.scene != "off":
-                starts = _starts(video, spec)
-                self.spoilt += len({self._stride * place for place in range(count)} - set(starts))
-                if not starts:
-                    run = max((end - first for first, end in video.runs or ()), default=0)
-                    longest.append(_longest_clip(run, spec.recipe))
-                    refusals.append(_all_cut(video, run, spec.recipe))
-                    continue
-                self._starts[len(admitted)] = starts
-                count = len(starts)
-            admitted.append(video)
-            counts.append(count)
-        self._videos = tuple(admitted)
-        self._ends = tuple(accumulate(counts))
-        self.count = self._ends[-1] if self._ends else 0
-        self.refusals = tuple(refusals)
-        self.longest_clips = tuple(voxels for voxels in longest if voxels)
+        counts = np.clip((columns.frames - recipe.frames_needed) // self._stride + 1, 0, spec.max_sequences_per_video)
+        suits = [_unsuited_size(videos[first], rows, spec) is None for first in columns.first_of_size]
+        counts *= np.array(suits, bool)[columns.size]
+        if spec.scene != "off":
+            if columns.cut is None:
+                raise UsageError(
+                    f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
+                    "start the server with --scene auto"
+                )
+            for place in columns.cut[counts[columns.cut] > 0].tolist():
+                starts = self._starts[place] = _starts(videos[place], spec)
+                self.spoilt += len({self._stride * each for each in range(counts[place])} - set(starts))
+                counts[place] = len(starts)
+        self._ends = np.cumsum(counts)
+        self.count = int(self._ends[-1]) if len(videos) else 0
+        self.videos = int(np.count_nonzero(counts))
+        self.refusals = Refusals(np.flatnonzero(counts == 0), videos, rows, spec)
 
     @property
-    def videos(self) -> int:
-        """Videos that give at least one sequence."""
-        return len(self._videos)
+    def longest_clips(self) -> tuple[int, ...]:
+        """Of the videos that are too short, the ``voxels_per_clip`` that each is long enough for."""
+        short = self._frames[self._frames < self._recipe.frames_needed]
+        runs = [_longest_run(self._all[place]) for place, starts in self._starts.items() if not starts]
+        clips = (_longest_clip(frames, self._recipe) for frames in [*short.tolist(), *runs])
+        return tuple(voxels for voxels in clips if voxels)
 
     def __getitem__(self, rank: int) -> Sequence:
         """The sequence of that rank, 0 .. count-1.
@@ -100,23 +124,54 @@ class SequenceTable:
         """
         if not 0 <= rank < self.count:
             raise IndexError(f"sequence {rank} of {self.count}")
-        video = bisect_right(self._ends, rank)
-        first = self._ends[video - 1] if video else 0
-        place = rank - first
+        video = int(self._ends.searchsorted(rank, side="right"))
+        place = rank - (int(self._ends[video - 1]) if video else 0)
         start = self._starts[video][place] if video in self._starts else place * self._stride
-        return Sequence(self._videos[video], start)
+        return Sequence(self._all[video], start)
+
+
+class Refusals(abc.Sequence[Refusal]):
+    """Why videos give no sequence.
+
+    Args:
+        places: of these videos.
+        videos: all of the catalogue.
+        rows, spec: that they do not suit.
+    """
+
+    def __init__(self, places: npt.NDArray[np.intp], videos: Videos, rows: Rows, spec: StreamSpec) -> None:
+        self._places, self._videos, self._rows, self._spec = places, videos, rows, spec
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, at: int) -> Refusal: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> tuple[Refusal, ...]: ...
+
+    def __getitem__(self, at: int | slice) -> Refusal | tuple[Refusal, ...]:
+        if isinstance(at, slice):
+            return tuple(self._why(place) for place in self._places[at].tolist())
+        return self._why(int(self._places[at]))
+
+    def _why(self, place: int) -> Refusal:
+        video, recipe = self._videos[place], self._spec.recipe
+        if video.frames < recipe.frames_needed:
+            return _too_short(video, recipe)
+        return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, _longest_run(video), recipe)
 
 
 def _starts(video: VideoEntry, spec: StreamSpec) -> tuple[int, ...]:
     """First frames of the sequences that lie within one of the video's runs: at 0, L, 2L ... of each."""
-    if video.runs is None:
-        raise UsageError(
-            f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: start '
-            "the server with --scene auto"
-        )
     needed, stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
-    starts = (start for first, end in video.runs for start in range(first, end - needed + 1, stride))
+    starts = (start for first, end in video.runs or () for start in range(first, end - needed + 1, stride))
     return tuple(islice(starts, spec.max_sequences_per_video))
+
+
+def _longest_run(video: VideoEntry) -> int:
+    return max((end - first for first, end in video.runs or ()), default=0)
 
 
 def _longest_clip(frames: int, recipe: Recipe) -> int:
@@ -142,6 +197,10 @@ def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
         f"at most {longest_run} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
     )
     return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+
+
+def _unsuited_size(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
+    return _too_small(video, rows, spec.recipe) or _too_large(video, rows, spec)
 
 
 def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:

@@ -13,6 +13,7 @@ from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
 from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.schedule import sequences
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8
 VERDICTS = [Verdict(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
@@ -84,6 +85,15 @@ def test_a_stream_from_a_server_that_knows_more_verdicts_is_told_what_to_do() ->
 def test_batch_sizes_are_limited(batch_size: int) -> None:
     with pytest.raises(UsageError, match=f"batch_size = {batch_size}: give 1 to {MOST_BATCH_SIZE}"):
         admission().admit(b"c", hello(batch_size), 1, 0.0)
+
+
+def test_how_many_share_a_decode_decides_what_a_worker_can_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two such specs shared a table: how many sequences there were depended on who had come first."""
+    at = admission()
+    monkeypatch.setattr(sequences, "MOST_CLIP_BYTES", 400)  # one sample takes 320
+    at.admit(b"c", hello(), 1, 0.0)
+    with pytest.raises(UsageError, match="MiB of decoded frames"):
+        at.admit(b"d", hello(samples_per_decode=2), 1, 0.0)
 
 
 def test_one_table_serves_all_specs_of_a_geometry() -> None:

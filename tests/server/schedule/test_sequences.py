@@ -105,7 +105,7 @@ def test_a_rank_outside_is_refused(rank: int) -> None:
 
 def test_an_empty_corpus_has_no_sequence() -> None:
     found = table()
-    assert (found.count, found.videos, found.refusals) == (0, 0, ())
+    assert (found.count, found.videos, len(found.refusals)) == (0, 0, 0)
 
 
 # --- refusals -------------------------------------------------------------------------------------------------------
