@@ -56,7 +56,7 @@ def deliver(
     # And the one that the trainer has: all of them are free when an epoch ends.
     buffers.shape(connection.layout, plan.batch_size, spare=most_drafts + 1)
     drafts: dict[int, _Draft] = {}
-    quarantine, lend, waited = 0, shared_memory, 0.0
+    quarantine, lend = 0, shared_memory
 
     def ask() -> None:
         asked, slots = window.ask(), {}
@@ -83,14 +83,10 @@ def deliver(
         while (sample := connection.receive(wait=False)) is not None:
             accept(sample)
             ask()
-        since = clock()
         while (number := window.take()) is None:
             if (sample := connection.receive()) is not None:
-                connection.waited(waited + clock() - since)
                 accept(sample)
                 ask()
-        waited += clock() - since
-        connection.waited(waited)
         ask()
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
         draft = drafts.pop(number)

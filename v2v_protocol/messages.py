@@ -70,7 +70,7 @@ class Want:
         epoch, indices: which samples.
         arenas, slots: for each index, memory that a worker of the same host may put its sample into, see
             :mod:`v2v_protocol.arena`; "" and 0 where there is none. Empty: none for any.
-        waited_seconds: for how long the consumer has waited for batches in all since its Hello. For people to read;
+        waited_seconds: for how long the consumer has waited for samples in all since its Hello. For people to read;
             nothing goes by it.
     """
 
@@ -88,7 +88,13 @@ class Ping:
 
 @dataclass(frozen=True, slots=True)
 class Goodbye:
-    """The sender leaves in peace: forget its session, or give its leases to others."""
+    """The sender leaves in peace: forget its session, or give its leases to others.
+
+    Attributes:
+        waited_seconds: of a consumer, as :class:`Want` says it.
+    """
+
+    waited_seconds: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -386,5 +386,5 @@ def test_arbitrary_samples(names: list[str], dtypes: list[str], shapes: list[int
 
 def test_one_message_of_each_kind_is_small() -> None:
     """A lease is the largest header in use; what polls and goodbyes cost is a handful of bytes."""
-    assert len(encode(Goodbye())[0]) < 20
+    assert len(encode(Goodbye())[0]) < 40
     assert len(encode(example(Lease))[0]) < 400

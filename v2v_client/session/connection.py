@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import Arrival, Conversation, Event, State
+from v2v_client.session.conversation import WAITS_TOLD_SECONDS, Arrival, Conversation, Event, State
 from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_protocol.arena import Slot
@@ -161,10 +161,6 @@ class Connection:
         self._conversation.want(indices, slots)
         self._send(link)
 
-    def waited(self, seconds: float) -> None:
-        """Batches were waited for so long in all; the server is told with the next request."""
-        self._conversation.waited_seconds = seconds
-
     def receive(self, *, wait: bool = True) -> Arrival | None:
         """The next sample to arrive, whichever it is.
 
@@ -176,10 +172,13 @@ class Connection:
             UsageError: the connection was opened by another process, from which this one was forked.
             V2VError: see :meth:`Conversation.hear`.
         """
-        self._listening.listen(self._clock())
+        began, before = self._clock(), self._conversation.waited_seconds
+        self._listening.listen(began)
         try:
             while True:
                 arrival, idle = self._step(wait=wait)
+                if wait:
+                    self._conversation.waits(before + self._clock() - began, self._now())
                 if arrival is not None or (idle and not wait):
                     return arrival
         finally:
@@ -191,7 +190,7 @@ class Connection:
         if conversation.tick(self._now()):
             link.connect(self._largest_frame_bytes, keep_name=True)
         self._send(link)
-        seconds = conversation.next_due(self._now()) if wait else 0.0
+        seconds = min(conversation.next_due(self._now()), WAITS_TOLD_SECONDS) if wait else 0.0
         due = self._clock() + seconds
         frames = link.receive(seconds)
         self._listening.woke(self._clock(), due)

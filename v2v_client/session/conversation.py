@@ -88,6 +88,8 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     },
 }
 
+WAITS_TOLD_SECONDS = 1.0
+"""From one word about how long samples are waited for to the next."""
 _MOST_CREDIT_DENIALS = 3
 _WARN_SECONDS = 5.0
 """So long after the last sign of hope a server without workers is worth a word."""
@@ -130,7 +132,8 @@ class Conversation:
         layout: dtype and shape of each array of one sample, once welcomed.
         credit: most samples asked for and not received.
         strays: samples of another epoch, dropped.
-        waited_seconds: for how long batches were waited for so far; the server is told with each request.
+        waited_seconds: for how long samples were waited for so far; the server is told with each request, while they
+            are waited for once a second, and at the end.
     """
 
     stream: StreamIdentity
@@ -178,6 +181,7 @@ class Conversation:
         self.credit = 0
         self.strays = 0
         self.waited_seconds = 0.0
+        self._waits_told_at = now
         if pinned is not None:
             self._pin(pinned)
 
@@ -204,7 +208,7 @@ class Conversation:
             case State.WELCOMED:
                 self._want_again()
             case State.CLOSED:
-                self.outbox.append(Goodbye())
+                self.outbox.append(Goodbye(self.waited_seconds))
 
     def tick(self, now: float) -> bool:
         """Does what the time demands.
@@ -238,6 +242,13 @@ class Conversation:
             # A server answers anybody's Ping; that it forgot us shows only when something is asked, be it nothing.
             self.outbox += [Want(self._epoch, (), waited_seconds=self.waited_seconds), Ping()]
         return False
+
+    def waits(self, seconds: float, now: float) -> None:
+        """Samples have been waited for, so long in all, and still are."""
+        self.waited_seconds = seconds
+        if self.state is State.WELCOMED and now - self._waits_told_at >= WAITS_TOLD_SECONDS:
+            self._waits_told_at = now
+            self.outbox.append(Want(self._epoch, (), waited_seconds=seconds))
 
     def next_due(self, now: float) -> float:
         """Seconds until :meth:`tick` has something to do, at least 0."""

@@ -113,6 +113,7 @@ class Admission:
             credit=min(suggested, MOST_CREDIT, self._max_credit_bytes // layout_bytes(layout)),
             liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
             quarantine=quarantine,
+            since=now,
             name=shown(hello.name),
             host=shown(hello.host),
         )

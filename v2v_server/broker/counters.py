@@ -59,6 +59,7 @@ class Counters:
         bytes: of the arrays of those samples.
         in_slots: samples put into memory shared with their consumer; the others travelled in messages.
         work: what the workers took for them.
+        waited_seconds: for how long consumers have waited for samples in all, as they say.
         refused_candidates: videos passed over because they could not give what they promised.
         unavailable: samples that no candidate could give.
         returned_leases: leases taken back from workers that died, hung or left.
@@ -78,6 +79,7 @@ class Counters:
     bytes: int = 0
     in_slots: int = 0
     work: WorkDone = field(default_factory=WorkDone)
+    waited_seconds: float = 0.0
     refused_candidates: int = 0
     unavailable: int = 0
     returned_leases: int = 0

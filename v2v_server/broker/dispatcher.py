@@ -164,11 +164,14 @@ class Dispatcher:
             case See():
                 return [Show(identity)]
             case Goodbye():
+                if session is not None:
+                    self.counters.waited_seconds += session.waits(message.waited_seconds, now)
                 self.consumer_lost(identity)
                 return []
             case Want():
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
+                self.counters.waited_seconds += session.waits(message.waited_seconds, now)
                 return self._want(session, message) or self._assign(now)
             case _:
                 stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
@@ -211,7 +214,6 @@ class Dispatcher:
             for index in want.indices[:1]:
                 SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
             self.sessions.want(session, want.epoch, want.indices, slots)
-            session.waited_seconds = max(session.waited_seconds, want.waited_seconds)
         except LimitExceeded as error:
             return [_deny(session.identity, ErrorCode.CREDIT, str(error))]
         except (IndexError, UsageError) as error:

@@ -53,10 +53,11 @@ class Session:
         served: samples sent.
         quarantine: number of the quarantine snapshot its samples are made under.
         left_at: when its connection ended; None while it has one, as far as is known.
+        since: when it was opened.
         name, host: what it calls itself.
         epoch: that it last asked for samples of.
         position: index after the highest of that epoch that was answered.
-        waited_seconds: for how long it has waited for batches since its Hello, as it says.
+        waited_seconds: for how long it has waited for samples since its Hello, as it says.
         form: of one of its samples.
     """
 
@@ -74,6 +75,7 @@ class Session:
     served: int = 0
     quarantine: int = 0
     left_at: float | None = None
+    since: float = 0.0
     name: str = ""
     host: str = ""
     epoch: int = 0
@@ -89,6 +91,12 @@ class Session:
         """Its consumer said something."""
         self.liveness.heard(now)
         self.left_at = None
+
+    def waits(self, seconds: float, now: float) -> float:
+        """Its consumer says how long it has waited in all; returns how much more than before that is, within reason."""
+        more = min(seconds, now - self.since) - self.waited_seconds
+        self.waited_seconds += max(0.0, more)
+        return max(0.0, more)
 
 
 class Sessions:

@@ -23,10 +23,11 @@ class Moment:
         worker_seconds: that there were workers, times how many.
         idle_seconds: of these, in which they held no lease.
         consumer_seconds: that there were consumers, times how many.
+        waited_seconds: of these, in which they waited for samples.
         broker_seconds: that the server's loop did not wait for a message.
         cpu: processor time, by worker.
         busy: time by the clock that samples took, by worker.
-        waited: time that a consumer waited for batches, by consumer.
+        waited: time that a consumer waited for samples, by consumer.
         served: samples, by consumer.
         positions: (epoch, position in it), by consumer.
     """
@@ -42,6 +43,7 @@ class Moment:
     worker_seconds: float = 0.0
     idle_seconds: float = 0.0
     consumer_seconds: float = 0.0
+    waited_seconds: float = 0.0
     broker_seconds: float = 0.0
     cpu: Mapping[bytes, float] = field(default_factory=dict)
     busy: Mapping[bytes, float] = field(default_factory=dict)
@@ -102,6 +104,7 @@ class History:
             self._worker_seconds,
             self._idle_seconds,
             self._consumer_seconds,
+            counters.waited_seconds,
             broker_seconds,
             {name: member.work.cpu_seconds for name, member in members.items()},
             {name: member.work.busy_seconds for name, member in members.items()},

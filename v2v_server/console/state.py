@@ -182,6 +182,7 @@ class Totals:
     decode_seconds: float
     simulate_seconds: float
     handover_seconds: float
+    waited_seconds: float
     refused_candidates: int
     unavailable: int
     returned_leases: int
@@ -387,6 +388,7 @@ def _totals(dispatcher: Dispatcher) -> Totals:
         decode_seconds=work.decode_seconds,
         simulate_seconds=work.simulate_seconds,
         handover_seconds=work.handover_seconds,
+        waited_seconds=counters.waited_seconds,
         refused_candidates=counters.refused_candidates,
         unavailable=counters.unavailable,
         returned_leases=counters.returned_leases,
@@ -459,6 +461,8 @@ def _worker(
 
 
 def _consumer(session: Session, now: float, before: Moment, seconds: float) -> ConsumerState:
+    # One that came a moment ago has rates of its own time, a second at least.
+    seconds = min(seconds, max(1.0, now - session.since))
     samples = _rate(session.served - before.served.get(session.identity, 0), seconds)
     waited = _rate(session.waited_seconds - before.waited.get(session.identity, 0.0), seconds)
     left = session.schedule.count - session.position

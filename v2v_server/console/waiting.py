@@ -50,11 +50,12 @@ class Shares:
     @classmethod
     def of(cls, before: Moment, last: Moment) -> Shares:
         """Those of the time between two moments."""
-        waited = sum(max(0.0, total - before.waited.get(name, 0.0)) for name, total in last.waited.items())
         workers = last.worker_seconds - before.worker_seconds
         return cls(
             seconds=last.now - before.now,
-            consumers=_share(waited, last.consumer_seconds - before.consumer_seconds),
+            consumers=_share(
+                last.waited_seconds - before.waited_seconds, last.consumer_seconds - before.consumer_seconds
+            ),
             idle=_share(last.idle_seconds - before.idle_seconds, workers),
             broker=_share(last.broker_seconds - before.broker_seconds, last.now - before.now),
             decode=_share(last.decode_seconds - before.decode_seconds, workers),

@@ -21,6 +21,7 @@ _COUNTERS = {
     "v2v_sample_bytes": ("bytes", "Bytes of their arrays."),
     "v2v_shared_memory_samples": ("in_slots", "Samples put into memory shared with their consumer."),
     "v2v_worker_cpu_seconds": ("cpu_seconds", "Processor time that samples took in workers."),
+    "v2v_consumer_waiting_seconds": ("waited_seconds", "Time that consumers waited for samples, as they say."),
     "v2v_refused_candidates": ("refused_candidates", "Videos passed over."),
     "v2v_unavailable_samples": ("unavailable", "Samples that no candidate could give."),
     "v2v_returned_leases": ("returned_leases", "Leases taken back from workers that died, hung or left."),

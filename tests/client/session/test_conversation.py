@@ -264,3 +264,15 @@ def test_a_connection_works_over_queues_too(silent_until: float, made_anew: int)
     assert sorted(arrival.header.index for arrival in arrivals if arrival is not None) == list(range(7))
     assert link.connected.count(True) == made_anew
     assert link.left == 2  # to learn the layout, and at the end
+
+
+def test_a_wait_is_told_once_a_second_and_at_the_end() -> None:
+    talk = begun()
+    said(talk)
+    for tenth in range(1, 35):
+        talk.waits(tenth / 10, tenth / 10)
+    told = [message.waited_seconds for message in said(talk) if isinstance(message, Want)]
+    assert 3 <= len(told) <= 4
+    assert told == sorted(told)
+    talk.happens(Event.LEFT, 1010.0)
+    assert said(talk) == [Goodbye(3.4)]

@@ -11,7 +11,7 @@ from tests.server.console.watched import WALL, seen, service
 from tests.server.corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
-from v2v_protocol.messages import Denied, ErrorCode, Hello, Result, See, Want, WorkerHello
+from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Result, See, Want, WorkerHello
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import Show, ToConsumer, ToWorker
@@ -291,3 +291,17 @@ def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> N
 def test_the_spec_of_the_server_is_told_resolved() -> None:
     state = service(peers()).state()
     assert set(state.spec) == set(SMALL_SPEC.to_dict())
+
+
+def test_a_consumer_cannot_have_waited_longer_than_it_was_there() -> None:
+    at = peers()
+    watched = service(at)
+    at.now = 10.0
+    hello(at)
+    at.now = 14.0
+    at.consumer_says(b"c", Want(0, (), waited_seconds=1e300))
+    at.consumer_says(b"c", Want(0, (), waited_seconds=3.0))
+    assert watched.state().consumers[0].waited_seconds == 4.0
+    at.consumer_says(b"c", Goodbye(4.0))
+    assert watched.state().totals.waited_seconds == 4.0
+    assert watched.state().consumers == ()
