@@ -16,6 +16,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
+from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
@@ -95,6 +96,9 @@ class ServeConfig:
     page_names: str = text(
         "", "names that the page may be asked by besides addresses and this host's own, with commas between",
         metavar="NAMES",
+    )  # fmt: skip
+    log_format: str = word(
+        "text", LOG_FORMATS, "what is said on standard error: text for people, or json, an object a line"
     )  # fmt: skip
     parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
     spec: StreamSpec = field(default_factory=StreamSpec)

@@ -12,8 +12,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
@@ -21,13 +23,16 @@ from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, 
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
+from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
+from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
-from v2v_server.console.status import StatusLine, summary, write
+from v2v_server.console.status import StatusLine, summary
+from v2v_server.console.status_log import StatusLog
 from v2v_server.console.watch import make_watch
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
@@ -37,6 +42,8 @@ from v2v_server.store.clips import check_file
 from v2v_server.supervise.engines import make_supervisor
 from v2v_server.supervise.protocol import Supervisor
 from v2v_server.supervise.scaling import Scaling
+from v2v_server.system.clock import Clock
+from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.video.rows import Rows
 
@@ -48,8 +55,6 @@ _SOON_SECONDS = 5.0
 """What keeps everybody waiting for longer is said."""
 _GIVE_BACK_SECONDS = 12.0
 """From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
-_LONGEST_TURN_SECONDS = 1.0
-"""What goes beyond is time in which nobody was listened to."""
 
 
 def question_workers(workers: int, cores: int) -> str:
@@ -69,7 +74,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
         CorpusError: nothing there, or nothing that can be used.
     """
     cores = usable_cores()
-    with catalogue_progress() as progress:
+    with catalogue_progress(log=Log(is_json=config.log_format == "json")) as progress:
         return open_catalogue(
             config.videos,
             list_file=config.list or None,
@@ -93,19 +98,20 @@ def serve(config: ServeConfig) -> None:
     """
     keep_freed_memory()
     open_many_files()
+    log = Log(is_json=config.log_format == "json")
     catalogue = load_catalogue(config)
     for note in catalogue.notes:
-        _say(note)
+        log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
     for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
-        _say(line)
+        log.say(line)
     catalogue.wait_no_more()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
     quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
     quarantine = read_quarantine(quarantine_file)
     for verdict in quarantine.verdicts(quarantine.latest):
-        _say(f"in quarantine: {verdict}")
+        log.say(f"in quarantine: {verdict}")
     dispatcher = Dispatcher(
         catalogue,
         config.spec,
@@ -118,6 +124,7 @@ def serve(config: ServeConfig) -> None:
     )
     # Workers of this host come in where no key is asked for.
     worker_flags = ["--keys", ""] if config.engine == "local" else []
+    worker_flags += ["--log-format", config.log_format]
     if config.cache:
         folder = Path(config.cache).absolute()
         make_cache(folder)
@@ -138,12 +145,12 @@ def serve(config: ServeConfig) -> None:
         server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file, page=page)
         try:
             if config.engine == "local" and (question := question_workers(config.most_workers, usable_cores())):
-                _say(question)
+                log.say(question, "warning")
             supervisor.start(sockets.local_address if config.engine == "local" else sockets.worker_address)
             supervisor.scale(config.least_workers)
             if page is not None:
                 page.start(sockets.local_address)
-                _say(f"page: {page.url}")
+                log.say(f"page: {page.url}")
             while not stop.is_set() and config.parent_pid in (0, os.getppid()):
                 server.turn(_TURN_SECONDS)
         finally:
@@ -179,6 +186,7 @@ class Server:
         page: PageProcess | None = None,
     ) -> None:
         self._page = page
+        self._log = Log(is_json=config.log_format == "json")
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
@@ -190,7 +198,7 @@ class Server:
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
-        self._status = StatusLine(sys.stderr)
+        self._status = StatusLog(self._log) if self._log.is_json else StatusLine(sys.stderr)
         self._watch = make_watch(
             config, catalogue, dispatcher, supervisor, quarantine, transport, self._clock(), _utc_now
         )
@@ -224,7 +232,7 @@ class Server:
                 self._dispatcher.worker_stopped(identity, seconds)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
-                self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others")
+                self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
                 self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
@@ -239,8 +247,14 @@ class Server:
     def close(self) -> None:
         """Tells the workers to stop, ends them, and ends all connections."""
         self._status.close()
-        for farewell in self._dispatcher.stop_workers():
-            self._transport.send(farewell)
+        if self._announced:
+            state = self._watch.state(self._clock())
+            for line in farewell(state):
+                self._log.say(line)
+            if self._log.is_json:
+                self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)
+        for stop in self._dispatcher.stop_workers():
+            self._transport.send(stop)
         self._supervisor.stop()
         if self._page is not None:
             self._page.stop()
@@ -267,11 +281,11 @@ class Server:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case Condemn() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record.verdict), now())))
+                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record), now())))
                 case LookFor() as missing:
                     todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
-                case PassOver(refusal):
-                    self._say(f"passed over {refusal}")
+                case PassOver(refusal, request):
+                    self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case Show() as show:
                     todo.extend(self._watch.ask(show))
 
@@ -281,25 +295,29 @@ class Server:
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
         name = hopeless.identity.decode(errors="replace")
-        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others")
+        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
         return loss
 
-    def _record(self, verdict: Verdict) -> list[Verdict]:
+    def _record(self, record: Condemn) -> list[Verdict]:
         """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
 
         Returns:
             the lines that the quarantine has more now.
         """
+        verdict = record.verdict
         try:
             written = write_verdict(self._quarantine_file, verdict, self._quarantine)
         except (OSError, CorpusError) as error:
             self._say(
                 f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
-                f"again, because the quarantine cannot be written: {error}"
+                f"again, because the quarantine cannot be written: {error}",
+                "error",
+                record.request,
+                video=verdict.path,
             )
             return []
         for line in written:
-            self._say(f"quarantine: {line}")
+            self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
         return written
 
     def _look_for(self, missing: LookFor) -> bool:
@@ -319,7 +337,10 @@ class Server:
             self._say(
                 f"worker {name} failed on {missing.video}, which is on this host as it was catalogued: "
                 f"{missing.reason}; others make the sample, and it gets no work for {REST_SECONDS:g} s. Look at "
-                "--videos on its host"
+                "--videos on its host",
+                "warning",
+                missing.request,
+                video=missing.video,
             )
         return True
 
@@ -331,7 +352,7 @@ class Server:
             self._held_up_due = now + _SOON_SECONDS
         elif now >= self._held_up_due:
             self._held_up_due = math.inf
-            self._say(f"no sample is begun: {self._dispatcher.held_up}")
+            self._say(f"no sample is begun: {self._dispatcher.held_up}", "warning")
 
     def _scale(self, now: float) -> None:
         """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""
@@ -356,26 +377,19 @@ class Server:
         if self._announced and self._status.is_due(now):
             self._status.show(now, self._watch.state(now))
 
-    def _say(self, text: str) -> None:
+    def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
+        """A line for whoever runs the server.
+
+        Args:
+            text, level: the line.
+            sample: that it is about.
+            about: what else programs may want to know.
+        """
         self._status.interrupt()
-        _say(text)
-
-
-class Clock:
-    """Seconds, as far as this process was there to listen.
-
-    While it is stopped (in a terminal, by a batch system, with its whole machine) it hears no answer, and those who owe
-    one may be stopped as well: a deadline that runs out meanwhile is nobody's fault.
-    """
-
-    def __init__(self) -> None:
-        self._seen = time.monotonic()
-        self._away = 0.0
-
-    def __call__(self) -> float:
-        seen, self._seen = self._seen, time.monotonic()
-        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
-        return self._seen - self._away
+        identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
+        if identity is not None:
+            about["sample"] = asdict(identity)
+        self._log.say(text, level, **about)
 
 
 def _private_address(label: str) -> str:
@@ -417,7 +431,3 @@ def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
 
 def _utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _say(text: str) -> None:
-    write(sys.stderr, text + "\n")

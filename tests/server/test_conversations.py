@@ -10,8 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import hypothesis.strategies as st
 import pytest
@@ -168,7 +167,7 @@ class World:
         self.supervisor.workers = list(self.workers)  # they find the new server at the same address
         self.server = Server(
             ServeConfig(videos="videos", workers=WORKERS),
-            cast(Any, SimpleNamespace()),
+            videos,
             self.dispatcher,
             self.queues,
             self.supervisor,

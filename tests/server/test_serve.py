@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from tests.server.peers import peers
 from tests.server.queues import Queues, ToySupervisor
+from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoChanged
 from v2v_protocol.messages import Pong, Stop
 from v2v_protocol.refusal import Refusal
@@ -26,6 +28,7 @@ from v2v_server.broker.quarantine import Quarantine, Verdict, read_quarantine
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.serve import Server, question_workers
+from v2v_server.system import clock as clock_module
 
 VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = Condemn(VERDICT, Request(b"c", 0, 0))
@@ -199,7 +202,7 @@ def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
 ) -> None:
     """Its workers were stopped along with it, or have answered to nobody: no deadline may run out."""
     dispatcher = Scripted()
-    monkeypatch.setattr(serve_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
+    monkeypatch.setattr(clock_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
     server = served(dispatcher, tmp_path)
     server.turn(0.0)
     server.turn(0.0)
@@ -235,3 +238,46 @@ def test_more_workers_come_while_consumers_wait_and_leave_again(
     said = capsys.readouterr().err
     assert "workers: 3 from now on, because 100% of consumers waited and 0% of workers were idle in 1 s" in said
     assert "workers: 2 from now on, because at the busiest 0% of consumers waited and 90%" in said
+
+
+def logged(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    """What a server said, each line one object."""
+    return [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+
+
+def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at = peers()
+    at.hello(b"c", seed=5)
+    request = Request(b"c", 2, 7)
+    dispatcher = Scripted([PassOver(Refusal("a.mp4", 7, "cut short"), request), Condemn(VERDICT, request)])
+    dispatcher._there = at.dispatcher
+    server = served(dispatcher, tmp_path, log_format="json")
+    server.close()
+    lines = logged(capsys)
+    assert all({"time", "level", "text"} <= line.keys() for line in lines)
+    passed_over, condemned = (next(line for line in lines if word in line["text"]) for word in ("passed", "quarantine"))
+    session = at.dispatcher.sessions.get(b"c")
+    assert session is not None
+    assert passed_over["sample"] == {
+        "spec_digest": session.spec.digest, "catalogue_digest": "c" * 32, "numerics_version": NUMERICS_VERSION,
+        "seed": 5, "epoch": 2, "index": 7,
+    }  # fmt: skip
+    assert (passed_over["level"], passed_over["video"]) == ("warning", "a.mp4")
+    assert (condemned["sample"], condemned["video"]) == (passed_over["sample"], "v.mp4")
+    status = next(line for line in lines if "slow_part" in line)
+    assert status["workers"] == 0
+    assert lines[-1]["totals"]["samples"] == 0
+
+
+def test_the_end_is_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    served(Scripted(), tmp_path).close()
+    said = capsys.readouterr().err
+    assert "in all 0 samples" in said
+    assert "\nfaults 0\n" in said
+
+
+def test_a_server_that_was_never_ready_sums_up_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    served(Scripted(), tmp_path, workers=1).close()
+    assert "in all" not in capsys.readouterr().err

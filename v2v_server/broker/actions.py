@@ -82,9 +82,15 @@ class LookFor:
 
 @dataclass(frozen=True, slots=True)
 class PassOver:
-    """Tell the operator that a video was passed over."""
+    """Tell the operator that a video was passed over.
+
+    Attributes:
+        refusal: which, and why.
+        request: that it was passed over for.
+    """
 
     refusal: Refusal
+    request: Request | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,7 +113,7 @@ class Candidates:
         passed_over = next_candidate(request, refusal)
         self.latest.append((self._wall_clock(), passed_over.refusals[-1]))
         # What the quarantine refuses is no news to the operator.
-        actions: list[Action] = [PassOver(passed_over.refusals[-1])] if kind != RefusalKind.QUARANTINED else []
+        actions: list[Action] = [PassOver(passed_over.refusals[-1], request)] if kind != RefusalKind.QUARANTINED else []
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions

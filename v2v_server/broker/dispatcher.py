@@ -130,6 +130,14 @@ class Dispatcher:
         """Consumers that are connected, as far as is known."""
         return sum(session.left_at is None for session in self.sessions)
 
+    def identity_of(self, request: Request) -> SampleId | None:
+        """Whose identity a request is for; None when its consumer is gone."""
+        session = self.sessions.get(request.session)
+        if session is None:
+            return None
+        catalogue = self._catalogue.digest_under(session.spec.scene)
+        return SampleId(session.spec.digest, catalogue, NUMERICS_VERSION, session.seed, request.epoch, request.index)
+
     def clip_of(self, request: Request) -> tuple[str, int] | None:
         """Video and first frame that a request is made from now; None when its consumer is gone."""
         session = self.sessions.get(request.session)

@@ -11,6 +11,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.catalogue.files import corpus_root
 from v2v_server.store.cache import GIB, Cache, make_cache
+from v2v_server.system.log import LOG_FORMATS, Log
 from v2v_server.worker.process import run_worker, unshared_name
 
 
@@ -27,6 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
     work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
     work.add_argument("--keys", metavar="FILE", help="its key, see v2v-keys (default: what V2V_KEYS names)")
+    parser.add_argument(
+        "--log-format", choices=LOG_FORMATS, default="text", help="text for people, or json, an object a line (text)"
+    )
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
@@ -44,7 +48,8 @@ def _run(arguments: argparse.Namespace) -> None:
         if arguments.logbook_fd is None:  # for its own workers a server has made it
             make_cache(folder)
         cache = Cache(folder, int(arguments.cache_gib * GIB))
-    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys)
+    log = Log(is_json=arguments.log_format == "json")
+    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log)
 
 
 if __name__ == "__main__":

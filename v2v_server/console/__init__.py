@@ -1,6 +1,8 @@
 """What the operator of a server sees.
 
 status     the summary at the start, and one live line
+status_log the same as a line that programs read
+farewell   what is said at the end
 progress   how far the catalogue is
 state      the one model of the service, which terminal, page and metrics read
 history    totals of the last ten seconds, from which rates and shares follow

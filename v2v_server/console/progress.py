@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.status import Status
 
-from v2v_server.console.status import write
+from v2v_server.system.log import Log
 
 _LOG_SECONDS = 10.0
 _SHOWN_AFTER_SECONDS = 1.0
@@ -29,14 +29,19 @@ class CatalogueProgress(Protocol):
 
 
 @contextlib.contextmanager
-def catalogue_progress(clock: Callable[[], float] = time.monotonic) -> Iterator[CatalogueProgress]:
+def catalogue_progress(
+    clock: Callable[[], float] = time.monotonic, log: Log | None = None
+) -> Iterator[CatalogueProgress]:
     """The progress of ``open_catalogue``, shown on stderr while anything is probed or looked at for long.
 
     Args:
         clock: seconds.
+        log: for lines, where it is no terminal or programs read along; None takes plain text.
     """
-    if not sys.stderr.isatty():
-        yield _Lines(clock)
+    if log is None:
+        log = Log()
+    if log.is_json or not sys.stderr.isatty():
+        yield _Lines(clock, log)
         return
     bar = _Bar(clock)
     try:
@@ -46,8 +51,8 @@ def catalogue_progress(clock: Callable[[], float] = time.monotonic) -> Iterator[
 
 
 class _Lines:
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
+    def __init__(self, clock: Callable[[], float], log: Log) -> None:
+        self._clock, self._log = clock, log
         self._due = clock() + _LOG_SECONDS
 
     def __call__(self, done: int, total: int) -> None:
@@ -57,7 +62,7 @@ class _Lines:
         now = self._clock()
         if now >= self._due:
             self._due = now + _LOG_SECONDS
-            write(sys.stderr, text + "\n")
+            self._log.say(text)
 
 
 class _Bar:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import TextIO
 
 from v2v_protocol.refusal import Refusal
@@ -12,6 +11,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.console.state import CacheState, ServiceState
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.system.log import write
 
 _SHOWN = 5
 _LIVE_SECONDS = 0.5
@@ -59,14 +59,6 @@ def _shorter_clips(table: SequenceTable) -> list[str]:
     choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
     shown = ", ".join(f"{choice} admits {sum(voxels >= choice for voxels in longest)}" for choice in choices)
     return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]
-
-
-def write(stream: TextIO, text: str) -> None:
-    """Says something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
-    and there is nowhere left to say so."""
-    with suppress(OSError):
-        stream.write(text)
-        stream.flush()
 
 
 class StatusLine:

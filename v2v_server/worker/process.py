@@ -12,7 +12,6 @@ import os
 import secrets
 import signal
 import socket
-import sys
 import time
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
+from v2v_server.system.log import Log
 from v2v_server.system.process import (
     die_with_parent,
     give_way,
@@ -70,6 +70,7 @@ class Worker:
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
         keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
+        log: for what people should know.
 
     Raises:
         UsageError: the address cannot be connected to.
@@ -84,9 +85,11 @@ class Worker:
         logbook: int | None = None,
         cache: Cache | None = None,
         keys: str | None = None,
+        log: Log | None = None,
     ) -> None:
         key = key_for(address, "worker", keys)
         self._name = name
+        self._log = log or Log()
         self._logbook = logbook
         self._clips = Clips(root, cache)
         self._kernels = set(USUAL)  # that are loaded
@@ -155,7 +158,7 @@ class Worker:
             self._socket.send(last, copy=False)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Say):
-            print(f"{self._name}: {action.text}", file=sys.stderr)
+            self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
     def _take(self, step: Action) -> list[Action]:
         """Takes the next step; returns what the conversation says to what came of it."""
@@ -268,6 +271,7 @@ def run_worker(
     logbook: int | None = None,
     cache: Cache | None = None,
     keys: str | None = None,
+    log: Log | None = None,
 ) -> None:
     """Runs one worker in this process until the server stops it.
 
@@ -279,6 +283,7 @@ def run_worker(
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
         keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
+        log: for what people should know.
 
     Raises:
         UsageError: the address cannot be connected to, or the server takes no such key.
@@ -295,7 +300,7 @@ def run_worker(
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys)
+    worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys, log)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.
     take_long_turns()
