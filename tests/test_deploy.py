@@ -65,7 +65,7 @@ def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawCon
 
 def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    assert [service["init"] for service in services.values()] == [True, True]
+    assert [service["init"] for service in services.values()] == [True, True, True]
     for file in ("Dockerfile", "trainer.Dockerfile"):
         assert "#   docker run --rm --init " in (DEPLOY / file).read_text()
 

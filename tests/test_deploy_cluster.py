@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.server.page.told import told
 from tests.waiting import until
 from v2v_server.commands import serve as serve_command
 from v2v_server.commands import worker as worker_command
@@ -111,7 +112,10 @@ def test_the_broker_listens_where_workers_trainers_probes_and_policies_look() ->
         assert pod[probe]["exec"]["command"] == ["test", "-s", config.port_file]
     assert pod["livenessProbe"]["tcpSocket"]["port"] in ports
     policy = named("NetworkPolicy", "v2v-broker")["spec"]["ingress"]
-    assert [rule["ports"][0]["port"] for rule in policy] == [ports["consumers"], ports["workers"]]
+    assert [rule["ports"][0]["port"] for rule in policy] == [ports["consumers"], ports["workers"], ports["page"]]
+    assert (config.page, config.page_host) == (ports["page"], "0.0.0.0")
+    annotations = named("Deployment", "v2v-broker")["spec"]["template"]["metadata"]["annotations"]
+    assert annotations["prometheus.io/port"] == str(ports["page"])
     assert policy[1]["from"][0]["podSelector"] == named("NetworkPolicy", "v2v-workers")["spec"]["podSelector"]
 
 
@@ -139,9 +143,7 @@ def test_what_is_mounted_is_there_and_the_root_is_not_written(deployment: str) -
 def test_the_scaler_asks_for_what_the_server_tells() -> None:
     query = yaml.safe_load((KUBERNETES / "autoscale" / "scaled-object.yaml").read_text())["spec"]["triggers"][0]
     assert "v2v_waiting_share{" in query["metadata"]["query"]
-    told = [path for path in (ROOT / "v2v_server").rglob("*.py") if "v2v_waiting_share" in path.read_text()]
-    if not told:
-        pytest.skip("the server tells no metrics yet: deploy/kubernetes/autoscale waits for them")
+    assert "v2v_waiting_share" in told()
 
 
 # --- systemd, shell ---------------------------------------------------------------------------------------------------

@@ -1,0 +1,23 @@
+"""Every metric that a server tells."""
+
+from __future__ import annotations
+
+import json
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from tests.server.console.watched import service
+from tests.server.peers import peers
+from v2v_server.page.metrics import exposition
+
+
+def told() -> set[str]:
+    """The names, as a query writes them, of a service that has everything."""
+    at = peers()
+    at.join()
+    at.hello()
+    at.want(0)
+    at.work_off()
+    content, _ = exposition(json.loads(service(at, cache="/nowhere").state().to_json()))
+    families = text_string_to_metric_families(content.decode())
+    return {sample.name for family in families for sample in family.samples}

@@ -1,0 +1,72 @@
+"""What `deploy/` asks of a server's metrics, the server tells."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tests.server.page.told import told
+from v2v_server.commands import serve as serve_command
+from v2v_server.config import ServeConfig
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+DASHBOARD: dict[str, Any] = json.loads((DEPLOY / "grafana.json").read_text())
+COMPOSE: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+_NAME = re.compile(r"\bv2v_\w+")
+
+
+def queries() -> list[str]:
+    return [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
+
+
+def test_every_query_of_the_dashboard_asks_for_metrics_that_are_told() -> None:
+    names = told()
+    assert queries()
+    for query in [*queries(), *(each["query"] for each in DASHBOARD["templating"]["list"] if each["type"] == "query")]:
+        assert _NAME.findall(query), query
+        assert set(_NAME.findall(query)) <= names, query
+
+
+def test_rates_are_of_what_only_grows() -> None:
+    for query in queries():
+        rates = re.findall(r"(?:rate|increase)\((v2v_\w+)", query)
+        assert all(name.endswith("_total") for name in rates), query
+        assert set(rates) == {name for name in _NAME.findall(query) if name.endswith("_total")} or "faults" in query
+
+
+def test_the_dashboard_can_be_read_with_any_prometheus() -> None:
+    variables = {each["name"] for each in DASHBOARD["templating"]["list"]}
+    assert set(re.findall(r"\$\{?(\w+)", json.dumps(DASHBOARD["panels"]))) <= variables
+    assert all(panel["datasource"]["uid"] == "${source}" for panel in DASHBOARD["panels"])
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
+
+
+def test_panels_do_not_lie_upon_each_other() -> None:
+    taken: set[tuple[int, int]] = set()
+    for panel in DASHBOARD["panels"]:
+        at = panel["gridPos"]
+        cells = {(at["x"] + x, at["y"] + y) for x in range(at["w"]) for y in range(at["h"])}
+        assert not cells & taken, panel["title"]
+        assert at["x"] + at["w"] <= 24
+        taken |= cells
+
+
+def test_prometheus_asks_the_server_by_a_name_that_the_page_answers_to(monkeypatch: Any) -> None:
+    asked: list[ServeConfig] = []
+    monkeypatch.setattr(serve_command, "serve", asked.append)
+    server = COMPOSE["services"]["v2v-server"]
+    flags = [flag.replace("${WORKERS:-8}", "8").replace("${ROWS:-full}", "full") for flag in server["command"]]
+    assert serve_command.main(["--videos", "/videos", "--insecure", *flags]) == 0
+    (config,) = asked
+    scrape = yaml.safe_load((DEPLOY / "prometheus.yaml").read_text())["scrape_configs"][0]["static_configs"][0]
+    ((host, port),) = (target.split(":") for target in scrape["targets"])
+    assert (host, int(port)) == ("v2v-server", config.page)
+    assert host in COMPOSE["services"]
+    assert host in config.page_names.split(",")
+    assert f"127.0.0.1:{config.page}:{config.page}" in server["ports"]
+    mounted = COMPOSE["services"]["prometheus"]["volumes"][0].split(":")[0]
+    assert (DEPLOY / mounted).is_file()
