@@ -1,5 +1,6 @@
 """What is answered to which path.
 
+/          the page, for a person; /static has its parts
 /healthz   200 where the server answers; for a probe that starts it again
 /readyz    200 where somebody can make samples; for a probe that sends consumers to it
 /metrics   for Prometheus
@@ -12,16 +13,19 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Iterable
+from pathlib import Path
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from v2v_server.page.guard import App, Guard
 from v2v_server.page.metrics import exposition
 from v2v_server.page.source import Source
 
+STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
 MOST_STREAMS = 64
 """Browsers that are told of every state. One that stops reading holds its own connection, and a state of memory."""
@@ -37,6 +41,10 @@ class Pages:
     def __init__(self, source: Source) -> None:
         self._source = source
         self._streams = 0
+
+    async def page(self, request: Request) -> Response:
+        """For a person."""
+        return FileResponse(STATIC / "index.html")
 
     async def healthz(self, request: Request) -> Response:
         """Whether the server answers."""
@@ -91,6 +99,8 @@ def make_app(source: Source, names: Iterable[str] = ()) -> App:
     """
     pages = Pages(source)
     routes = [
+        Route("/", pages.page),
+        Mount("/static", StaticFiles(directory=STATIC)),
         Route("/healthz", pages.healthz),
         Route("/readyz", pages.readyz),
         Route("/metrics", pages.metrics),

@@ -1,0 +1,197 @@
+"""The page as a person sees it: a real browser, a real server, a real stream."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.server.page.browser import CHROMIUM, Browser
+from tests.server.page.test_child import SMALL, free_port, got
+from tests.waiting import until
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here"),
+]
+
+HOSTILE = "<img src=x onerror=document.title='taken'>.mp4"
+CUT = "<b>cut<b>.mp4"
+SENT = "document.querySelector('#tiles dd small').textContent"
+WIDTHS_PX = (360, 1280, 1920)
+
+
+class Consumer:
+    """Takes batches in a thread, as long as it is told to; a context manager."""
+
+    def __init__(self, address: str) -> None:
+        self.batches = 0
+        self._stop = threading.Event()
+        self._dataset = V2VStreamDataset(address, 2, rank=0, world_size=1, timeout_seconds=120.0)
+        self._thread = threading.Thread(target=self._take, daemon=True)
+
+    def _take(self) -> None:
+        while not self._stop.is_set():
+            for _ in self._dataset:
+                self.batches += 1
+                if self._stop.wait(0.02):
+                    return
+
+    def __enter__(self) -> Consumer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page-clips")
+    for number in range(8):
+        write_clip(folder / f"{number}.mp4", panned_luma(120, 64, 80))
+    (folder / "0.mp4").rename(folder / HOSTILE)
+    (folder / CUT).write_bytes((folder / "1.mp4").read_bytes()[:3000])
+    return folder
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def served(clips: Path, port: int) -> Iterator[LocalServer]:
+    flags = ["--page", str(port), *SMALL]
+    with LocalServer(clips, workers=2, flags=flags) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser() as started:
+        yield started
+
+
+def states(port: int) -> dict[str, Any]:
+    status, text = got(port, "/state")
+    assert status == 200
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def test_a_stream_is_seen_and_a_killed_worker_soon(served: LocalServer, port: int, browser: Browser) -> None:
+    with Consumer(served.address):
+        browser.resize(1280)
+        browser.open(f"http://127.0.0.1:{port}/")
+        browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
+        browser.until("document.querySelectorAll('#consumers .taking, #consumers .stalled').length === 1")
+        browser.value(f"window.before = {SENT}")
+        browser.until(f"{SENT} !== window.before", 3.0)
+        browser.until("charts.speed.data[0].length > 3")
+
+        # A name that is markup stays a name.
+        said = set()
+
+        def named() -> bool:
+            said.update(browser.value("[...document.querySelectorAll('#workers td.wide')].map((at) => at.textContent)"))
+            return any(text.startswith(HOSTILE) for text in said)
+
+        until(named)
+        assert browser.value("document.images.length") == 0
+        assert browser.value("document.title").endswith("v2v-serve")
+
+        # A worker that is killed shows within three seconds.
+        assert served.pid is not None
+        workers = [
+            child for child in psutil.Process(served.pid).children() if "v2v_server.commands.worker" in child.cmdline()
+        ]
+        workers[0].kill()
+        restarts = "[...document.querySelectorAll('#workers tbody tr')].map((row) => row.lastChild.textContent)"
+        browser.until(f"{restarts}.includes('1') || document.querySelectorAll('#workers tbody tr').length < 2", 3.0)
+        browser.until(f"{restarts}.includes('1')")
+        assert browser.complaints == []
+
+
+def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, browser: Browser, tmp_path: Path) -> None:
+    browser.open(f"http://127.0.0.1:{port}/")
+    browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
+    papers = set()
+    for dark in (False, True):
+        for width in WIDTHS_PX:
+            browser.resize(width, dark=dark)
+            browser.until(f"window.innerWidth === {width} && charts.speed.width <= {width}")
+            assert browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
+            papers.add(browser.value("getComputedStyle(document.body).backgroundColor"))
+    assert len(papers) == 2
+    browser.picture(tmp_path / "page.png", whole=True)
+    assert (tmp_path / "page.png").stat().st_size > 10_000
+    assert browser.complaints == []
+
+
+def test_a_server_that_is_gone_is_said_and_one_that_comes_back_is_shown(
+    clips: Path, port: int, browser: Browser
+) -> None:
+    flags = ["--page", str(port), *SMALL]
+    with LocalServer(clips, workers=1, flags=flags) as server:
+        browser.open(f"http://127.0.0.1:{port}/")
+        browser.until("document.querySelectorAll('#workers tbody tr').length === 1")
+        assert browser.value("document.getElementById('lost').hidden")
+        assert server.pid is not None
+        psutil.Process(server.pid).kill()
+        browser.until("!document.getElementById('lost').hidden")
+        assert "does not answer" in browser.value("document.getElementById('lost').textContent")
+    with LocalServer(clips, workers=1, flags=flags):
+        browser.until("document.getElementById('lost').hidden")
+
+
+def test_a_page_that_is_left_open_does_not_grow(served: LocalServer, port: int, browser: Browser) -> None:
+    """Two hours of states in one go."""
+    browser.open(f"http://127.0.0.1:{port}/")
+    browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
+    state = states(port)
+    state["consumers"] = [consumer_state(number) for number in range(250)]
+    elements = "document.querySelectorAll('*').length"
+    first, rows, last, points = browser.value(  # in one go, or the server's own states come between
+        f"""(() => {{
+            const state = {json.dumps(state)};
+            for (let i = 0; i < 10; i++) show(state);
+            const first = {elements}, rows = document.querySelectorAll('#consumers tbody tr').length;
+            for (let i = 0; i < 14400; i++) i % 100 ? remember('speed', [i, 1, 1]) : show(state);
+            return [first, rows, {elements}, Math.max(...Object.values(past).flat().map((each) => each.length))];
+        }})()"""
+    )
+    assert (rows, last, points) == (201, first, 1200)
+
+
+def consumer_state(number: int) -> dict[str, Any]:
+    texts = {"id": f"{number:032x}", "name": f"rank {number}", "host": "h", "state": "taking", "spec": "s"}
+    figures = ("epoch", "position", "batch_size", "credit", "in_flight", "waiting", "served", "samples_per_second")
+    return {
+        **texts,
+        **dict.fromkeys(figures, 1),
+        "sequences": 2,
+        "eta_seconds": None,
+        "batches_per_second": 1.0,
+        "waiting_share": 0.5,
+    }
+
+
+def test_a_browser_that_stops_reading_stops_nobody(served: LocalServer, port: int) -> None:
+    with Consumer(served.address) as consumer, socket.create_connection(("127.0.0.1", port)) as stalled:
+        stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+        stalled.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        for _ in range(3):
+            told, had = states(port)["time"], consumer.batches
+            until(lambda told=told: states(port)["time"] > told)  # type: ignore[misc]
+            until(lambda had=had: consumer.batches > had)  # type: ignore[misc]
