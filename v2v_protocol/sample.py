@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_protocol.events import EventList, to_events
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.settings import require_whole
@@ -268,6 +269,17 @@ class Sample:
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name}: {array.dtype}{list(array.shape)}" for name, array in self.arrays.items())
         return f"Sample({shapes}, {self.provenance.video}@{self.provenance.start_frame})"
+
+    def to_events(self, bin_us: float) -> EventList:
+        """Events (x, y, t, p) with the counts of the voxels, lead voxels included, for bins of ``bin_us`` microseconds.
+        Their times within a bin are invented, by the rule of :mod:`v2v_protocol.events`.
+
+        Raises:
+            UsageError: the sample has no voxels, or a duration out of range.
+        """
+        if "voxels" not in self.arrays:
+            raise UsageError("events are made of voxels: ask for that array")
+        return to_events(self.arrays["voxels"], bin_us)
 
     def _repr_html_(self) -> str:
         rows = {name: f"{array.dtype} {list(array.shape)}" for name, array in self.arrays.items()}

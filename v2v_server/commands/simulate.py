@@ -12,6 +12,7 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_server.commands.spec_flags import add_spec, spec_fields
 from v2v_server.config import recipe_setting
+from v2v_server.offline.event_files import FORMS
 from v2v_server.offline.remake import simulate_to_file
 
 
@@ -21,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "v2v-simulate", "VIDEO --out FILE.npz [flags]",
         "Make one sample in this process: the same bytes a server would stream.",
         [
-            "v2v-simulate clip.mp4 --out sample.npz --picture sample.png",
+            "v2v-simulate clip.mp4 --out sample.npz --picture sample.png --events events.h5",
             "v2v-simulate webvid10k/ --rows top:0.54 --seed 3 --epoch 2 --index 4711 --out sample.npz",
         ],
     )  # fmt: skip
@@ -40,6 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--out", required=True, metavar="FILE.npz", help="receives the arrays and the provenance (JSON)")
     out.add_argument("--picture", metavar="FILE.png", help="also draw frames and voxels")
     out.add_argument(
+        "--events", metavar="FILE",
+        help=f"also write events, their times within a bin invented: {', '.join(FORMS)}",
+    )  # fmt: skip
+    out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",
         help=f"of {', '.join(ARRAYS)} (default {','.join(DEFAULT_ARRAYS)})",
     )  # fmt: skip
@@ -52,6 +57,7 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.video,
         out=Path(arguments.out),
         picture=None if arguments.picture is None else Path(arguments.picture),
+        events=None if arguments.events is None else Path(arguments.events),
         list_file=arguments.list,
         rows=arguments.rows,
         spec=spec_fields(arguments) | {"recipe": recipe_setting(arguments.recipe, arguments.set)},

@@ -2,4 +2,5 @@
 
 remake.py   any sample of any stream again: ``v2v-simulate``, tests, bug reports
 preview.py  what a recipe makes of a video, as pictures
+event_files.py  events as HDF5, npz, EVT 3, AEDAT 4
 """

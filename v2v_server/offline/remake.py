@@ -22,6 +22,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
@@ -150,6 +151,7 @@ def simulate_to_file(
     index: int,
     snapshot: int = 0,
     cache_dir: str | None = None,
+    events: Path | None = None,
 ) -> None:
     """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
 
@@ -161,6 +163,8 @@ def simulate_to_file(
         arrays, seed, epoch, index: see :func:`remake`.
         snapshot: number of the quarantine snapshot to make it under.
         cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
+        events: a file for events made of the voxels (``event_files.py``), or None. Their clock is the video's average
+            rate.
 
     Raises:
         UsageError, CorpusError, SampleUnavailable, VideoUnreadable: see :func:`remake`; or a file cannot be written, or
@@ -169,6 +173,10 @@ def simulate_to_file(
     stream = StreamSpec.from_dict(spec)
     if picture is not None:
         check_drawable(arrays)
+    if events is not None:
+        check_event_file(events)
+        if "voxels" not in arrays:
+            raise UsageError("--events needs the array voxels")
     scene = stream.scene != "off"
     catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
@@ -194,6 +202,10 @@ def simulate_to_file(
         if picture is not None:
             camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe.frames_per_bin)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
+        if events is not None:
+            made = sample.to_events(_bin_us(catalogue, sample, stream))
+            write_events(events, made)
+            print(f"{len(made)} events written to {events}; their times within a bin are invented")
     except OSError as error:
         raise UsageError(f"{error.filename or out}: {error.strerror}") from error
     params = sample.provenance.params
@@ -203,3 +215,10 @@ def simulate_to_file(
         + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
         f"{params.hot_pixel_count} hot pixels, {sample.provenance.saturated_bins} bins saturated; written to {out}"
     )
+
+
+def _bin_us(catalogue: Catalogue, sample: Sample, spec: StreamSpec) -> float:
+    (video,) = (video for video in catalogue.videos if video.id == sample.provenance.video)
+    if not video.frames_per_second > 0:
+        raise UsageError(f"{video.id}: its frame rate is unknown, and events need times")
+    return 1e6 * spec.recipe.frames_per_bin * spec.recipe.frame_stride / video.frames_per_second

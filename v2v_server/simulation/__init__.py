@@ -5,6 +5,7 @@ analytic scenes); :func:`simulate_clip` is what the server worker calls. The pix
 
     draw.py       from a recipe to one camera and its view
     view.py       what the camera sees of the picture: resize, crop, flip, contrast
+    grey.py       frames of any usual kind to grey levels
     intensity.py  from grey level to log intensity and to light
     clip.py       simulating a clip: arguments checked, noise prepared, kernel called
     pixel.py      the kernel: all pixels, all steps, one pass

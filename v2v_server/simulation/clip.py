@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.events import EventList, to_events
 from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import require_known
@@ -18,6 +19,7 @@ from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects import prepare
 from v2v_server.simulation.effects.kernel import simulate_pixels_with_effects
+from v2v_server.simulation.grey import grey_levels
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
@@ -35,9 +37,14 @@ class Voxels(NamedTuple):
     voxels: npt.NDArray[Any]
     saturated_bins: int
 
+    def to_events(self, bin_us: float) -> EventList:
+        """Events (x, y, t, p) with these counts, for bins of ``bin_us`` microseconds. Their times within a bin are
+        invented, by the rule of ``v2v_protocol.events``."""
+        return to_events(self.voxels, bin_us)
+
 
 def simulate(
-    frames: npt.NDArray[np.uint8],
+    frames: Any,
     *,
     threshold_pos: float,
     threshold_neg: float | None = None,
@@ -58,7 +65,8 @@ def simulate(
     """Simulate an event camera that watches a clip.
 
     Args:
-        frames: [n, H, W] uint8 grey levels; n - 1 is a multiple of ``bins * frames_per_bin``.
+        frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or what ``grey.py`` makes these of: colour
+            (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``.
         threshold_pos, threshold_neg: contrast thresholds, log-intensity units; equal when only one is given.
         noise_sigma: standard deviation of the noise, log units per frame.
         hot_pixel_count: how many pixels drift by themselves.
@@ -76,14 +84,13 @@ def simulate(
             zero is off.
 
     Returns:
-        voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins.
+        voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins. A numpy
+        array, whatever the frames are; ``torch.from_numpy`` shares its memory.
 
     Raises:
         UsageError: an argument of the wrong type, shape or range, or more events than the precision can count.
     """
-    frames = np.asarray(frames)
-    if frames.ndim != 3 or frames.dtype != np.uint8:
-        raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give uint8 [n, H, W]")
+    frames = grey_levels(frames)
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
     known = effect_settings()

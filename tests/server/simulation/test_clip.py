@@ -68,7 +68,7 @@ def test_double_precision_differs_in_rounding_only() -> None:
         ({"dtype": "uint8"}, "int8, int16, float32"),
         ({"precision": "float16"}, "float32, float64"),
         ({"frames": FRAMES[0]}, "frames"),
-        ({"frames": FRAMES.astype(float)}, "uint8"),
+        ({"frames": FRAMES.astype(float)}, "0 .. 1"),
         ({"frames": FRAMES[:1]}, "1 frames"),
         ({"frames": FRAMES[:, :0]}, "0 pixels"),
     ],
