@@ -18,6 +18,7 @@ MODULES = {
     "v2v-preview": "v2v_server.commands.preview",
     "v2v-prepare": "v2v_server.commands.prepare",
     "v2v-quarantine": "v2v_server.commands.quarantine",
+    "v2v-top": "v2v_server.commands.top",
     "v2v-keys": "v2v_server.commands.keys",
     "v2v-loadtest": "v2v_client.tools.loadtest",
     "v2v-train": "trainer.train",

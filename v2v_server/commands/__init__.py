@@ -5,6 +5,7 @@ worker      v2v-worker
 simulate    v2v-simulate
 preview     v2v-preview
 prepare     v2v-prepare
+top         what a server is at, on a terminal (v2v-top)
 keys        who may talk to a server (v2v-keys)
 quarantine  v2v-quarantine
 spec_flags  the flags for what a stream is made of

@@ -9,4 +9,5 @@ history    totals of the last ten seconds, from which rates and shares follow
 waiting    who waits for whom, in one sentence
 watch      makes the state when somebody looks, and answers
 asking     the other end: asks a server for its state
+top        the state on a terminal, for whoever asked
 """

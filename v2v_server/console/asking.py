@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -76,7 +77,8 @@ class Looker:
         while (now := time.monotonic()) < end:
             if now >= ask_at:
                 ask_at = now + _AGAIN_SECONDS
-                self._socket.send_multipart(encode(See()))
+                with suppress(zmq.Again):  # the handshake has failed, and is heard of below
+                    self._socket.send_multipart(encode(See()), flags=zmq.NOBLOCK)
             ready = dict(self._poller.poll(int(1000 * max(0.0, min(end, ask_at) - now)) + 1))
             if self._monitor in ready:
                 self._handshakes.take(

@@ -1,0 +1,76 @@
+"""`v2v-top`: what a server, its workers and its consumers are at, on a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import ServerLost, V2VError
+from v2v_server.console.asking import Looker
+from v2v_server.console.top import draw, line
+
+_LIVE_SECONDS, _LINE_SECONDS = 1.0, 10.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-top", "[flags]",
+        "Show who waits for whom at a running server, and what its workers and consumers are at. Ctrl-C ends it.",
+        ["v2v-top", "v2v-top --connect tcp://node7:5555 --keys gpu.key", "v2v-top --once"],
+    )  # fmt: skip
+    what = parser.group("Watching")
+    what.add_argument(
+        "--connect",
+        default="tcp://127.0.0.1:5555",
+        metavar="ADDRESS",
+        help="where consumers connect (default %(default)s)",
+    )
+    what.add_argument("--keys", metavar="FILE", help="a consumer's key (default: what V2V_KEYS names)")
+    what.add_argument(
+        "--once", action="store_true", help="show the state of now, and end; status 1 where nobody answers"
+    )
+    what.add_argument("--timeout-seconds", type=float, default=10.0, metavar="S", help="for an answer (default 10)")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    console = Console()
+    with Looker(arguments.connect, arguments.keys) as looker:
+        state = looker.look(arguments.timeout_seconds)  # who is not there at all is said at once
+        if not console.is_terminal:
+            _lines(looker, state, arguments)
+        elif arguments.once:
+            console.print(draw(state))
+        else:
+            _live(console, looker, state, arguments.timeout_seconds)
+
+
+def _lines(looker: Looker, state: dict[str, Any], arguments: argparse.Namespace) -> None:
+    print(line(state), flush=True)
+    while not arguments.once:
+        time.sleep(_LINE_SECONDS)
+        print(line(looker.look(arguments.timeout_seconds)), flush=True)
+
+
+def _live(console: Console, looker: Looker, state: dict[str, Any], timeout_seconds: float) -> None:
+    with Live(draw(state), console=console, screen=True, auto_refresh=False) as live:
+        while True:
+            time.sleep(_LIVE_SECONDS)
+            note = ""
+            try:
+                state = looker.look(timeout_seconds)
+            except ServerLost as error:  # it may come back
+                note = f"{error} What is shown is old."
+            live.update(draw(state, note), refresh=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
