@@ -45,7 +45,7 @@ class StreamConfig:
     """Where batches come from.
 
     Attributes:
-        address: of a running server; empty: one is started here, on ``videos``.
+        address: of a running server, or of several with commas between them; empty: one is started here, on ``videos``.
         videos, list, rows, workers: for that server, see ``v2v-serve --help``.
         batch_size: samples of one rank's batch.
         recipe: preset name, or recipe fields (with ``preset`` to start from); never the server's default.

@@ -41,7 +41,9 @@ def _parser() -> Parser:
     )  # fmt: skip
     stream = parser.group("Stream")
     source = stream.add_mutually_exclusive_group()
-    source.add_argument("--connect", metavar="ADDRESS", help="of a running server (stream.address)")
+    source.add_argument(
+        "--connect", metavar="ADDRESS", help="of a running server, or several with commas (stream.address)"
+    )
     source.add_argument("--videos", metavar="DIR", help="start a server on these videos (stream.videos)")
     stream.add_argument("--workers", type=int, metavar="N", help="of the started server (stream.workers)")
     run = parser.group("Run")

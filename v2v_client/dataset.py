@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import logging
 import os
 import platform
 import warnings
@@ -25,16 +26,18 @@ from v2v_client.options import Options
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.session.brokers import addresses, order
 from v2v_client.session.connection import Connection
 from v2v_client.session.link import Link
 from v2v_client.session.liveness import Patience
-from v2v_protocol.errors import StateMismatch, UsageError
+from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 
+_log = logging.getLogger(__name__)
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
     "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
@@ -61,7 +64,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
     :meth:`set_epoch` before each iteration; with ``persistent_workers`` it always should.
 
     Args:
-        address: of the server, ``tcp://host:port``.
+        address: of the server, ``tcp://host:port``; or of several that serve the same videos, in a list or with commas
+            between them. Each rank takes from its own (:mod:`v2v_client.session.brokers`), and from another where that
+            is lost: no sample is lost thereby, and none comes twice.
         batch_size: samples of one rank's batch.
         arrays: which of "voxels", "frames", "flow" and "flow_valid" to receive. It never changes what they hold.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
@@ -105,7 +110,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     def __init__(
         self,
-        address: str,
+        address: str | Sequence[str],
         batch_size: int = 12,
         arrays: Sequence[str] = ("voxels", "frames"),
         recipe: str | Mapping[str, Any] | Recipe | None = None,
@@ -123,7 +128,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         super().__init__()
         if (rank is None) != (world_size is None):
             raise UsageError(f"rank = {rank}, world_size = {world_size}: give both or none")
-        self._address = address
+        self._brokers = addresses(address)
+        self._address = ",".join(self._brokers)
         self._batch_size = require_whole("batch_size", batch_size, 1, 65_536)
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._seed = require_whole("seed", seed, 0, LARGEST_SEED)
@@ -304,7 +310,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             connection.open()
             stream = connection.stream
             if pinned is None:
-                self._position.pin(stream, self._address)
+                self._compare(connection, epoch)
+                self._position.pin(stream, connection.address)
             plan = consumer.plan(stream, state)
             if state is None:
                 plan.require_batches()
@@ -339,8 +346,37 @@ class V2VStreamDataset(IterableDataset[Batch]):
         of_loader = "" if loader is None else f", loader worker {loader.id} of {loader_workers}"
         return f"rank {self.rank} of {self.world_size}{of_loader}"
 
-    def _connection(self, epoch: int, state: ResumeState | None = None, loader_workers: int = 1) -> Connection:
+    def _compare(self, connection: Connection, epoch: int) -> None:
+        """Every rank holds its broker to one other, the first that answers: that is the same one for nearly all.
+
+        Raises:
+            StateMismatch: they offer different streams.
+        """
+        patience = dataclasses.replace(self._patience, timeout_seconds=self._patience.takeover_seconds)
+        for broker in self._brokers if len(self._brokers) > 1 else ():
+            if broker == connection.address:
+                continue
+            try:
+                with closing(self._connection(epoch, brokers=(broker,), patience=patience)) as other:
+                    other.open()
+                    connection.stream.require_same(other.stream, ours=connection.address, theirs=broker)
+            except ServerLost as lost:
+                _log.warning("not compared with %s, which will be when it takes over: %s", connection.address, lost)
+                continue
+            return
+
+    def _connection(
+        self,
+        epoch: int,
+        state: ResumeState | None = None,
+        loader_workers: int = 1,
+        *,
+        brokers: Sequence[str] | None = None,
+        patience: Patience | None = None,
+    ) -> Connection:
         pinned = self.stream
+        loader = get_worker_info()
+        consumer = self.rank * loader_workers + (0 if loader is None else loader.id)
         hello = Hello(
             self._options.spec(pinned, "this dataset's stream"),
             self._arrays,
@@ -352,12 +388,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
             host=platform.node(),
         )
         return Connection(
-            self._address,
+            brokers or order(self._brokers, consumer, self.world_size * loader_workers),
             hello,
             epoch,
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
-            patience=self._patience,
+            patience=patience or self._patience,
             transport=functools.partial(Link, keys=self._keys),
         )
 

@@ -54,6 +54,7 @@ class FakeServer:
         shuffled: answers come one at a time, at random, when nothing else is to do.
         held: answers nothing but Ping until it is False again.
         mute: answers nothing at all.
+        trouble: what a Pong says of the workers.
         drop: samples (epoch, index) that are lost once, after they count as answered.
         twice: samples that are sent twice.
         unavailable: indices that cannot be made.
@@ -79,6 +80,7 @@ class FakeServer:
         self.shuffled = False
         self.held = False
         self.mute = False
+        self.trouble = ""
         self.drop: set[tuple[int, int]] = set()
         self.twice: set[tuple[int, int]] = set()
         self.unavailable: set[int] = set()
@@ -210,7 +212,7 @@ class FakeServer:
             self.goodbyes += 1
             self._sessions.pop(identity, None)
         elif isinstance(message, Ping):
-            self._send(identity, encode(Pong()))
+            self._send(identity, encode(Pong(self.trouble)))
         elif session is None:
             self._send(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "say Hello again")))
         elif isinstance(message, Want):

@@ -9,9 +9,10 @@ A connection belongs to the process that made it; its ZeroMQ context is made whe
 
 from __future__ import annotations
 
+import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 from v2v_client.position.state import StreamIdentity
@@ -28,12 +29,15 @@ _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
 _NO_SLOTS: Mapping[int, Slot] = {}
 
+_log = logging.getLogger(__name__)
+
 
 class Connection:
     """A consumer's session with a server, for one epoch.
 
     Args:
-        address: ``tcp://host:port``.
+        address: ``tcp://host:port``; or several, in the order in which they are turned to. Where one is silent for
+            ``patience.takeover_seconds``, or has no worker, the next takes over.
         hello: what to ask for.
         epoch: of the samples to ask for.
         pinned: the stream that the server must offer; None takes what it offers.
@@ -45,7 +49,7 @@ class Connection:
 
     def __init__(
         self,
-        address: str,
+        address: str | Sequence[str],
         hello: Hello,
         epoch: int,
         *,
@@ -55,7 +59,9 @@ class Connection:
         clock: Callable[[], float] = time.monotonic,
         transport: Callable[[str], Transport] = Link,
     ) -> None:
-        self._address = address
+        self._brokers = (address,) if isinstance(address, str) else tuple(address)
+        self._moves = 0  # from one broker to the next since the last sample
+        self._address = self._brokers[0]
         self._is_pinned = pinned is not None
         self._patience = patience or Patience()
         self._clock = clock
@@ -65,8 +71,14 @@ class Connection:
         self._link: Transport | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._conversation = Conversation(
-            address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
+            self._address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
         )
+        self._last_sample = self._now()  # or the beginning
+
+    @property
+    def address(self) -> str:
+        """Of the broker that is spoken to."""
+        return self._address
 
     @property
     def stream(self) -> StreamIdentity:
@@ -109,9 +121,9 @@ class Connection:
             if not self._is_pinned:
                 self._link.connect(self._largest_frame_bytes)
                 self._await_welcome()
-                self._leave(self._link)
+                self._leave(self._open_link())
             self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, *self._conversation.form.sizes)
-            self._link.connect(self._largest_frame_bytes)
+            self._open_link().connect(self._largest_frame_bytes)
             self._await_welcome()
             self._listening.pause(self._clock())  # until here we listened
         except BaseException:
@@ -186,6 +198,41 @@ class Connection:
 
     def _step(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         """Does what is due, then handles one message: (a sample if it was one, whether no message came)."""
+        if len(self._brokers) > 1 and self._conversation.silence(self._now()) >= self._patience.takeover_seconds:
+            self._take_over("silent")
+        try:
+            arrival, idle = self._exchange(wait=wait)
+        except ServerLost as lost:
+            if self._link is None or len(self._brokers) == 1:
+                raise
+            self._take_over(str(lost))
+            return None, False
+        if arrival is not None:
+            self._moves, self._last_sample = 0, self._now()
+        return arrival, idle
+
+    def _take_over(self, reason: str) -> None:
+        """The next broker's turn. It is asked for all that is unanswered: where we stand, no broker has to know.
+
+        Raises:
+            ServerLost: all of them had their turn, and the time is over.
+        """
+        now, waited = self._now(), self._now() - self._last_sample
+        if self._moves >= len(self._brokers) - 1 and waited >= self._patience.timeout_seconds:
+            raise ServerLost(
+                f"none of {', '.join(self._brokers)} gave a sample for {waited:.0f} s; the last one: {reason}; start "
+                f"v2v-serve there, or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
+            )
+        self._moves += 1
+        lost = self._address
+        self._address = self._brokers[(self._brokers.index(lost) + 1) % len(self._brokers)]
+        _log.warning("%s: %s; %s takes over", lost, reason, self._address)
+        old, self._link = self._open_link(), self._transport(self._address)
+        old.close()
+        self._link.connect(self._largest_frame_bytes)
+        self._conversation.move(self._address, now)
+
+    def _exchange(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         link, conversation = self._open_link(), self._conversation
         if conversation.tick(self._now()):
             link.connect(self._largest_frame_bytes, keep_name=True)

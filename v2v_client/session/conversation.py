@@ -167,6 +167,7 @@ class Conversation:
         self._answered = now  # a request, or all were asked again
         self._hope = now  # the last time that nothing spoke against a sample to come
         self._warned = False
+        self._moved = False  # from a broker that had offered the stream
         self._asked: dict[int, None] = {}  # sent and not answered, in that order
         self._queued: deque[int] = deque()  # to be sent when the credit allows
         self._hello_due = 0.0
@@ -184,6 +185,17 @@ class Conversation:
         self._waits_told_at = now
         if pinned is not None:
             self._pin(pinned)
+
+    def move(self, address: str, now: float) -> None:
+        """Goes on with the broker at ``address``, over a link that was just made: it must offer the same stream."""
+        if self._pinned is not None and not self._moved:
+            self._pinned_by += f", begun at {self._address},"
+            self._moved = True
+        self._address = address
+        self._server.heard(now)
+        self._answered = self._hope = now
+        self.outbox.clear()
+        self.happens(Event.SILENCE, now)
 
     def _pin(self, stream: StreamIdentity) -> None:
         spec = stream.resolved

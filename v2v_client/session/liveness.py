@@ -25,6 +25,8 @@ class Patience:
             network which is only slow is not flooded, nor left before it could answer.
         timeout_seconds: silence after which the server is given up, and time without a sample after which one is that
             has no worker to make it.
+        takeover_seconds: with several brokers, silence after which the next one is turned to. ServerLost is raised
+            after ``timeout_seconds``, once every one of them has had as long.
 
     Raises:
         UsageError: a time that is not positive.
@@ -33,9 +35,10 @@ class Patience:
     timeout_seconds: float = 60.0
     ping_seconds: float = 2.0
     rewant_seconds: float = 10.0
+    takeover_seconds: float = 10.0
 
     def __post_init__(self) -> None:
-        for name in ("timeout_seconds", "ping_seconds", "rewant_seconds"):
+        for name in ("timeout_seconds", "ping_seconds", "rewant_seconds", "takeover_seconds"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"{name} = {getattr(self, name)!r}: give a positive number of seconds")
 

@@ -194,7 +194,9 @@ def _parser() -> Parser:
     server, stream, measuring = parser.group("Server"), parser.group("Stream"), parser.group("Measuring")
     source = server.add_mutually_exclusive_group(required=True)
     source.add_argument("--videos", metavar="DIR", help="start servers of our own on these videos")
-    source.add_argument("--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port")
+    source.add_argument(
+        "--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port, or several with commas"
+    )
     server.add_argument(
         "--workers", type=_counts, metavar="N,N", help="with --videos: server workers, one run each (default 1,2)"
     )

@@ -1,0 +1,135 @@
+"""Several brokers: whose consumer is whose, and what happens when one is lost or serves something else."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from tests.client.fake_server import SPEC, FakeServer
+from v2v_client import V2VStreamDataset
+from v2v_client.session.brokers import addresses, order
+from v2v_client.session.connection import Connection
+from v2v_client.session.liveness import Patience
+from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
+from v2v_protocol.messages import Hello
+from v2v_protocol.sample import DEFAULT_ARRAYS
+
+QUICK = Patience(timeout_seconds=2.0, ping_seconds=0.05, takeover_seconds=0.3)
+NOBODY = "tcp://127.0.0.1:9"
+
+
+@pytest.fixture
+def servers() -> Iterator[tuple[FakeServer, FakeServer]]:
+    with FakeServer(sequences=24, credit=4) as one, FakeServer(sequences=24, credit=6) as other:
+        yield one, other
+
+
+def dataset(brokers: object, **options: object) -> V2VStreamDataset:
+    options = {"rank": 0, "world_size": 1, "timeout_seconds": 2.0, "patience": QUICK} | options
+    return V2VStreamDataset(brokers, 4, DEFAULT_ARRAYS, seed=5, **options)  # type: ignore[arg-type]
+
+
+# --- the rule ---------------------------------------------------------------------------------------------------------
+
+
+def test_neighbours_take_from_the_same_broker_and_hosts_from_their_own() -> None:
+    homes = [order("abcd", rank, 32)[0] for rank in range(32)]
+    assert homes == [name for name in "abcd" for _ in range(8)]
+
+
+@pytest.mark.parametrize("brokers", range(1, 9))
+@pytest.mark.parametrize("consumers", [1, 2, 3, 7, 8, 24])
+def test_consumers_are_spread_evenly_also_those_of_a_lost_broker(brokers: int, consumers: int) -> None:
+    names = "abcdefgh"[:brokers]
+    orders = [order(names, consumer, consumers) for consumer in range(consumers)]
+    assert all(sorted(each) == list(names) for each in orders)  # every broker comes once
+    loads = Counter(each[0] for each in orders)
+    assert max(loads.values()) - min(loads[name] for name in names) <= 1
+    for lost in names if brokers > 1 else "":
+        stand_ins = Counter(each[1] for each in orders if each[0] == lost)
+        assert max(stand_ins.values(), default=0) <= -(-loads[lost] // (brokers - 1))
+
+
+@pytest.mark.parametrize("given", ["tcp://a:1, tcp://b:2", ["tcp://a:1", "tcp://b:2"]])
+def test_addresses_come_in_a_list_or_with_commas(given: object) -> None:
+    assert addresses(given) == ("tcp://a:1", "tcp://b:2")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", ["", [], "tcp://a:1,", ["tcp://a:1", "tcp://a:1"]])
+def test_no_address_or_one_twice_is_refused(given: object) -> None:
+    with pytest.raises(UsageError, match="address"):
+        addresses(given)  # type: ignore[arg-type]
+
+
+# --- what it is for ---------------------------------------------------------------------------------------------------
+
+
+def test_a_broker_that_falls_silent_is_taken_over_and_every_sample_comes_once(
+    servers: tuple[FakeServer, FakeServer],
+) -> None:
+    one, other = servers
+    stream = dataset([one.address, other.address])
+    whole = [batch.indices for batch in dataset(other.address)]
+    asked_before = len(other.wants)
+    indices, silenced = [], False
+    for batch in stream:
+        indices.append(batch.indices)
+        if not silenced:
+            assert len(other.wants) == asked_before, "only compared until then"
+            one.call(lambda: setattr(one, "mute", True))
+            silenced = True
+    assert indices == whole
+    assert len(other.wants) > asked_before
+
+
+def test_one_that_never_answered_is_passed_over(servers: tuple[FakeServer, FakeServer]) -> None:
+    assert len(list(dataset([NOBODY, servers[0].address]))) == 6
+
+
+def test_two_that_serve_different_videos_are_refused_with_both_named(servers: tuple[FakeServer, FakeServer]) -> None:
+    one, other = servers
+    other.catalogue = "catalogue-2"
+    for rank in (0, 1):
+        with pytest.raises(StateMismatch, match="catalogue") as refused:
+            next(iter(dataset([one.address, other.address], rank=rank, world_size=2)))
+        assert one.address in str(refused.value)
+        assert other.address in str(refused.value)
+
+
+def test_one_that_takes_over_with_other_videos_is_refused_with_both_named(
+    servers: tuple[FakeServer, FakeServer],
+) -> None:
+    """It may have been restarted on another folder since they were compared."""
+    one, other = servers
+    batches = iter(dataset([one.address, other.address]))
+    next(batches)
+    other.call(lambda: setattr(other, "catalogue", "catalogue-2"))
+    one.call(lambda: setattr(one, "mute", True))
+    with pytest.raises(StateMismatch, match="catalogue") as refused:
+        list(batches)
+    assert one.address in str(refused.value)
+    assert other.address in str(refused.value)
+
+
+def test_all_are_lost_when_each_had_its_turn() -> None:
+    with pytest.raises(ServerLost, match="none of tcp") as lost:
+        next(iter(dataset(["tcp://127.0.0.1:9", "tcp://127.0.0.1:11"], patience=QUICK, timeout_seconds=0.5)))
+    assert "127.0.0.1:9, tcp://127.0.0.1:11" in str(lost.value)
+
+
+def test_one_without_workers_is_taken_over(servers: tuple[FakeServer, FakeServer]) -> None:
+    one, other = servers
+    one.held, one.trouble = True, "no worker is connected"
+    patience = dataclasses.replace(QUICK, timeout_seconds=0.4)
+    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
+    with closing(Connection([one.address, other.address], hello, 0, patience=patience)) as connection:
+        connection.open()
+        connection.want([0])
+        arrival = connection.receive()
+        assert arrival is not None
+        assert arrival.header.index == 0
+        assert connection.address == other.address
