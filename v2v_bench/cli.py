@@ -30,6 +30,7 @@ BENCHMARKS = {
     "scaling": "speed.scaling",
     "gpu_feed": "speed.gpu_feed",
     "released": "speed.released",
+    "watched": "speed.watched",
     "step": "step",
     "cache": "cache",
     "store": "tradeoff.store",

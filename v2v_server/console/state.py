@@ -270,7 +270,7 @@ class ServiceState:
         """The same as JSON, UTF-8. Where that would be too much for a message, fewer workers and consumers are told one
         by one."""
         values = self.to_dict()
-        while len(encoded := json.dumps(values, ensure_ascii=False, allow_nan=False).encode()) > most_bytes:
+        while len(encoded := json.dumps(values, ensure_ascii=False).encode(errors="replace")) > most_bytes:
             shown = max(len(values["workers"]), len(values["consumers"])) // 2
             values["workers"], values["consumers"] = values["workers"][:shown], values["consumers"][:shown]
         return encoded
@@ -343,13 +343,13 @@ def service_state(service: Service, now: float, time: str, broker_seconds: float
         workers=_workers(service, now, before, last),
         consumers=tuple(_consumer(each, now, before, seconds) for each in sessions[:MOST_SHOWN]),
         refusals=tuple(
-            RefusalState(when, each.video, each.frame, each.reason[:_LONGEST_TEXT], str(each.kind))
+            RefusalState(when, each.video[:_LONGEST_TEXT], each.frame, each.reason[:_LONGEST_TEXT], str(each.kind))
             for when, each in reversed(dispatcher.candidates.latest)
         ),
         quarantine_snapshot=service.quarantine.latest,
         quarantined=len(service.quarantine.verdicts(service.quarantine.latest)),
         verdicts=tuple(
-            VerdictState(each.snapshot, each.time, each.path, each.frame, each.reason[:_LONGEST_TEXT])
+            VerdictState(each.snapshot, each.time, each.path[:_LONGEST_TEXT], each.frame, each.reason[:_LONGEST_TEXT])
             for each in reversed(service.quarantine.verdicts(service.quarantine.latest)[-_MOST_VERDICTS:])
         ),
     )

@@ -237,6 +237,18 @@ def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None
     assert took < 1.0  # 0.1 s on an idle core, twice that for lists that do not fit
 
 
+def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
+    at = peers()
+    for _ in range(20):
+        at.dispatcher.candidates.latest.append((WALL, Refusal("\x01" * 4000, None, "\x02" * 4000)))
+    at.quarantine.extend([Verdict(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)])
+    state = service(at, cache="/not-utf8-\udcff").state()
+    encoded = state.to_json()
+    assert len(encoded) < 1 << 18
+    assert json.loads(encoded)["cache"]["folder"] == "/not-utf8-?"
+    assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
+
+
 # --- looking ----------------------------------------------------------------------------------------------------------
 
 
