@@ -19,6 +19,7 @@ MODULES = {
     "v2v-prepare": "v2v_server.commands.prepare",
     "v2v-quarantine": "v2v_server.commands.quarantine",
     "v2v-top": "v2v_server.commands.top",
+    "v2v-doctor": "v2v_server.commands.doctor",
     "v2v-keys": "v2v_server.commands.keys",
     "v2v-loadtest": "v2v_client.tools.loadtest",
     "v2v-train": "trainer.train",

@@ -62,6 +62,7 @@ preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server
 prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
 top = _program("v2v-top", "v2v_server.commands.top", "main", "server")
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
+doctor = _program("v2v-doctor", "v2v_server.commands.doctor", "main", "server")
 keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")
 loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
 train = _program("v2v-train", "trainer.train", "main", "trainer")

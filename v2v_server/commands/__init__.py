@@ -6,6 +6,7 @@ simulate    v2v-simulate
 preview     v2v-preview
 prepare     v2v-prepare
 top         what a server is at, on a terminal (v2v-top)
+doctor      what is in the way on this machine (v2v-doctor)
 keys        who may talk to a server (v2v-keys)
 quarantine  v2v-quarantine
 spec_flags  the flags for what a stream is made of

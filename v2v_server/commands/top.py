@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(
         "v2v-top", "[flags]",
         "Show who waits for whom at a running server, and what its workers and consumers are at. Ctrl-C ends it.",
-        ["v2v-top", "v2v-top --connect tcp://node7:5555 --keys gpu.key", "v2v-top --once"],
+        ["v2v-top --connect tcp://node7:5555 --keys gpu.key", "v2v-top --once"],
     )  # fmt: skip
     what = parser.group("Watching")
     what.add_argument(

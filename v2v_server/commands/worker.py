@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
     work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
     work.add_argument("--keys", metavar="FILE", help="its key, see v2v-keys (default: what V2V_KEYS names)")
-    parser.add_argument(
+    work.add_argument(
         "--log-format", choices=LOG_FORMATS, default="text", help="text for people, or json, an object a line (text)"
     )
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)

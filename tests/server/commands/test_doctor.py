@@ -1,0 +1,133 @@
+"""`v2v-doctor` finds what is in the way, says what to change, and its status tells."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from v2v_server.commands import doctor as command
+from v2v_server.offline import doctor
+from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a process that loads torch, and whatever this machine's memory is."""
+    monkeypatch.setattr(doctor, "_torch", lambda: Finding(OK, "torch", "here"))
+    monkeypatch.setattr(doctor, "_memory", lambda: Finding(OK, "memory", "enough"))
+
+
+def told(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
+    status = command.main(flags)
+    return status, capsys.readouterr().out
+
+
+def free_port() -> int:
+    with socket.socket() as taker:
+        taker.bind(("127.0.0.1", 0))
+        port: int = taker.getsockname()[1]
+        return port
+
+
+def test_nothing_is_in_the_way_where_tests_run(capsys: pytest.CaptureFixture[str]) -> None:
+    status, said = told(capsys, "--port", str(free_port()))
+    assert status == 0
+    assert "is free" in said
+    assert f"\n{BAD} " not in said
+    assert said.endswith("nothing is in the way\n")
+
+
+def test_a_port_that_is_taken_is_worth_a_note(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taker:
+        taker.bind(("127.0.0.1", 0))
+        taker.listen()
+        status, said = told(capsys, "--port", str(taker.getsockname()[1]))
+    assert status == 0
+    assert "cannot be taken" in said
+    assert "--bind tcp://127.0.0.1:" in said
+
+
+def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clip(tmp_path / "long.mp4", panned_luma(21, 140, 160))
+    write_clip(tmp_path / "short.mp4", panned_luma(12, 140, 160))
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("voxels_per_clip: 4\n")
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe)]
+    status, said = told(capsys, *flags)
+    assert status == 0
+    assert "2 videos: 2 h264" in said
+    assert "1 files cannot be used: broken.mp4" in said
+    assert "1 videos give no sequence" in said
+    assert "voxels_per_clip=2 admits" in said
+    assert "1 samples an epoch" in said
+    recipe.write_text("voxels_per_clip: 5\n")
+    status, said = told(capsys, *flags)
+    assert status == 1
+    assert "\nbad   corpus        2 videos give no sequence" in said
+
+
+def test_a_corpus_that_is_not_there_is_in_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, said = told(capsys, "--videos", str(tmp_path / "nowhere"))
+    assert status == 1
+    assert "there is no such folder" in said
+
+
+def test_what_is_missing_or_too_old_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    version = metadata.version
+    found = {"av": None, "pyzmq": "25.9"}
+
+    def pretended(name: str) -> str:
+        if name in found and found[name] is None:
+            raise metadata.PackageNotFoundError(name)
+        return str(found.get(name) or version(name))
+
+    monkeypatch.setattr(doctor.metadata, "version", pretended)
+    assert {"av>=18", "pyzmq>=26"} == set(doctor._missing("server"))
+    assert {"av>=18", "pyzmq>=26"} == set(doctor._missing("trainer"))  # one of its own, one of the client's
+    status, said = told(capsys, "--videos", ".")
+    assert status == 1  # neither part is whole
+    assert "pip install '.[server]'" in said
+
+
+def test_a_gpu_that_torch_does_not_see_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    done = subprocess.CompletedProcess([], 0, stdout='warning\n["2.9+cpu", []]\n')
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: done)
+    monkeypatch.setattr(doctor, "_cards", lambda: "NVIDIA H100")
+    assert doctor._torch().level == BAD
+    monkeypatch.setattr(doctor, "_cards", lambda: "")
+    assert doctor._torch().level == NOTE
+    done.stdout = '["2.9", ["NVIDIA H100"]]\n'
+    assert doctor._torch().level == OK
+    done.stdout = ""
+    assert doctor._torch().level == BAD
+
+
+def test_memory_is_that_of_the_tightest_control_group(tmp_path: Path) -> None:
+    own, pod = tmp_path / "own", tmp_path / "groups" / "pod"
+    own.write_text("0::/pod/container\n")
+    (pod / "container").mkdir(parents=True)
+    for folder, limit, used in ((pod, "3000", "2500"), (pod / "container", "2000", "100")):
+        (folder / "memory.max").write_text(f"{limit}\n")
+        (folder / "memory.current").write_text(f"{used}\n")
+    assert control_group_memory(tmp_path / "groups", own) == (3000, 2500)
+    (pod / "memory.max").write_text("max\n")
+    assert control_group_memory(tmp_path / "groups", own) == (2000, 100)
+    assert control_group_memory(tmp_path / "groups", tmp_path / "none") == (None, 0)
+
+
+def test_it_starts_where_nothing_else_is_installed() -> None:
+    """It has to say so there: what it imports at its start is the standard library, numpy and msgpack."""
+    others = ("av", "zmq", "numba", "cv2", "yaml", "rich", "torch", "psutil")
+    program = f"import sys, v2v_server.commands.doctor\nprint(*sorted(set({others!r}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == []

@@ -1,0 +1,45 @@
+"""`v2v-doctor`: arguments -> call."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from v2v_protocol.command import FAILED, Parser, run_command
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_server.offline.doctor import BAD, look_around
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-doctor", "[--videos DIR] [flags]",
+        "Look at this machine, this installation and a corpus, and say what to change.",
+        ["v2v-doctor --videos webvid10k/", "v2v-doctor --videos webvid10k/ --recipe davis346 --port 6000"],
+        "Exit status: 0 nothing is in the way, 1 something is.",
+    )  # fmt: skip
+    what = parser.group("What to look at")
+    what.add_argument("--videos", metavar="DIR", help="also a folder of videos, a video or a list file")
+    what.add_argument("--recipe", metavar="NAME", default="paper", help="the videos shall suit it (default paper)")
+    what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    what.add_argument("--port", type=int, default=5555, metavar="N", help="that a server would take (default 5555)")
+    return run_command(parser, _run, argv, failures=(V2VError,))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if not 1 <= arguments.port <= 65535:
+        raise UsageError(f"--port {arguments.port}: give 1 to 65535")
+    found_bad = False
+    for finding in look_around(arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir):
+        found_bad = found_bad or finding.level == BAD
+        print(f"{finding.level:4}  {finding.about:12}  {finding.text}", flush=True)
+        if finding.change:
+            print(f"{'':20}-> {finding.change}", flush=True)
+    print("something is in the way: see the lines that begin with bad" if found_bad else "nothing is in the way")
+    return FAILED if found_bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

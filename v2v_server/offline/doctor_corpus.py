@@ -1,0 +1,81 @@
+"""A look at a corpus for `v2v-doctor`: what can be used, what cannot and why, and whether it suits a recipe."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.config import recipe_setting
+from v2v_server.console.progress import catalogue_progress
+from v2v_server.offline.remake import Remaker
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.system.process import usable_cores
+from v2v_server.video.rows import Rows
+
+Line = tuple[str, str, str, str]
+"""(level, about, text, change)"""
+
+
+def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, shown: int) -> Iterator[Line]:
+    """Lines of the report.
+
+    Args:
+        videos, rows, cache_dir: as of :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        recipe: name of a preset, or a YAML file.
+        shown: of many refusals of a kind, how many to name.
+
+    Raises:
+        UsageError: the recipe or the rows say nothing.
+    """
+    spec = StreamSpec.from_dict({"recipe": recipe_setting(recipe, [])})
+    bounds = Rows.parse(rows)
+    try:
+        with catalogue_progress() as progress:
+            catalogue = open_catalogue(
+                videos, rows=bounds, cache_dir=cache_dir, processes=usable_cores(),
+                progress=progress, notice=progress.notice,
+            )  # fmt: skip
+    except CorpusError as error:
+        yield "bad", "corpus", str(error), "give a folder, a video or a list file that this user can read"
+        return
+    try:
+        yield from _lines(catalogue, spec, recipe, shown)
+    finally:
+        catalogue.close()
+
+
+def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> Iterator[Line]:
+    found = catalogue.videos
+    codecs = Counter(video.codec for video in found)
+    text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
+    yield "ok", "corpus", text, ""
+    if catalogue.refusals:
+        few = "; ".join(map(str, catalogue.refusals[:shown]))
+        more = len(catalogue.refusals) - shown
+        text = f"{len(catalogue.refusals)} files cannot be used: {few}" + (f"; and {more} more" if more > 0 else "")
+        yield "note", "corpus", text, "they are passed over; repair or remove them if they matter"
+    table = SequenceTable(found, catalogue.rows, spec)
+    useless = len(found) - table.videos
+    if useless:
+        shortest = min(table.longest_clips, default=0)
+        change = f"--set voxels_per_clip={shortest} admits all that are only too short" if shortest else ""
+        why = "; ".join(str(table.refusals[place]) for place in range(min(shown, useless)))
+        level = "note" if table.count else "bad"
+        yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
+    if not table.count:
+        return
+    remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
+    try:
+        remaker.sample(0, 0, 0)  # with compiling
+        began = time.perf_counter()
+        remaker.sample(0, 0, min(1, remaker.count - 1))
+    except V2VError as error:
+        yield "bad", "corpus", f"a sample could not be made: {error}", "see what v2v-simulate says of that video"
+        return
+    text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
+    yield "ok", "corpus", text, ""
