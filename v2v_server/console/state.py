@@ -14,6 +14,7 @@ import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -264,7 +265,13 @@ class ServiceState:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        return dataclasses.asdict(self)
+        values = _plain(self)
+        values["waiting"] = _plain(self.waiting) | {"shares": _plain(self.waiting.shares)}
+        values["totals"] = _plain(self.totals)
+        values["cache"] = None if self.cache is None else _plain(self.cache)
+        for many in ("workers", "consumers", "refusals", "verdicts"):
+            values[many] = [_plain(each) for each in values[many]]
+        return values
 
     def to_json(self, most_bytes: int = LARGEST_HEADER_BYTES - 1024) -> bytes:
         """The same as JSON, UTF-8. Where that would be too much for a message, fewer workers and consumers are told one
@@ -498,6 +505,17 @@ def _consumer(session: Session, now: float, before: Moment, seconds: float) -> C
         seed=session.seed,
         quarantine=session.quarantine,
     )
+
+
+def _plain(item: Any) -> dict[str, Any]:
+    """A dataclass's fields; ``dataclasses.asdict`` looks into all of them, for 35 ms with two thousand peers."""
+    kind: Any = type(item)
+    return {name: getattr(item, name) for name in _names(kind)}
+
+
+@cache
+def _names(kind: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 def _rate(amount: float, seconds: float) -> float:

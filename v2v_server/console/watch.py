@@ -5,6 +5,7 @@ A state is made at most a few times a second, however many look and however ofte
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from v2v_protocol.messages import ErrorCode, Seen
@@ -20,6 +21,8 @@ from v2v_server.console.state import Service, ServiceState, service_state
 from v2v_server.supervise.protocol import Supervisor
 
 ANSWER_SECONDS = 0.4
+LARGEST_SHARE = 0.02
+"""Of the loop's time that states may take: with thousands of workers and consumers they come less often."""
 MOST_LOOKERS = 64
 """Peers that are answered with one state."""
 
@@ -31,15 +34,23 @@ class Watch:
         service: where the state is read from.
         waited_seconds: for how long the loop has waited for messages in all.
         wall_clock: gives the time of day, ISO 8601.
+        processor_clock: seconds that this thread has worked.
 
     Attributes:
         is_ready: whether the server has said so.
     """
 
-    def __init__(self, service: Service, waited_seconds: Callable[[], float], wall_clock: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        service: Service,
+        waited_seconds: Callable[[], float],
+        wall_clock: Callable[[], str],
+        processor_clock: Callable[[], float] = time.thread_time,
+    ) -> None:
         self._service = service
         self._waited_seconds = waited_seconds
         self._wall_clock = wall_clock
+        self._processor_clock = processor_clock
         self._lookers: dict[Show, None] = {}
         self._answer_at = service.started
         self.is_ready = False
@@ -60,9 +71,10 @@ class Watch:
         self._service.history.look(now, self._service.dispatcher, self._broker_seconds(now))
         if not self._lookers or now < self._answer_at:
             return []
-        self._answer_at = now + ANSWER_SECONDS
+        began = self._processor_clock()
         lookers, self._lookers = self._lookers, {}
         frames = encode(Seen(self.state(now).to_json()))
+        self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
         return [_to(show, frames) for show in lookers]
 
     def _broker_seconds(self, now: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 
@@ -211,7 +212,7 @@ def test_the_state_is_plain_json() -> None:
     at.want(0, 1)
     at.begin()
     state = watched.state()
-    assert json.loads(state.to_json()) == json.loads(json.dumps(state.to_dict()))
+    assert json.loads(state.to_json()) == json.loads(json.dumps(dataclasses.asdict(state)))
     assert json.loads(state.to_json())["workers"][0]["name"] == "w"
 
 
@@ -284,6 +285,20 @@ def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
         made += len(answers)
         at.now += 0.1
     assert made == 2.0 / ANSWER_SECONDS
+
+
+def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
+    at = peers()
+    watched = service(at)
+    worked = iter(range(1000))
+    watched.watch._processor_clock = lambda: float(next(worked)) / 10.0
+    made = []
+    for _ in range(200):
+        watched.ask(at.dispatcher.from_consumer(b"page", encode(See()), at.now))
+        made += [at.now] * len(watched.answers())
+        at.now += 0.1
+    # A tenth of a second of work each.
+    assert made == pytest.approx([0.0, 5.0, 10.0, 15.0], abs=0.5)
 
 
 def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> None:
