@@ -47,6 +47,7 @@ BENCHMARKS = {
     "siege": "chaos.siege",
     "soak": "chaos.soak",
     "fuzz": "fuzz.fuzz",
+    "watching": "watching",
     "limits": "limits",
     "corpus": "corpus",
 }
