@@ -37,8 +37,8 @@ def test_an_error_of_the_system_is_one_line_too(
 
 
 def test_what_is_unknown_is_named_with_what_is_known(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["nothing"]) == 2
-    assert "no benchmark 'nothing'; known: throughput, kernel, transport, " in capsys.readouterr().err
+    assert cli.main(["zzz"]) == 2
+    assert "no benchmark 'zzz'; known: throughput, kernel, transport, " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
