@@ -184,13 +184,14 @@ class Connection:
             UsageError: the connection was opened by another process, from which this one was forked.
             V2VError: see :meth:`Conversation.hear`.
         """
-        began, before = self._clock(), self._conversation.waited_seconds
+        began = self._clock()
         self._listening.listen(began)
         try:
             while True:
                 arrival, idle = self._step(wait=wait)
                 if wait:
-                    self._conversation.waits(before + self._clock() - began, self._now())
+                    began, before = self._clock(), began
+                    self._conversation.waits(began - before, self._now())
                 if arrival is not None or (idle and not wait):
                     return arrival
         finally:

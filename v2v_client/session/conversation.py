@@ -132,8 +132,8 @@ class Conversation:
         layout: dtype and shape of each array of one sample, once welcomed.
         credit: most samples asked for and not received.
         strays: samples of another epoch, dropped.
-        waited_seconds: for how long samples were waited for so far; the server is told with each request, while they
-            are waited for once a second, and at the end.
+        waited_seconds: for how long samples were waited for since the last Hello; the server is told with each request,
+            while they are waited for once a second, and at the end.
     """
 
     stream: StreamIdentity
@@ -216,6 +216,7 @@ class Conversation:
             case State.GREETING:
                 self._hello_wait = self._patience.ping_seconds
                 self._hello_due = now + self._hello_wait
+                self.waited_seconds = 0.0
                 self.outbox.append(self._hello)
             case State.WELCOMED:
                 self._want_again()
@@ -256,11 +257,11 @@ class Conversation:
         return False
 
     def waits(self, seconds: float, now: float) -> None:
-        """Samples have been waited for, so long in all, and still are."""
-        self.waited_seconds = seconds
+        """Samples have been waited for, so long since the last call, and still are."""
+        self.waited_seconds += seconds
         if self.state is State.WELCOMED and now - self._waits_told_at >= WAITS_TOLD_SECONDS:
             self._waits_told_at = now
-            self.outbox.append(Want(self._epoch, (), waited_seconds=seconds))
+            self.outbox.append(Want(self._epoch, (), waited_seconds=self.waited_seconds))
 
     def next_due(self, now: float) -> float:
         """Seconds until :meth:`tick` has something to do, at least 0."""

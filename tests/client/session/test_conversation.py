@@ -270,9 +270,19 @@ def test_a_wait_is_told_once_a_second_and_at_the_end() -> None:
     talk = begun()
     said(talk)
     for tenth in range(1, 35):
-        talk.waits(tenth / 10, tenth / 10)
+        talk.waits(0.1, tenth / 10)
     told = [message.waited_seconds for message in said(talk) if isinstance(message, Want)]
     assert 3 <= len(told) <= 4
     assert told == sorted(told)
     talk.happens(Event.LEFT, 1010.0)
-    assert said(talk) == [Goodbye(3.4)]
+    assert said(talk) == [Goodbye(pytest.approx(3.4))]
+
+
+def test_a_session_that_is_opened_again_begins_to_wait_anew() -> None:
+    talk = begun()
+    talk.waits(5.0, 5.0)
+    talk.hear(FORGOTTEN, [], 6.0)
+    talk.hear(WELCOME, [], 6.0)
+    talk.waits(0.5, 6.5)
+    talk.happens(Event.LEFT, 7.0)
+    assert said(talk)[-1] == Goodbye(0.5)
