@@ -31,8 +31,8 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
-from v2v_server.console.status import StatusLine, summary
-from v2v_server.console.status_log import StatusLog
+from v2v_server.console.status import summary
+from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
@@ -198,7 +198,7 @@ class Server:
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
-        self._status = StatusLog(self._log) if self._log.is_json else StatusLine(sys.stderr)
+        self._status = make_status(self._log, sys.stderr)
         self._watch = make_watch(
             config, catalogue, dispatcher, supervisor, quarantine, transport, self._clock(), _utc_now
         )

@@ -1,6 +1,7 @@
 """What the operator of a server sees.
 
-status     the summary at the start, and one live line
+status     the summary at the start, and a line every ten seconds
+terminal   the same on a terminal, a few lines kept up to date
 status_log the same as a line that programs read
 farewell   what is said at the end
 progress   how far the catalogue is

@@ -1,4 +1,4 @@
-"""What a person sees of a running server: the summary at the start and one live line."""
+"""What a person sees of a running server: the summary at the start, and lines of figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.log import write
 
 _SHOWN = 5
-_LIVE_SECONDS = 0.5
 _LOG_SECONDS = 10.0
 
 
@@ -62,7 +61,7 @@ def _shorter_clips(table: SequenceTable) -> list[str]:
 
 
 class StatusLine:
-    """One line that is kept up to date on a terminal, or printed every ten seconds into a log.
+    """A line every ten seconds, for what is no terminal.
 
     Args:
         stream: where to.
@@ -70,10 +69,7 @@ class StatusLine:
 
     def __init__(self, stream: TextIO = sys.stderr) -> None:
         self._stream = stream
-        self._live = stream.isatty()
-        self._period = _LIVE_SECONDS if self._live else _LOG_SECONDS
         self._next = 0.0
-        self._width = 0
 
     def is_due(self, now: float) -> bool:
         """Whether it is time to show the state again."""
@@ -81,29 +77,18 @@ class StatusLine:
 
     def show(self, now: float, state: ServiceState) -> None:
         """Shows the state."""
-        self._next = now + self._period
-        self._show(_text(state))
+        self._next = now + _LOG_SECONDS
+        write(self._stream, figures(state) + "\n")
 
     def interrupt(self) -> None:
-        """Clears the live line, because something else is about to be printed."""
-        if self._live and self._width:
-            write(self._stream, "\r" + " " * self._width + "\r")
-            self._width = 0
+        """Something else is about to be printed: nothing is in its way."""
 
     def close(self) -> None:
-        """Leaves the last line standing."""
-        if self._live and self._width:
-            write(self._stream, "\n")
-
-    def _show(self, text: str) -> None:
-        if self._live:
-            write(self._stream, "\r" + text.ljust(self._width))
-            self._width = len(text)
-        else:
-            write(self._stream, text + "\n")
+        """No more is shown."""
 
 
-def _text(state: ServiceState) -> str:
+def figures(state: ServiceState) -> str:
+    """Rates and counts in one line."""
     totals = state.totals
     achieved = ""
     if 0 < totals.decodes < totals.samples:

@@ -69,7 +69,7 @@ def draw(state: Mapping[str, Any], note: str = "") -> RenderableType:
     if cache is not None and (read := cache["hits"] + cache["misses"]):
         said += f"   cache {cache['hits'] / read:.0%} hits, {cache['held_gib']:.2f} of {cache['most_gib']:g} GiB"
         said += f" ({cache['trouble']})" if cache["trouble"] else ""
-    parts += [shares, _text(said), _consumers(state), _workers(state)]
+    parts += [shares, _text(said), consumers_table(state["consumer_count"], state["consumers"]), _workers(state)]
     if state["refusals"]:
         passed = _table(f"passed over {totals['refused_candidates']} times, the last", "video", "frame", "why")
         for each in state["refusals"][:5]:
@@ -78,12 +78,18 @@ def draw(state: Mapping[str, Any], note: str = "") -> RenderableType:
     return Group(*parts)
 
 
-def _consumers(state: Mapping[str, Any]) -> Table:
+def consumers_table(count: int, consumers: Sequence[Mapping[str, Any]]) -> Table:
+    """How far each consumer is.
+
+    Args:
+        count: of those that are connected.
+        consumers: some of them, as ``ServiceState`` has them.
+    """
     table = _table(
-        f"{state['consumer_count']} consumers",
+        f"{count} consumers",
         *("who", "state", "epoch", "", "position", "left", "batches/s", "waits", "on its way"),
     )
-    for each in _shown(table, state["consumers"]):
+    for each in _shown(table, consumers):
         share = each["position"] / each["sequences"] if each["sequences"] else 0.0
         table.add_row(
             _text(f"{each['name'] or each['id'][:8]} on {each['host']}"),

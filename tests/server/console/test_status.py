@@ -15,7 +15,10 @@ from v2v_server.broker.counters import Counters
 from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
 from v2v_server.console.state import CacheState, ServiceState
 from v2v_server.console.status import StatusLine, summary
+from v2v_server.console.status_log import StatusLog
+from v2v_server.console.terminal import StatusBlock, make_status
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.system.log import Log
 from v2v_server.video.rows import Rows
 
 
@@ -134,27 +137,43 @@ def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_an
     assert "cache 75% hits, 1.50 of 4 GiB (no room)  workers" in said(replace(service(at).state(), cache=cache))
 
 
-def test_a_terminal_shows_one_line_that_leaves_no_rest_of_the_one_before() -> None:
+def test_a_terminal_shows_a_few_lines_in_the_place_of_those_before() -> None:
     at = peers()
     out = Terminal()
-    line = StatusLine(out)
-    at.dispatcher.counters.samples = 123456
-    line.show(0.0, service(at).state())
-    assert not line.is_due(0.4)
-    assert line.is_due(0.5)
-    at.dispatcher.counters.samples = 7
-    line.show(0.6, service(at).state())
-    _, long, short = out.getvalue().split("\r")
-    assert len(long) <= len(short)
-    assert short.rstrip().endswith("total 7 samples")
-    line.close()
-    assert out.getvalue().endswith("\n")
+    block = StatusBlock(out)
+    watched = service(at)
+    block.show(0.0, watched.state())
+    first = out.getvalue()
+    assert "Nobody is connected" in first
+    assert not block.is_due(0.4)
+    assert block.is_due(0.5)
+    at.join()
+    at.hello(batch_size=2)
+    at.want(0, 1)
+    at.finish()
+    block.show(0.6, watched.state())
+    second = out.getvalue().removeprefix(first)
+    assert second.startswith(f"\x1b[{first.count(chr(10))}F\x1b[J")
+    assert "1 consumers" in second
+    assert "1/50" in second
+    block.interrupt()
+    assert out.getvalue().endswith(f"\x1b[{second.count(chr(10))}F\x1b[J")
+    block.close()
+    block.interrupt()
+    assert out.getvalue().count("\x1b[J") == 2
 
 
-def test_closing_before_anything_was_shown_prints_nothing() -> None:
+def test_a_hostile_name_does_not_steer_the_terminal() -> None:
+    state = service(peers()).state()
     out = Terminal()
-    StatusLine(out).close()
-    assert out.getvalue() == ""
+    StatusBlock(out).show(0.0, replace(state, waiting=replace(state.waiting, sentence="a\x1b[2Jb")))
+    assert "\x1b[2J" not in out.getvalue()
+
+
+def test_which_it_is_depends_on_where_it_goes() -> None:
+    assert isinstance(make_status(Log(), Terminal()), StatusBlock)
+    assert isinstance(make_status(Log(), io.StringIO()), StatusLine)
+    assert isinstance(make_status(Log(is_json=True), Terminal()), StatusLog)
 
 
 # --- metrics ----------------------------------------------------------------------------------------------------------
