@@ -47,7 +47,6 @@ BENCHMARKS = {
     "siege": "chaos.siege",
     "soak": "chaos.soak",
     "fuzz": "fuzz.fuzz",
-    "watching": "watching",
     "limits": "limits",
     "corpus": "corpus",
 }
