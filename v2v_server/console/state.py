@@ -305,18 +305,17 @@ class Service:
     started: float
 
 
-def service_state(service: Service, now: float, time: str, broker_seconds: float, *, is_ready: bool) -> ServiceState:
+def service_state(service: Service, now: float, time: str, *, is_ready: bool) -> ServiceState:
     """The state of now.
 
     Args:
         service: see there.
         now: the time by the loop's clock, seconds.
         time: of day, ISO 8601.
-        broker_seconds: since the start, in which the loop did not wait for a message.
         is_ready: whether the server has said so.
     """
     config, dispatcher, catalogue = service.config, service.dispatcher, service.catalogue
-    before, last = service.history.window(now, dispatcher, broker_seconds)
+    before, last = service.history.window(now, dispatcher)
     seconds = last.now - before.now
     sessions = list(dispatcher.sessions)
     return ServiceState(
@@ -334,7 +333,7 @@ def service_state(service: Service, now: float, time: str, broker_seconds: float
         unusable_count=len(catalogue.refusals),
         spec=config.spec.to_dict(),
         specs={each.spec.digest: each.spec.to_dict() for each in _first_of_each_spec(sessions)},
-        waiting=_waiting(service, before, last),
+        waiting=_waiting(service, now, before, last),
         samples_per_second=_rate(last.samples - before.samples, seconds),
         batches_per_second=_rate(last.batches - before.batches, seconds),
         bytes_per_second=_rate(last.array_bytes - before.array_bytes, seconds),
@@ -370,11 +369,11 @@ def _first_of_each_spec(sessions: list[Session]) -> list[Session]:
     return list(found.values())
 
 
-def _waiting(service: Service, before: Moment, last: Moment) -> Waiting:
+def _waiting(service: Service, now: float, before: Moment, last: Moment) -> Waiting:
     dispatcher = service.dispatcher
     return who_waits(
         Shares.of(before, last),
-        consumers=dispatcher.consumers,
+        is_attended=service.history.is_attended(now) or dispatcher.consumers > 0,
         workers=dispatcher.workers,
         starting=max(0, service.supervisor.running - dispatcher.workers),
         trouble=dispatcher.held_up or dispatcher.registry.trouble(service.config.workers_in_all),

@@ -29,10 +29,10 @@ _SPARE_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Shares of time, each 0 to 1.
+    """Shares of the time in which there was a consumer, each 0 to 1.
 
     Attributes:
-        seconds: of the window.
+        seconds: of that time, within the last ten.
         consumers: of all consumers' time, in which they waited for batches.
         idle: of all workers' time, in which they held nothing to make.
         broker: of the server's loop, in which it did not wait for a message.
@@ -50,14 +50,15 @@ class Shares:
     @classmethod
     def of(cls, before: Moment, last: Moment) -> Shares:
         """Those of the time between two moments."""
+        attended = last.attended_seconds - before.attended_seconds
         workers = last.worker_seconds - before.worker_seconds
         return cls(
-            seconds=last.now - before.now,
+            seconds=attended,
             consumers=_share(
                 last.waited_seconds - before.waited_seconds, last.consumer_seconds - before.consumer_seconds
             ),
             idle=_share(last.idle_seconds - before.idle_seconds, workers),
-            broker=_share(last.broker_seconds - before.broker_seconds, last.now - before.now),
+            broker=_share(last.broker_seconds - before.broker_seconds, attended),
             decode=_share(last.decode_seconds - before.decode_seconds, workers),
             simulate=_share(last.simulate_seconds - before.simulate_seconds, workers),
             handover=_share(last.handover_seconds - before.handover_seconds, workers),
@@ -86,7 +87,7 @@ class Waiting:
 def who_waits(
     shares: Shares,
     *,
-    consumers: int,
+    is_attended: bool,
     workers: int,
     starting: int = 0,
     trouble: str = "",
@@ -96,20 +97,20 @@ def who_waits(
 
     Args:
         shares: of the last seconds.
-        consumers: that are connected.
+        is_attended: whether there are consumers.
         workers: that have said hello.
         starting: processes of the server's own that have not said hello yet.
         trouble: why no worker can make a sample; empty where one can.
         has_cache: whether the server's workers keep what was decoded.
     """
-    part, sentence, remedy = _verdict(shares, consumers, workers, starting, trouble, has_cache)
+    part, sentence, remedy = _verdict(shares, is_attended, workers, starting, trouble, has_cache)
     return Waiting(part, sentence, remedy, shares)
 
 
 def _verdict(
-    shares: Shares, consumers: int, workers: int, starting: int, trouble: str, has_cache: bool
+    shares: Shares, is_attended: bool, workers: int, starting: int, trouble: str, has_cache: bool
 ) -> tuple[str, str, str]:
-    if not consumers:
+    if not is_attended:
         return "nobody", "Nobody is connected: the service waits for consumers.", ""
     if trouble:
         if starting and not workers:

@@ -57,7 +57,7 @@ class Watch:
 
     def state(self, now: float) -> ServiceState:
         """The state of now."""
-        return service_state(self._service, now, self._wall_clock(), self._broker_seconds(now), is_ready=self.is_ready)
+        return service_state(self._service, now, self._wall_clock(), is_ready=self.is_ready)
 
     def ask(self, show: Show) -> list[ToConsumer | ToWorker]:
         """Somebody looks; returns what is to be sent at once, which is nothing as a rule."""

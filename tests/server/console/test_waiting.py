@@ -8,12 +8,12 @@ import pytest
 
 from tests.server.console.watched import service
 from tests.server.peers import answer_to, peers
-from v2v_protocol.messages import Result, Want
+from v2v_protocol.messages import Goodbye, Result, Want
 from v2v_server.console.waiting import Shares, who_waits
 
 FULL = {"seconds": 10.0, "consumers": 0.8, "idle": 0.02, "broker": 0.2}
 CASES: list[tuple[dict[str, Any], str, str, str]] = [
-    ({"there": {"consumers": 0}}, "nobody", "Nobody is connected", ""),
+    ({"there": {"is_attended": False}}, "nobody", "Nobody is connected", ""),
     ({"seconds": 1.0}, "start", "too early", ""),
     ({"there": {"workers": 0, "trouble": "no worker is there", "starting": 0}}, "workers", "no worker is there", ""),
     ({"there": {"workers": 0, "trouble": "no worker is there", "starting": 3}}, "workers", "3 are starting", ""),
@@ -31,7 +31,7 @@ CASES: list[tuple[dict[str, Any], str, str, str]] = [
 
 @pytest.mark.parametrize(("case", "part", "sentence", "remedy"), CASES)
 def test_each_verdict_follows_from_the_shares(case: dict[str, Any], part: str, sentence: str, remedy: str) -> None:
-    there = {"consumers": 2, "workers": 4} | case.get("there", {})
+    there = {"is_attended": True, "workers": 4} | case.get("there", {})
     shares = Shares(**{**FULL, **{name: value for name, value in case.items() if name != "there"}})
     said = who_waits(shares, **there)
     assert said.part == part
@@ -43,8 +43,8 @@ def test_each_verdict_follows_from_the_shares(case: dict[str, Any], part: str, s
 
 def test_a_cache_that_is_there_is_no_remedy() -> None:
     shares = Shares(**FULL, decode=0.9)
-    assert "--cache" in who_waits(shares, consumers=1, workers=1).remedy
-    assert "--cache" not in who_waits(shares, consumers=1, workers=1, has_cache=True).remedy
+    assert "--cache" in who_waits(shares, is_attended=True, workers=1).remedy
+    assert "--cache" not in who_waits(shares, is_attended=True, workers=1, has_cache=True).remedy
 
 
 def test_the_shares_are_of_the_time_that_was_noted() -> None:
@@ -82,3 +82,31 @@ def test_what_was_long_ago_counts_no_more() -> None:
     shares = watched.state().waiting.shares
     assert (shares.consumers, shares.broker) == (0.0, pytest.approx(0.0))
     assert shares.seconds == pytest.approx(10.0, abs=1.1)
+
+
+def test_what_was_before_anybody_came_counts_for_nothing() -> None:
+    at = peers()
+    watched = service(at)
+    at.join()
+    watched.pass_seconds(9.0)
+    at.hello()
+    at.want(0, 1)
+    watched.pass_seconds(1.0, busy_share=0.5)
+    assert watched.state().waiting.part == "start"
+    watched.pass_seconds(2.0, busy_share=0.5)
+    shares = watched.state().waiting.shares
+    assert shares.seconds == pytest.approx(3.0, abs=0.2)
+    assert (shares.idle, shares.broker) == pytest.approx((0.0, 0.5), abs=0.05)
+
+
+def test_a_consumer_that_comes_again_for_the_next_epoch_was_not_away() -> None:
+    at = peers()
+    watched = service(at)
+    at.join()
+    at.hello(b"c1")
+    watched.pass_seconds(5.0)
+    at.consumer_says(b"c1", Goodbye())
+    watched.pass_seconds(1.0)
+    assert watched.state().waiting.part != "nobody"
+    watched.pass_seconds(1.5)
+    assert watched.state().waiting.part == "nobody"
