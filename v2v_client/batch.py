@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import KeysView, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,22 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.indices)
+
+    def keys(self) -> KeysView[str]:
+        """Names of the tensors; with these, ``dict(batch)`` and ``network(**batch)`` give them by name."""
+        return self.arrays.keys()
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        """The tensor of that name.
+
+        Raises:
+            KeyError: this batch has none of that name.
+        """
+        if name not in self.arrays:
+            raise KeyError(f"{name!r}: this batch has {', '.join(self.arrays)}, each by its name")
+        return self.arrays[name]
+
+    __iter__ = None  # its length counts samples and its keys are tensors: neither can be what a loop over it means
 
     def __repr__(self) -> str:
         arrays = "".join(

@@ -36,6 +36,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.tables import html_table
 
 _log = logging.getLogger(__name__)
 _NOT_SHARED = (
@@ -189,6 +190,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def __repr__(self) -> str:
         own = f"seed {self._seed}, rank {self.rank} of {self.world_size}"
         return f"V2VStreamDataset({self._address!r}, batch_size {self._batch_size}, {own})"
+
+    def _repr_html_(self) -> str:
+        rows = {"batch_size": self._batch_size, "arrays": ", ".join(self._arrays), "seed": self._seed}
+        rows |= {"epoch": self.epoch, "rank": f"{self.rank} of {self.world_size}"}
+        return html_table(f"V2VStreamDataset of {self._address}", rows)
 
     # --- what it is ---------------------------------------------------------------------------------------------------
 

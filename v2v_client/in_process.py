@@ -22,6 +22,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.tables import html_table
 
 
 class V2VDataset(Dataset[Sample]):
@@ -93,6 +94,12 @@ class V2VDataset(Dataset[Sample]):
 
     def __repr__(self) -> str:
         return f"V2VDataset({self._source[0]!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
+
+    def _repr_html_(self) -> str:
+        recipe = self.spec.recipe
+        shape = f"{recipe.voxels_per_clip} voxel grids of {recipe.bins} bins, {recipe.crop_width_px} x "
+        rows = {"samples": self._length, "of": f"{shape}{recipe.crop_height_px} px", "arrays": ", ".join(self._arrays)}
+        return html_table(f"V2VDataset of {self._source[0]}", rows | {"seed": self.seed, "epoch": self.epoch})
 
     def show(self, index: int = 0, path: str | os.PathLike[str] | None = None) -> Any:
         """One sample as a picture, which a notebook displays.

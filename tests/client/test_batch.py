@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import abc
 from typing import Any
 
 import pytest
@@ -44,3 +45,16 @@ def test_only_memory_that_waits_for_the_copy_is_copied_behind_our_back(
     of(voxels).to("cuda:0", non_blocking=True)
     of(voxels).to("cuda:0")
     assert voxels.moves == [("cuda:0", returns_early), ("cuda:0", False)]
+
+
+def test_it_gives_its_tensors_by_name_and_is_no_mapping() -> None:
+    """Frameworks rebuild a Mapping, and count what they can iterate over: a Batch has to go through them whole."""
+    batch = of(torch.ones(1, 2))
+    assert batch["voxels"] is batch.voxels
+    assert dict(batch) == dict(batch.arrays)
+    assert (lambda **tensors: set(tensors))(**batch) == set(batch.arrays)
+    with pytest.raises(KeyError, match="this batch has"):
+        batch["depth"]
+    assert not isinstance(batch, abc.Mapping | abc.Iterable)
+    with pytest.raises(TypeError, match="not iterable"):
+        iter(batch)

@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import FakeServer
-from v2v_client import Batch, V2VStreamDataset
+from v2v_client import Batch, UsageError, V2VStreamDataset
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "frameworks.md"
 EXAMPLES = re.findall(r"^## (.+?)\n\n```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
 
 
+OTHERS = {"Lightning": "lightning", "accelerate": "accelerate"}
+"""Examples that need a package which only the extra ``frameworks`` brings."""
+OURS = {name: text for name, text in EXAMPLES if name not in OTHERS}
+
+
+class Crash(Exception):
+    pass
+
+
+def of_two_bins(text: str) -> str:
+    """An example for the fake server's grids."""
+    assert "Conv2d(5," in text
+    return text.replace("Conv2d(5,", "Conv2d(2,")
+
+
 def test_there_are_examples() -> None:
-    assert [name for name, _ in EXAMPLES] == ["A plain loop", "DataLoader", "StatefulDataLoader"]
+    assert [name for name, _ in EXAMPLES] == ["A plain loop", "DataLoader", "StatefulDataLoader", *OTHERS]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Python's, of a fork in a process with threads
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")  # torchdata calls it
-@pytest.mark.parametrize("text", [text for _, text in EXAMPLES], ids=[name for name, _ in EXAMPLES])
+@pytest.mark.parametrize("text", OURS.values(), ids=OURS)
 def test_an_example_resumes_where_it_was(text: str) -> None:
     taken: list[int] = []
 
@@ -32,4 +50,54 @@ def test_an_example_resumes_where_it_was(text: str) -> None:
     with FakeServer(sequences=23, credit=8) as server:
         names = {"ADDRESS": server.address, "train": train, "V2VStreamDataset": V2VStreamDataset}
         exec(text, names | {"DataLoader": DataLoader, "StatefulDataLoader": StatefulDataLoader})
+    assert taken == list(range(20))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
+def test_the_example_of_accelerate_resumes_where_it_was() -> None:
+    accelerate = pytest.importorskip("accelerate", reason="accelerate is not installed; the extra frameworks has it")
+    taken: list[int] = []
+    with FakeServer(sequences=23, credit=8) as server:
+        names = {"ADDRESS": server.address, "train": lambda batch: taken.extend(batch.indices), "torch": torch}
+        exec(
+            of_two_bins(dict(EXAMPLES)["accelerate"]), names | {"V2VStreamDataset": V2VStreamDataset} | vars(accelerate)
+        )
+        loader = DataLoader(V2VStreamDataset(server.address, batch_size=4), batch_size=None)
+        prepared = iter(accelerate.Accelerator(cpu=True).prepare(loader))
+        with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
+            next(prepared)
+    assert taken == list(range(20))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
+@pytest.mark.parametrize("workers", [None, 0, 2])
+def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, workers: int | None) -> None:
+    """The checkpoint is written after two batches; the crash comes in the fourth. Workers: of a StatefulDataLoader."""
+    lightning = pytest.importorskip("lightning", reason="lightning is not installed; the extra frameworks has it")
+    callbacks = importlib.import_module("lightning.pytorch.callbacks")
+    taken: list[int] = []
+
+    def train(batch: Batch) -> None:
+        if batch.indices[0] == 12 and 12 not in crashed:
+            crashed.append(12)
+            raise Crash
+        taken.extend(batch.indices)
+
+    def given(address: str, batch_size: int) -> Any:
+        stream = V2VStreamDataset(address, batch_size=batch_size)
+        return stream if workers is None else StatefulDataLoader(stream, batch_size=None, num_workers=workers)
+
+    crashed: list[int] = []
+    quiet = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    first, second = of_two_bins(dict(EXAMPLES)["Lightning"]).split("  # a crash\n")
+    with FakeServer(sequences=23, credit=8) as server:
+        names = {"ADDRESS": server.address, "train": train, "V2VStreamDataset": given, "FOLDER": str(tmp_path)}
+        names |= {"lightning": lightning, "torch": torch, "QUIET": quiet, "ModelCheckpoint": callbacks.ModelCheckpoint}
+        with pytest.raises(Crash):
+            exec(first, names)
+        assert taken == list(range(12))
+        del taken[8:]  # what came after the checkpoint is trained on again
+        exec(second, names)
     assert taken == list(range(20))

@@ -85,3 +85,12 @@ def test_a_streamed_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pyt
     dataclasses.replace(batch, resume_state=state)._picture()
     batch._picture()
     assert asked == [dataset.spec.recipe.frames_per_bin, None]
+
+
+def test_datasets_show_themselves_as_tables(dataset: V2VDataset) -> None:
+    shown = dataset._repr_html_()
+    assert f'<td style="text-align:left">{len(dataset)}</td>' in shown
+    assert "4 voxel grids of 5 bins, 48 x 48 px" in shown
+    stream = V2VStreamDataset("tcp://127.0.0.1:1", 3, rank=1, world_size=2)
+    assert "1 of 2" in stream._repr_html_()
+    assert "tcp://127.0.0.1:1" in stream._repr_html_()
