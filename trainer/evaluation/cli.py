@@ -17,13 +17,14 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from trainer.convert.items import SensorSize
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
 from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
 from trainer.evaluation.metrics import METRICS, make_metrics
 from trainer.evaluation.reconstruct import Stretch
 from trainer.evaluation.score import SequenceScore
-from trainer.evaluation.tables import records, table
+from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
 from trainer.weights import load_network
@@ -84,12 +85,21 @@ def _parser() -> Parser:
         "--as-published", action="store_true",
         help="event_idx as stored, times cut to us: as the released code does, faults included",
     )  # fmt: skip
-    how.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
+    windows = how.add_mutually_exclusive_group()
+    windows.add_argument(
+        "--window-seconds", type=float, metavar="S",
+        help="windows of so long, in place of those from picture to picture; a picture is scored against the window "
+        "whose end is nearest, at most half a window away",
+    )  # fmt: skip
+    windows.add_argument("--window-events", type=int, metavar="N", help="the same with windows of so many events")
+    windows.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
+    how.add_argument("--size", metavar="WxH", help="of the sensor, for recordings without pictures")
     how.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
     out.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
     out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of a picture (default 6)")
     out.add_argument("--video", action="store_true", help="also a video of each sequence, side by side")
     out.add_argument("--json", metavar="FILE", help="also write flat records")
+    out.add_argument("--per-frame", metavar="FILE.csv", help="also write the scores of every window")
     return parser
 
 
@@ -97,6 +107,8 @@ def _run(arguments: argparse.Namespace) -> int:
     data = Path(arguments.data)
     if not data.exists():
         raise UsageError(f"--data {data}: no such folder or file")
+    if arguments.per_frame is not None and not Path(arguments.per_frame).parent.is_dir():
+        raise UsageError(f"--per-frame {arguments.per_frame}: no folder {Path(arguments.per_frame).parent}")
     if arguments.json is not None and not Path(arguments.json).parent.is_dir():
         raise UsageError(f"--json {arguments.json}: cannot be written: no folder {Path(arguments.json).parent}")
     config = folder_config(data) if arguments.config is None else read_config(arguments.config)
@@ -115,6 +127,8 @@ def _run(arguments: argparse.Namespace) -> int:
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
         raise UsageError(f"--data {data} holds no sequence of {wanted}; v2v-convert makes the files")
     _print(config, scores)
+    if arguments.per_frame is not None:
+        write_frames(Path(arguments.per_frame), scores)
     if arguments.json is not None:
         settings = {
             "model": model,
@@ -124,6 +138,8 @@ def _run(arguments: argparse.Namespace) -> int:
             "as_published": run.as_published,
             "cuts": arguments.cuts,
             "reconstruction_hz": run.fps,
+            "window_seconds": run.window_seconds,
+            "window_events": run.window_events,
             "stretch": run.stretch,
         }
         write_json(arguments.json, records(scores, settings))
@@ -186,10 +202,20 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         as_published=arguments.as_published,
         use_cuts=arguments.cuts == "paper",
         fps=arguments.fps,
+        window_seconds=arguments.window_seconds,
+        window_events=arguments.window_events,
+        size=_size(arguments.size),
         stretch=arguments.stretch,
         drawing=Drawing(None if arguments.out is None else Path(arguments.out), arguments.rows, arguments.video),
     )
     return run, model
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    size = SensorSize.parse(text)
+    return size.height, size.width
 
 
 def _device(wanted: str | None) -> str:

@@ -1,7 +1,7 @@
 """The paper's four data sets: their sequences, and which seconds of each are scored.
 
-Seconds count from the first picture of the raw recording. Sequences of EVAID that the paper leaves out (blocks,
-umbrella, room2) are not listed.
+Seconds count from the first picture of the raw recording; a picture at the end of a cut does not belong to it.
+Sequences of EVAID that the paper leaves out (blocks, umbrella, room2) are not listed.
 """
 
 from __future__ import annotations

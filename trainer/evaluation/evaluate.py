@@ -58,6 +58,8 @@ class Run:
         as_published: see :mod:`trainer.evaluation.readers`.
         use_cuts: False scores all of each recording.
         fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
+        window_seconds, window_events: windows of so long, or of so many events, in place of those between pictures.
+        size: of the sensor, see :class:`Recording`.
         drawing: pictures and videos.
         stretch: see :func:`reconstruct`.
     """
@@ -69,6 +71,9 @@ class Run:
     as_published: bool = False
     use_cuts: bool = True
     fps: float | None = None
+    window_seconds: float | None = None
+    window_events: int | None = None
+    size: tuple[int, int] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     stretch: Stretch = "none"
 
@@ -94,14 +99,19 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
         UsageError: see :class:`Recording`.
     """
     for sequence, path in find_recordings(data, data_set).items():
-        with Recording(path, as_published=run.as_published) as recording:
+        with Recording(path, as_published=run.as_published, size=run.size) as recording:
             _windows(run, recording, data_set.cuts[sequence])
 
 
 def _windows(run: Run, recording: Recording, cut: Cut | None) -> list[EventWindow]:
     if run.fps is not None:
         return recording.regular_windows(run.fps)
-    return recording.windows(cut if run.use_cuts else None)
+    cut = cut if run.use_cuts else None
+    if run.window_seconds is not None:
+        return recording.windows_of_seconds(run.window_seconds, cut)
+    if run.window_events is not None:
+        return recording.windows_of_events(run.window_events, cut)
+    return recording.windows(cut)
 
 
 def evaluate_data_set(
@@ -122,7 +132,7 @@ def evaluate_sequence(
     run: Run, path: Path, data_set: str, cut: Cut | None, advance: Advance = lambda _sequence, _done, _total: None
 ) -> SequenceScore:
     """Score, and draw, one recording."""
-    with Recording(path, as_published=run.as_published) as recording:
+    with Recording(path, as_published=run.as_published, size=run.size) as recording:
         windows = _windows(run, recording, cut)
         scorer = SequenceScorer(run.metrics)
         rows = []

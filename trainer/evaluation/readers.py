@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator, Sequence
@@ -87,6 +88,7 @@ class Recording:
     Args:
         path: of the file; opened for reading.
         as_published: see the module.
+        size: height and width of the sensor, where there is no picture to tell them; None: what the file states.
 
     Attributes:
         name: of the sequence, the file's name without its ending.
@@ -98,8 +100,9 @@ class Recording:
         UsageError: no such file, not of this layout, or its clocks do not fit together.
     """
 
-    def __init__(self, path: str | Path, *, as_published: bool = False) -> None:
+    def __init__(self, path: str | Path, *, as_published: bool = False, size: tuple[int, int] | None = None) -> None:
         self.path = Path(path)
+        self._given_size = size
         self.name = self.path.stem
         if not self.path.is_file():
             raise UsageError(f"no file {self.path}")
@@ -219,24 +222,38 @@ class Recording:
             if len(shape) != 2:
                 raise UsageError(f"{self.path}: {self.images[0].key} is {list(shape)}, not [H, W]")
             return int(shape[0]), int(shape[1])
+        if self._given_size is not None:
+            return self._given_size
         stated = self._file.attrs.get("sensor_resolution", self._file.get("sensor_resolution"))
         if stated is None or len(stated) != 2:
-            raise UsageError(f"{self.path} has neither pictures nor sensor_resolution: the sensor's size is unknown")
+            raise UsageError(
+                f"{self.path} has neither pictures nor sensor_resolution: say the sensor's size with --size WxH"
+            )
         return int(stated[0]), int(stated[1])
 
     def windows(self, cut: tuple[float, float] | None = None) -> list[EventWindow]:
         """Windows between consecutive pictures.
 
         Args:
-            cut: first and last second, counted from the first picture of the recording; None takes all pictures.
+            cut: from which second on and before which, counted from the first picture of the recording; None takes
+                all pictures.
 
         Raises:
             UsageError: fewer than two pictures in the cut, or the recording ends before the cut does.
         """
         if not self.images:
             raise UsageError(f"{self.path} has no pictures to compare with; --fps reconstructs without")
+        images = self._images_in(cut)
+        if len(images) < 2:
+            raise UsageError(f"{self.path}: {len(images)} pictures in the cut {cut}; two or more make a window")
+        return [
+            EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
+            for one, other in itertools.pairwise(images)
+        ]
+
+    def _images_in(self, cut: tuple[float, float] | None) -> list[Image]:
         images = list(self.images)
-        if cut is not None:
+        if cut is not None and images:
             start, end = cut
             zero, last = images[0].time, images[-1].time - images[0].time
             # A recording that was cut before would be cut twice. One that begins at 0 cannot be mistaken.
@@ -245,19 +262,15 @@ class Recording:
                     f"{self.path} lasts {last:.2f} s, and the cut is from {start:g} to {end:g} s: if it is already "
                     "cut, give --cuts none"
                 )
-            images = [image for image in images if start <= image.time - zero <= end]
-        if len(images) < 2:
-            raise UsageError(f"{self.path}: {len(images)} pictures in the cut {cut}; two or more make a window")
-        return [
-            EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
-            for one, other in itertools.pairwise(images)
-        ]
+            images = [image for image in images if start <= image.time - zero < end]
+        return images
 
     def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[EventWindow]:
         """Windows between the times of consecutive flow fields; the target is the field of the window.
 
         Args:
-            cut: first and last second, counted from the first picture of the recording, else its first field.
+            cut: from which second on and before which, counted from the first picture of the recording, else its
+                first field.
             one_later: pair each window with the field at its end, as V2V's released code does, not that at its start.
 
         Raises:
@@ -268,7 +281,7 @@ class Recording:
             fields = [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
         if cut is not None and fields:
             zero = self.images[0].time if self.images else fields[0].time
-            fields = [each for each in fields if cut[0] <= each.time - zero <= cut[1]]
+            fields = [each for each in fields if cut[0] <= each.time - zero < cut[1]]
         if len(fields) < 2:
             raise UsageError(
                 f"{self.path} has {len(fields)} flow fields{f' in the cut {cut}' if cut else ''}; two or more make a "
@@ -308,6 +321,81 @@ class Recording:
         edges = [first + step / fps for step in range(count + 1)]
         indices = [bisect.bisect_left(self._times, edge) for edge in edges]
         return [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
+
+    def windows_of_seconds(self, seconds: float, cut: tuple[float, float] | None = None) -> list[EventWindow]:
+        """Windows of equal length in time, without regard to pictures; :meth:`_with_targets` says which are scored.
+
+        Args:
+            seconds: of each.
+            cut: as for :meth:`windows`; None takes all events.
+
+        Raises:
+            UsageError: ``seconds`` not above 0, or less than one window.
+        """
+        if not seconds > 0:
+            raise UsageError(f"windows of {seconds:g} s: give more than 0")
+        first, last, images = self._scored_span(cut)
+        count = int((last - first) / seconds + 1e-9)
+        if count < 1:
+            raise UsageError(f"{self.path}: {last - first:.3f} s are less than one window of {seconds:g} s")
+        edges = [first + step * seconds for step in range(count + 1)]
+        indices = [bisect.bisect_left(self._times, edge) for edge in edges]
+        return self._with_targets(
+            [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)], images
+        )
+
+    def windows_of_events(self, events: int, cut: tuple[float, float] | None = None) -> list[EventWindow]:
+        """Windows of as many events each, which are short where much moves; the rest at the end is left out.
+
+        Args:
+            events: of each.
+            cut: as for :meth:`windows`; None takes all events.
+
+        Raises:
+            UsageError: ``events`` not above 0, or less than one window.
+        """
+        if events < 1:
+            raise UsageError(f"windows of {events} events: give at least 1")
+        first, last, images = self._scored_span(cut)
+        begin, end = bisect.bisect_left(self._times, first), bisect.bisect_right(self._times, last)
+        if end - begin < events:
+            raise UsageError(f"{self.path}: {end - begin} events are less than one window of {events}")
+        starts = range(begin, end - events + 1, events)
+        ends = [self._times[min(start + events, len(self) - 1)] for start in starts]
+        begins = [first, *ends[:-1]]
+        return self._with_targets(
+            [
+                EventWindow(start, start + events, at, until, None)
+                for start, at, until in zip(starts, begins, ends, strict=True)
+            ],
+            images,
+        )
+
+    def _scored_span(self, cut: tuple[float, float] | None) -> tuple[float, float, list[Image]]:
+        first, last = self.span
+        images = self._images_in(cut)
+        if cut is not None and self.images:
+            zero = self.images[0].time
+            first, last = max(first, zero + cut[0]), min(last, zero + cut[1])
+        return first, last, images
+
+    @staticmethod
+    def _with_targets(windows: Sequence[EventWindow], images: Sequence[Image]) -> list[EventWindow]:
+        """Each picture is the target of the window whose end is nearest to it, if that is at most half a window away;
+        of several for one window, the nearest."""
+        ends = [window.end for window in windows]
+        nearest: dict[int, tuple[float, Image]] = {}
+        for image in images:
+            after = bisect.bisect_left(ends, image.time)
+            places = [place for place in (after - 1, after) if 0 <= place < len(ends)]
+            place = min(places, key=lambda place: abs(ends[place] - image.time))
+            away = abs(ends[place] - image.time)
+            if 2 * away <= windows[place].end - windows[place].begin and away < nearest.get(place, (away + 1,))[0]:
+                nearest[place] = away, image
+        return [
+            dataclasses.replace(window, target=nearest[place][1]) if place in nearest else window
+            for place, window in enumerate(windows)
+        ]
 
     def events(self, window: EventWindow) -> Events:
         """The events of a window, in order of time.

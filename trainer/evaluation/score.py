@@ -23,6 +23,7 @@ class SequenceScore:
         repaired_images: time stamps that were mended.
         means: mean over the frames by metric; empty where there was nothing to compare with.
         blank: the same of a blank in the mean grey of each target, the best that one without any picture could score.
+        by_frame: of each window that was scored, its number, its end (s), its events, and each metric.
     """
 
     data_set: str
@@ -33,6 +34,7 @@ class SequenceScore:
     repaired_images: int
     means: Mapping[str, float]
     blank: Mapping[str, float] = field(default_factory=dict)
+    by_frame: Sequence[Mapping[str, float]] = ()
 
 
 @dataclass
@@ -42,6 +44,7 @@ class SequenceScorer:
     metrics: Mapping[str, Metric]
     values: dict[str, list[float]] = field(default_factory=dict)
     blank: dict[str, list[float]] = field(default_factory=dict)
+    by_frame: list[dict[str, float]] = field(default_factory=list)
     frames: int = 0
     events: int = 0
     empty_windows: int = 0
@@ -54,8 +57,11 @@ class SequenceScorer:
         if step.window.target is None or step.camera is None:
             return
         prediction, target = step.prediction.astype(np.float64), step.camera / 255.0
+        scored: dict[str, float] = {"frame": self.frames - 1, "seconds": step.window.end, "events": step.events}
+        self.by_frame.append(scored)
         for name, metric in self.metrics.items():
-            self.values.setdefault(name, []).append(metric(prediction, target))
+            scored[name] = metric(prediction, target)
+            self.values.setdefault(name, []).append(scored[name])
             self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
 
     def score(self, data_set: str, sequence: str, repaired_images: int) -> SequenceScore:
@@ -64,7 +70,7 @@ class SequenceScorer:
             {name: float(np.mean(each)) for name, each in kind.items()} for kind in (self.values, self.blank)
         )
         counts = (self.frames, self.events, self.empty_windows, repaired_images)
-        return SequenceScore(data_set, sequence, *counts, means, blank)
+        return SequenceScore(data_set, sequence, *counts, means, blank, tuple(self.by_frame))
 
 
 def mean_over_sequences(scores: Sequence[SequenceScore], *, blank: bool = False) -> dict[str, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
@@ -11,6 +13,7 @@ from rich.table import Table
 from trainer.evaluation import paper
 from trainer.evaluation.cuts import DataSet
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
+from v2v_protocol.errors import UsageError
 
 TITLES = {
     "mse": "MSE",
@@ -55,6 +58,28 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
 
 def _number(values: Mapping[str, float], name: str) -> str:
     return f"{values[name]:.3f}" if name in values else "-"
+
+
+def write_frames(file: Path, scores_by_set: Mapping[str, Sequence[SequenceScore]]) -> None:
+    """One line a window that was scored, CSV: data set, sequence, number of the window, its end in seconds of the
+    recording's clock, its events, and each metric.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
+    try:
+        with file.open("w", newline="", encoding="utf-8") as out:
+            lines: Any = None
+            for name, scores in scores_by_set.items():
+                for score in scores:
+                    for scored in score.by_frame:
+                        line = {"data_set": name, "sequence": score.sequence, **scored}
+                        if lines is None:
+                            lines = csv.DictWriter(out, list(line))
+                            lines.writeheader()
+                        lines.writerow(line)
+    except OSError as error:
+        raise UsageError(f"--per-frame {file}: {error.strerror}") from error
 
 
 def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,25 @@ def test_scores_of_a_converted_bag_equal_those_computed_by_hand(tmp_path: Path, 
     assert sequence["ssim_range2"] == pytest.approx(np.mean([slow_ssim(a, b, 2.0) for a, b in pairs]), abs=1e-5)
     assert (sequence["sequence"], sequence["frames"], sequence["events"]) == ("desk", 4, 28)
     assert (mean["sequence"], mean["mse"], mean["voxels"]) == (None, sequence["mse"], "discrete")
+
+
+def test_scores_of_every_window_are_written(tmp_path: Path, weights: Path) -> None:
+    data = random_recording(tmp_path / "a.h5")
+    file = tmp_path / "frames.csv"
+    sequence, _ = evaluate("--weights", weights, "--data", data, "--per-frame", file)
+    lines = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+    assert [line["frame"] for line in lines] == [str(number) for number in range(5)]
+    assert np.mean([float(line["mse"]) for line in lines]) == pytest.approx(sequence["mse"])
+    assert sum(int(line["events"]) for line in lines) == sequence["events"]
+    assert [float(line["seconds"]) for line in lines] == pytest.approx([1.02, 1.04, 1.06, 1.08, 1.1])
+
+
+@pytest.mark.parametrize(("flag", "value", "frames"), [("--window-seconds", 0.03, 3), ("--window-events", 200, 3)])
+def test_windows_need_not_end_at_pictures(tmp_path: Path, weights: Path, flag: str, value: float, frames: int) -> None:
+    sequence, _ = evaluate("--weights", weights, "--data", random_recording(tmp_path / "a.h5"), flag, value)
+    assert sequence["frames"] == frames
+    assert sequence[flag.removeprefix("--").replace("-", "_")] == value
+    assert 0 < sequence["mse"] < 1
 
 
 def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path) -> None:

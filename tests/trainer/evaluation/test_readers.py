@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -124,14 +125,75 @@ def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
     with Recording(path) as opened:
         windows = opened.windows((1.0, 3.0))
-        assert len(windows) == 20
+        assert len(windows) == 19
         assert windows[0].begin == pytest.approx(2.0)
-        assert windows[-1].end == pytest.approx(4.0)
+        assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a cut is not in it, as released
         assert len(opened.windows((0.0, 60.0))) == 50
         with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the cut is from 5 to 20 s.*--cuts none"):
             opened.windows((5.0, 20.0))
         with pytest.raises(UsageError, match="two or more"):
             opened.windows((4.96, 5.5))
+
+
+def test_windows_of_time_have_the_picture_nearest_to_their_end(tmp_path: Path) -> None:
+    path = recording(tmp_path, stamped(1.0, 1.19, 1.26, 1.33, 1.5))
+    with Recording(path) as opened:
+        windows = opened.windows_of_seconds(0.1)
+        assert [(window.start, window.stop) for window in windows] == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+        assert [window.end for window in windows] == pytest.approx([1.1, 1.2, 1.3, 1.4, 1.5])
+        # 1.0 is more than half a window from an end; of 1.26 and 1.33, both nearest to 1.3, 1.33 is the nearer one.
+        times = [None if window.target is None else window.target.time for window in windows]
+        assert times == [None, 1.19, 1.33, None, 1.5]
+        with pytest.raises(UsageError, match="give more than 0"):
+            opened.windows_of_seconds(0.0)
+        with pytest.raises(UsageError, match="less than one window of 2 s"):
+            opened.windows_of_seconds(2.0)
+
+
+def test_windows_of_events_have_as_many_each(tmp_path: Path) -> None:
+    with Recording(recording(tmp_path, stamped(1.05, 1.21, 1.4))) as opened:
+        windows = opened.windows_of_events(2)
+        assert [(window.start, window.stop) for window in windows] == [(0, 2), (2, 4), (4, 6)]
+        assert [window.begin for window in windows] == pytest.approx([1.0, 1.2, 1.4])
+        assert [window.end for window in windows] == pytest.approx([1.2, 1.4, 1.5])
+        times = [None if window.target is None else window.target.time for window in windows]
+        assert times == [1.21, 1.4, None]
+        assert [len(opened.events(window)) for window in opened.windows_of_events(4)] == [4]
+        for wrong, why in ((0, "at least 1"), (7, "6 events are less than one window of 7")):
+            with pytest.raises(UsageError, match=why):
+                opened.windows_of_events(wrong)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 400), st.floats(0.005, 0.2), st.booleans())
+def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
+    tmp_path_factory: pytest.TempPathFactory, events: int, seconds: float, is_cut: bool
+) -> None:
+    path = random_recording(tmp_path_factory.mktemp("any") / "a.h5", images=21)
+    cut = (0.1, 0.35) if is_cut else None
+    with Recording(path) as opened:
+        allowed = {image.key for image in opened.images if cut is None or cut[0] <= image.time - 1.0 < cut[1]}
+        for windows in (opened.windows_of_seconds(seconds, cut), opened.windows_of_events(min(events, 200), cut)):
+            for one, other in itertools.pairwise(windows):
+                assert (one.stop, one.end) == (other.start, other.begin)
+            for window in windows:
+                t = opened.events(window).t
+                assert ((t >= window.begin) & (t <= window.end)).all()
+            keys = [window.target.key for window in windows if window.target is not None]
+            assert len(set(keys)) == len(keys)
+            assert set(keys) <= allowed
+
+
+def test_a_size_may_be_given_where_nothing_states_it(tmp_path: Path) -> None:
+    numbers = np.arange(6)
+    path = write_h5(tmp_path / "a.h5", T, numbers % 4, numbers % 3, numbers % 2, [])
+    with pytest.raises(UsageError, match="say the sensor's size with --size WxH"):
+        Recording(path)
+    with Recording(path, size=(3, 4)) as opened:
+        assert opened.size == (3, 4)
+    write_h5(path, T, numbers % 4, numbers % 3, numbers % 2, [], sensor_resolution=(4, 3))  # x, y: the wrong way round
+    with Recording(path, size=(3, 4)) as opened:
+        assert opened.size == (3, 4)
 
 
 def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,7 +279,7 @@ def broken(path: Path, kind: str) -> Path:
         ("scalar", r"events/xs is int64 \[\], not a column"),
         ("fractions", r"events/xs is float64 \[6\], not a column \[N\], of whole numbers"),
         ("raw", r"no events/ts.*v2v-convert"),
-        ("no images or size", "size is unknown"),
+        ("no images or size", "say the sensor.s size with --size WxH"),
         ("no index", "without the attribute event_idx"),
         ("colour", r"is \[3, 4, 3\], not \[H, W\]"),
         ("twice back", "only single ones can be mended"),
