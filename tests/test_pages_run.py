@@ -1,0 +1,117 @@
+"""The command lines of README and guides run as they stand there, in a folder where the names that they use are
+names of real clips. What is added to them only makes them smaller."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.test_commands import MODULES, ROOT
+
+VIDEOS = ("my.mp4", "VIDEO")
+FOLDERS = ("DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
+SMALLER = {
+    "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
+    "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
+    "v2v-prepare": ["--workers", "1"],
+}
+CANNOT = {
+    r"^v2v-convert ": "recordings that nobody may hand on",
+    r"^v2v-eval ": "weights and recordings that nobody may hand on; tests of the trainer run v2v-eval on made ones",
+    r"^v2v-train (e2vid|firenet-cpu|my\.yaml) ": "a night, weights of LPIPS, or a configuration of the reader's own",
+    r"^v2v-serve .*--page": "a port that somebody may have; tests of the page start it on a free one",
+}
+"""What cannot run here, and why."""
+_BLOCK = re.compile(r"(?:^(?: {4}.*)?\n)+", re.M)
+_COMMAND = re.compile(r"^ {4}(v2v-(?!bench)[a-z]+ .*)$", re.M)
+
+
+def blocks(page: Path) -> list[list[str]]:
+    """The command lines of each code block of a page, one of `v2v-bench` not among them: those take minutes."""
+    text = re.sub(r" *\\\n\s*", " ", page.read_text(encoding="utf-8"))
+    return [found for block in _BLOCK.findall(text) if (found := _COMMAND.findall(block))]
+
+
+def can_run(line: str) -> bool:
+    return not any(re.search(pattern, line) for pattern in CANNOT)
+
+
+RUN = [
+    pytest.param([line for line in block if can_run(line)], id=f"{page.stem}: {block[0][:40].strip()}")
+    for page in PAGES
+    for block in blocks(page)
+    if any(map(can_run, block))
+]
+
+
+def test_there_are_commands_of_each_kind() -> None:
+    lines = [line for page in PAGES for block in blocks(page) for line in block]
+    assert len(lines) > 25
+    for pattern in CANNOT:
+        assert any(re.search(pattern, line) for line in lines), pattern
+    ran = {line.split()[0] for line in lines if can_run(line)}
+    assert ran >= {"v2v-serve", "v2v-preview", "v2v-simulate", "v2v-prepare", "v2v-train", "v2v-doctor"}
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two clips, long and large enough for the paper's recipe, in WebVid's upper rows too."""
+    folder = tmp_path_factory.mktemp("clips")
+    for number in range(2):
+        write_clip(folder / f"{number}.mp4", panned_luma(203, 256, 256, step=(1, 1 + number)))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lines", RUN)
+def test_commands_run_as_they_stand(
+    lines: list[str], clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in {"PYTHONPATH": str(ROOT), "V2V_CACHE_DIR": str(tmp_path / "cache")}.items():
+        monkeypatch.setenv(name, value)
+    for name in VIDEOS:
+        (tmp_path / name).symlink_to(clips / "0.mp4")
+    for name in FOLDERS:
+        (tmp_path / name).symlink_to(clips)
+    for line in lines:
+        program, *given = shlex.split(line, comments=True)
+        smaller = SMALLER.get(program, [])
+        if program == "v2v-train":
+            smaller = [*smaller, "--set", "run.steps=2"]
+        if "--cache" in given:
+            smaller = [*smaller, "--cache", "decoded"]
+        command = [sys.executable, "-m", MODULES[program], *given, *smaller]
+        status, said = served(command) if program == "v2v-serve" else finished(command)
+        assert status == 0, f"{line}\n{said}"
+
+
+def finished(command: list[str]) -> tuple[int, str]:
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
+    return done.returncode, done.stdout + done.stderr
+
+
+def served(command: list[str]) -> tuple[int, str]:
+    """Starts a server, waits until it is ready, and ends it as Ctrl-C does."""
+    said, port = Path("said"), Path("port")
+    with said.open("w") as out, subprocess.Popen(command, stdout=out, stderr=out) as process:
+        try:
+            deadline = time.monotonic() + 120
+            while not port.exists() and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.05)
+            ready = port.exists()
+            process.send_signal(signal.SIGINT)
+            status = process.wait(60)
+        finally:
+            process.kill()
+    port.unlink(missing_ok=True)
+    return (0 if ready and status in (0, 130) else 1), said.read_text()
