@@ -6,17 +6,26 @@ this device. Both lie on the grid of a step's earlier frame, [2, H, W] (x, y) in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from trainer import pictures
+from trainer.evaluation.config import folder_config
+from trainer.evaluation.evaluate import find_recordings
+from trainer.evaluation.flow import TITLES, FlowRun, evaluate_flow
+from trainer.evaluation.readers import Recording
+from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.models.sequence import VoxelNetwork
 from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
 from v2v_client import Batch
+from v2v_protocol.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,6 +123,28 @@ class Flow(Task):
             last = prediction.detach().float().reshape(-1, *truth.shape)[-1]
             error = torch.linalg.vector_norm(last - truth, dim=2).mean()
         return {"end_point_error_px": error, "total": total}
+
+    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
+        """See :meth:`Task.validator`: AEE and 3PE on recordings with known flow, as ``v2v-eval`` gives them."""
+        if not recordings.exists():
+            raise UsageError(f"run.validate = {recordings}: no such file or folder")
+        (data_set,) = folder_config(recordings).data_sets
+        files = list(find_recordings(recordings, data_set).values())
+        for file in files:
+            with Recording(file) as recording:
+                recording.flow_windows()
+        run = FlowRun(network, VoxelSettings(bins=network.bins), str(self.device))
+
+        def scores() -> dict[str, float]:
+            training = network.training
+            found = [evaluate_flow(run, file, None)["network"].means for file in files]
+            network.train(training)
+            names = [name for name in TITLES if all(name in means for means in found)]
+            if not names:
+                raise UsageError(f"run.validate = {recordings}: no pixel with known flow")
+            return {name: float(np.mean([means[name] for means in found])) for name in names}
+
+        return scores
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
         """Events, flow to be found, flow found; both in the colours of one scale."""

@@ -143,7 +143,7 @@ class Task(abc.ABC):
         Raises:
             UsageError: there are none, or this task has no such scores.
         """
-        raise UsageError(f"run.validate = {recordings}: {type(self).__name__} has none; v2v-eval scores its networks")
+        raise UsageError(f"run.validate = {recordings}: {type(self).__name__} has no such scores")
 
     @torch.no_grad()
     def judge(self, network: VoxelNetwork, batch: Batch, films: int) -> tuple[dict[str, float], list[Image]]:
