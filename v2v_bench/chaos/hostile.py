@@ -6,6 +6,7 @@
     headers    the largest and most costly header that is let in, as fast as it is taken
     hello      says Hello ten times a second, asks for as much as it may, and never reads
     leave      says Hello under a new name and goes, again and again: its sessions stay behind
+    look       asks for the state of the service without a pause, and never reads
     idle       takes connections, half of them in the middle of the handshake, and says nothing
     slow       no enemy: a stream that is allowed and takes long (flow on whole pictures, long clips)
 
@@ -28,7 +29,7 @@ from typing import NoReturn
 
 import zmq
 
-from v2v_protocol.messages import Hello, Want
+from v2v_protocol.messages import Hello, See, Want
 from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
 
@@ -75,6 +76,13 @@ def leave(address: str, number: int) -> None:
         peer.poll(1000)
 
 
+def look(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, number) as peer:
+        while True:
+            peer.send_multipart(encode(See()))
+
+
 def idle(address: str, number: int) -> None:
     """See the module."""
     links = []
@@ -101,7 +109,7 @@ def slow(address: str, number: int) -> None:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (parts, headers, hello, leave, idle, slow)
+    each.__name__: each for each in (parts, headers, hello, leave, look, idle, slow)
 }
 
 
