@@ -90,14 +90,14 @@ class Camera:
         return still_bins[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
-        """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled."""
+        """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled. Paused
+        bins, in which only noise fires, count nothing, and the more of them a grid has the less it is worth."""
         bins = self.voxels.shape[1]
-        activity = self.rates.sum(axis=0).reshape(-1, bins).sum(axis=1)
-        moving = ~self.paused.reshape(-1, bins).any(axis=1)
+        moving = ~self.paused.reshape(-1, bins)
+        activity = (self.rates.sum(axis=0).reshape(-1, bins) * moving).sum(axis=1) * moving.mean(axis=1)
         first = min(round(len(activity) * _SETTLED_SHARE), len(activity) - 1)
         edges = np.linspace(first, len(activity), min(count, len(activity) - first) + 1).round().astype(int)
-        score = np.where(moving, activity, activity - activity.max(initial=0.0) - 1)
-        return [int(start + np.argmax(score[start:end])) for start, end in pairwise(edges)]
+        return [int(start + np.argmax(activity[start:end])) for start, end in pairwise(edges)]
 
     def describe(self) -> str:
         """The draw in one line."""

@@ -18,6 +18,8 @@ BRIGHTER = (202, 0, 32)
 DARKER = (5, 93, 176)
 
 _QUANTILE = 0.98
+_PALEST = 0.35
+"""Share of full colour that the least event has."""
 
 
 def full_colour(counts: Iterable[npt.NDArray[np.generic]]) -> float:
@@ -40,9 +42,12 @@ def draw_events(counts: npt.NDArray[np.generic], full: float) -> Image:
         full: the count that gets full colour, see :func:`full_colour`.
 
     Returns:
-        [H, W, 3] uint8. The square root of the share lifts single events out of the white.
+        [H, W, 3] uint8. Any event stands out from the white, whatever the scale; the square root of the share spreads
+        the small counts.
     """
-    share = np.sqrt(np.clip(np.abs(counts, dtype=np.float32) / full, 0.0, 1.0))[..., None]
+    size = np.abs(counts, dtype=np.float32)
+    root = np.sqrt(np.clip(size / full, 0.0, 1.0))
+    share = np.where(size > 0, _PALEST + (1 - _PALEST) * root, 0)[..., None]
     brighter, darker = np.array(BRIGHTER, np.float32), np.array(DARKER, np.float32)
     colour = np.where((np.asarray(counts) > 0)[..., None], brighter, darker)
     image: Image = np.rint(255.0 + share * (colour - 255.0)).astype(np.uint8)

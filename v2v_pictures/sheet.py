@@ -17,7 +17,7 @@ from v2v_pictures.canvas import Canvas
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
 
 MARGIN_PX, GAP_PX = 28, 8
-_TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 62, 46, 26, 46, 96
+_TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 62, 46, 36, 46, 96
 _STRIP_LABEL_PX = 116
 _LEAST_SOURCE_PX = 120
 _HATCH_PX = 7

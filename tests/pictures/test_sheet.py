@@ -58,6 +58,13 @@ def test_colours_of_known_events(dtype: type[np.generic]) -> None:
     assert np.argmax(DARKER) == 2
 
 
+def test_a_single_event_is_seen_whatever_the_scale() -> None:
+    image = draw_events(np.array([[1, 0, -1]], np.int8), 1000.0).astype(int)
+    assert (image[0, 1] == WHITE).all()
+    assert np.abs(image[0, 0] - WHITE).max() > 80
+    assert np.abs(image[0, 2] - WHITE).max() > 80
+
+
 def test_the_least_count_of_int8_does_not_wrap() -> None:
     """|-128| is no int8: its colour must not turn."""
     counts = np.full((12, 12), -128, np.int8)
@@ -125,6 +132,15 @@ def test_moments_are_active_and_not_paused() -> None:
     assert chosen == [12]
     assert camera(voxels).moments(2) == [7, 12]
     assert camera(voxels[:1]).moments(3) == [0]
+
+
+def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise() -> None:
+    voxels = np.zeros((20, 5, 4, 4), np.int8)
+    voxels[:, :, 0, 0] = 1
+    voxels[9] = 30
+    assert camera(voxels, pauses=((9 * 5 + 1, 3), (15 * 5 + 1, 10))).moments(1) == [9]
+    voxels[12] = 30
+    assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
 
 
 @given(st.integers(1, 30), st.integers(1, 8))
