@@ -48,6 +48,7 @@ BENCHMARKS = {
     "soak": "chaos.soak",
     "fuzz": "fuzz.fuzz",
     "limits": "limits",
+    "catalogue": "catalogue",
     "corpus": "corpus",
 }
 """Module of each benchmark, below this package."""

@@ -19,7 +19,8 @@ from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode
 from v2v_server.broker.leases import Request
-from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.catalogue.videos import VideoEntry
 from v2v_server.schedule.sequences import Sequence
 
 

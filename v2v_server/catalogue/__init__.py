@@ -1,6 +1,8 @@
 """The catalogue: which videos there are, under stable names, and what each of them holds.
 
 catalogue        the snapshot that everything else works from
+videos           its videos, in columns
+columns          very many records side by side
 files            which files a corpus has
 listfile         list files like the paper's
 survey           probing many files in processes of their own

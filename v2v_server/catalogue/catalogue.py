@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_server.catalogue.columns import Records
 from v2v_server.catalogue.files import (
     UNPRINTABLE,
     VIDEO_SUFFIXES,
     Notice,
     corpus_root,
+    is_said,
     printable,
     regular_files,
     video_files,
@@ -27,6 +30,7 @@ from v2v_server.catalogue.manifest import Header, Manifest, PreparedVideo, find_
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
+from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
@@ -39,34 +43,6 @@ _KEPT_LONG_FRAMES = 1 << 22
 _SMALL_INDEX_BYTES = 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
-
-
-@dataclass(frozen=True, slots=True)
-class VideoEntry:
-    """A video that can be used.
-
-    Attributes:
-        id: relative POSIX path; its name for ever.
-        fingerprint: see :mod:`v2v_server.video.fingerprint`.
-        frames: how many frames there are to decode.
-        width_px, height_px: size of the upright picture, before ``rows``.
-        frames_per_second: average rate; NaN where unknown.
-        codec: FFmpeg's name of the format.
-        threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
-        runs: (first frame, frame after the last) of each stretch without a cut and with something to see; None where
-            the catalogue was opened without ``scene``.
-    """
-
-    id: str
-    fingerprint: str
-    frames: int
-    width_px: int
-    height_px: int
-    frames_per_second: float
-    codec: str
-    threshold_pos: float | None = None
-    threshold_neg: float | None = None
-    runs: tuple[tuple[int, int], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -88,14 +64,13 @@ class Catalogue:
 
     root: Path
     rows: Rows
-    videos: tuple[VideoEntry, ...]
+    videos: Videos
     refusals: tuple[Refusal, ...]
     notes: tuple[str, ...]
     digest: str
     prepared: Header | None
     scene_digest: str | None
     _store: Store = field(repr=False, compare=False)
-    _fingerprints: dict[str, str] = field(repr=False, compare=False)
     _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
     _looking: Looking | None = field(repr=False, compare=False)
@@ -224,9 +199,10 @@ class Catalogue:
         self._store.close()
 
     def _fingerprint(self, id: str) -> str:
-        if id not in self._fingerprints:
+        number = self.videos.find(id)
+        if number is None:
             raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
-        return self._fingerprints[id]
+        return self.videos.fingerprint(number)
 
 
 def open_catalogue(
@@ -302,7 +278,7 @@ def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[
     ids = []
     for id in video_files(root, refused):
         ids.append(id)
-        if notice is not None:
+        if notice is not None and is_said(len(ids)):
             notice(f"looking for videos: {len(ids)} so far")
     return tuple(ids)
 
@@ -310,7 +286,7 @@ def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[
 def _snapshot(
     root: Path,
     rows: Rows,
-    records: dict[str, IndexRow],
+    records: Records,
     listed: Sequence[ListEntry],
     refused: dict[str, str],
     notes: list[str],
@@ -318,29 +294,27 @@ def _snapshot(
     manifest: Manifest | None,
     looking: Looking | None,
 ) -> Catalogue:
-    by_id, unlisted = {entry.id: entry for entry in listed}, ListEntry("")
-    problems = dict(refused)
-    used, files = [], {}
-    videos = []
-    shorter = []
+    problems, files = dict(refused), dict[str, str]()
     absent: dict[str, PreparedVideo] = {}
-    for id in sorted(records):
-        record, entry = records[id], by_id.get(id, unlisted)
-        file = record.fingerprint
-        if manifest is not None:
-            files[id] = file
+    on_disk = records
+    if manifest is not None:
+        records = Records()
+        for record in on_disk:
+            files[record.id] = record.fingerprint
             if not manifest.describes(record):
-                absent[id] = manifest.videos[id]
-            record = manifest.as_source(record)
-        elif record.codec == STORE_FORMAT:
-            record = replace(record, problem="is a file of a lossless corpus by itself: serve the whole folder")
-        if record.problem is not None:
-            problems[id] = record.problem
-            continue
-        used.append(record if record.fingerprint == file else replace(record, fingerprint=file))
-        videos.append(_entry(record, entry))
-        if entry.frames is not None and entry.frames > record.frames:
-            shorter.append(f"{id} has {record.frames} frames, not {entry.frames}")
+                absent[record.id] = manifest.videos[record.id]
+            records.append(manifest.as_source(record))
+    elif STORE_FORMAT in records.codecs:
+        why = "is a file of a lossless corpus by itself: serve the whole folder"
+        lossless = np.flatnonzero(records.codec == records.codecs[STORE_FORMAT]).tolist()
+        records.problems.update(dict.fromkeys(lossless, why))
+    problems.update((records.ids[place], problem) for place, problem in records.problems.items())
+    usable = np.ones(len(records), bool)
+    usable[list(records.problems)] = False
+    places = np.flatnonzero(usable)
+    videos = Videos(records, places, {})
+    thresholds, shorter = _listed(listed, videos)
+    videos = Videos(records, places, thresholds)
     if not videos:
         raise CorpusError(f"{root}: none of {len(problems)} videos can be used{_told(problems)}")
     if absent:
@@ -354,33 +328,36 @@ def _snapshot(
             f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
             "them; run it once for all to have them served",
         ]
-    if woven := [record.id for record in used if record.interlaced]:
+    if len(woven := np.flatnonzero(videos.interlaced)):
+        first = videos[int(woven[0])].id
         notes = [
             *notes,
-            f"{len(woven)} videos are interlaced ({woven[0]}): their frames are served as they are stored, two fields "
+            f"{len(woven)} videos are interlaced ({first}): their frames are served as they are stored, two fields "
             "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
             "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
         ]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
-    digest = _digest(rows, videos)
+    digest = videos.digest(rows)
     scene_digest, unseen = None, set(absent)
     if looking is not None:
+        used = (_of_file(records[place], files) for place in places.tolist())
         runs, scene_digest = looking.runs(store, used, unseen, digest)
-        videos = [replace(video, runs=its) for video, its in zip(videos, runs, strict=True)]
+        whole = zip(runs, videos.frames.tolist(), strict=True)
+        cut = {number: its for number, (its, frames) in enumerate(whole) if its != ((0, frames),)}
+        videos = Videos(records, places, thresholds, cut)
         if died := sorted(unseen - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
     return Catalogue(
         root=root,
         rows=rows,
-        videos=tuple(videos),
+        videos=videos,
         refusals=tuple(Refusal(id, None, problems[id], RefusalKind.UNUSABLE) for id in sorted(problems)),
         notes=tuple(notes),
         digest=digest,
         prepared=None if manifest is None else manifest.header,
         scene_digest=scene_digest,
         _store=store,
-        _fingerprints={video.id: video.fingerprint for video in videos},
         _files=files,
         _absent=absent,
         _looking=looking,
@@ -388,29 +365,25 @@ def _snapshot(
     )
 
 
-def _entry(record: IndexRow, entry: ListEntry) -> VideoEntry:
-    return VideoEntry(
-        id=record.id,
-        fingerprint=record.fingerprint,
-        frames=record.frames,
-        width_px=record.width_px,
-        height_px=record.height_px,
-        frames_per_second=float("nan") if record.frames_per_second is None else record.frames_per_second,
-        codec=record.codec,
-        threshold_pos=entry.threshold_pos,
-        threshold_neg=entry.threshold_neg,
-    )
+def _of_file(record: IndexRow, files: Mapping[str, str]) -> IndexRow:
+    """The record under the fingerprint of the file that lies here."""
+    return replace(record, fingerprint=files.get(record.id, record.fingerprint))
 
 
-def _digest(rows: Rows, videos: Sequence[VideoEntry]) -> str:
-    digest = hashlib.sha256(f"v2v catalogue 1\n{rows}\n".encode())
-    for video in videos:
-        fields = (
-            video.id, video.fingerprint, video.frames, video.width_px, video.height_px, video.threshold_pos,
-            video.threshold_neg,
-        )  # fmt: skip
-        digest.update("\0".join(map(str, fields)).encode() + b"\n")
-    return digest.hexdigest()[:32]
+def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:
+    """What a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
+    thresholds: dict[int, Thresholds] = {}
+    shorter = []
+    for entry in sorted({entry.id: entry for entry in listed}.values(), key=lambda entry: entry.id):
+        number = videos.find(entry.id)
+        if number is None:
+            continue
+        if (stated := (entry.threshold_pos, entry.threshold_neg)) != NO_THRESHOLDS:
+            thresholds[number] = stated
+        frames = int(videos.frames[number])
+        if entry.frames is not None and entry.frames > frames:
+            shorter.append(f"{entry.id} has {frames} frames, not {entry.frames}")
+    return thresholds, shorter
 
 
 def _told(problems: dict[str, str]) -> str:

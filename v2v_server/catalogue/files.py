@@ -69,7 +69,7 @@ def _below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused
             continue
         if is_folder:
             yield from _below(folder / entry.name, f"{relative}/", above | {identity}, refused)
-        elif os.path.splitext(entry.name)[1].lower() in VIDEO_SUFFIXES:
+        elif f".{entry.name.rpartition('.')[2].lower()}" in VIDEO_SUFFIXES and "." in entry.name:
             if printable(relative) != relative:
                 refused[printable(relative)] = UNPRINTABLE
             elif not is_file:
@@ -134,6 +134,11 @@ def regular_files(
         else:
             refused[id] = "is no regular file"
     return tuple(found)
+
+
+def is_said(done: int) -> bool:
+    """Whether progress is told after so many: to tell it a million times takes seconds."""
+    return done <= _TOGETHER or done % _TOGETHER == 0
 
 
 def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q, A], None, None]:

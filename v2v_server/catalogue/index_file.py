@@ -9,10 +9,11 @@ alone, it does not matter which of them wrote it.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 SCHEMA_VERSION = 3
 """Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
@@ -58,7 +59,7 @@ class IndexRow:
         frames, width_px, height_px, frames_per_second, codec, interlaced: see
             :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
         problem: why the file cannot be used; None if it can.
-        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and in what :meth:`Store.records` returns.
+        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
     """
 
     id: str
@@ -114,14 +115,14 @@ class Store:
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
-    def records(self) -> dict[str, IndexRow]:
-        """All records by id, without their frame indices.
+    def rows(self) -> Generator[tuple[Any, ...], None, None]:
+        """All records by id, as the attributes of :class:`IndexRow` without their frame indices.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video")) as rows:
-            return {row[0]: IndexRow(*row) for row in rows}
+        with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video ORDER BY id")) as rows:
+            yield from rows
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
         """The encoded frame index of a file; None if the index does not know that state of it.

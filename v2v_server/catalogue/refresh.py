@@ -7,16 +7,19 @@ import hashlib
 import os
 import sqlite3
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
+from itertools import chain, islice, pairwise
+from operator import itemgetter
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.files import Notice, answers
+from v2v_server.catalogue.columns import CHUNK, Records, joined
+from v2v_server.catalogue.files import Notice, answers, is_said
 from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
-from v2v_server.system.process import without_collections
 
 _WRITE_EVERY = 256
 
@@ -58,7 +61,7 @@ def up_to_date(
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, dict[str, IndexRow], list[str]]:
+) -> tuple[Store, Records, list[str]]:
     """An open index that knows every id, its records, and notes for the user.
 
     The index is in memory, with a note, where the file cannot serve.
@@ -89,45 +92,62 @@ def _refreshed(
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, dict[str, IndexRow]]:
+) -> tuple[Store, Records]:
     store = Store(path)
     try:
-        with without_collections():
-            known = store.records()
-        stale = _stale(root, ids, known, notice)
-        store.forget(_gone(root, known.keys() - set(ids), notice))
+        records, states, unasked = _known(store, ids)
+        stale = _stale(root, records.ids, states, notice)
+        store.forget(_gone(root, unasked, notice))
         with closing(survey(root, stale, processes)) as found:
             for batch in _batches(found, len(stale), progress):
                 store.put(batch)
-                known.update((record.id, record) for record in batch)
-        records = {id: known[id] for id in ids}
+                for record in batch:
+                    place = records.ids.find(record.id)
+                    assert place is not None, record.id
+                    records.change(place, record)
+        records.fingerprints.settle()
         if looking is not None:
-            looking.take_in(store, root, records, processes, progress)
+            looking.take_in(store, root, {record.id: record for record in records}, processes, progress)
         return store, records
     except BaseException:
         store.close()
         raise
 
 
-def _stale(root: Path, ids: Sequence[str], known: Mapping[str, IndexRow], notice: Notice | None) -> list[str]:
-    """Those of the ids whose files are new or changed."""
+def _known(store: Store, ids: Sequence[str]) -> tuple[Records, array[int], list[str]]:
+    """What the index has of these ids; (size, mtime, ctime) of each, one after the other; other ids that it has."""
+    ids = sorted(ids)
+    if any(one == next for one, next in pairwise(ids)):  # a list may name a video twice
+        ids = sorted(set(ids))
+    records, states, unasked = Records(), array("q"), list[str]()
+    with closing(store.rows()) as rows:
+        found = joined(ids, rows, unasked)
+        while chunk := list(islice(found, CHUNK)):
+            records.extend(chunk)
+            states.extend(chain.from_iterable(map(itemgetter(1, 2, 3), chunk)))
+    return records, states, unasked
 
-    def is_unchanged(id: str) -> bool:
-        if id not in known:
+
+def _stale(root: Path, ids: Sequence[str], states: array[int], notice: Notice | None) -> list[str]:
+    """Those of the ids whose files are new or changed."""
+    folder = os.path.join(root, "")
+
+    def is_unchanged(place: int) -> bool:
+        size, mtime, ctime = states[3 * place : 3 * place + 3]
+        if size < 0:
             return False
         try:
-            status, record = os.stat(os.path.join(root, id)), known[id]
+            status = os.stat(folder + ids[place])
         except OSError:
             return False
-        seen = record.size_bytes, record.mtime_ns, record.ctime_ns
-        return (status.st_size, status.st_mtime_ns, status.st_ctime_ns) == seen
+        return (status.st_size, status.st_mtime_ns, status.st_ctime_ns) == (size, mtime, ctime)
 
     stale = []
-    for done, (id, unchanged) in enumerate(answers(is_unchanged, ids), 1):
+    for place, unchanged in answers(is_unchanged, range(len(ids))):
         if not unchanged:
-            stale.append(id)
-        if notice is not None:
-            notice(f"looking at files: {done} of {len(ids)}, {len(stale)} of them new or changed")
+            stale.append(ids[place])
+        if notice is not None and is_said(place + 1):
+            notice(f"looking at files: {place + 1} of {len(ids)}, {len(stale)} of them new or changed")
     return stale
 
 

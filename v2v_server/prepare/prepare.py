@@ -22,10 +22,11 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
-from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.manifest import Header, PreparedVideo
 from v2v_server.catalogue.manifest_writer import ManifestWriter
 from v2v_server.catalogue.scene import Scene
+from v2v_server.catalogue.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode

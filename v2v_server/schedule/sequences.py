@@ -20,7 +20,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import VideoEntry
+from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.catalogue.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
@@ -47,21 +48,35 @@ class Columns:
 
     Attributes:
         frames: int64 [N], of each video.
-        size: int32 [N], which of ``first_of_size``.
+        size: int64 [N], which of ``first_of_size``.
         first_of_size: for each size of picture, the first video that has it.
         cut: int64, the videos whose one run is not the whole of them; None where a video's runs are not known.
     """
 
     def __init__(self, videos: Videos) -> None:
-        numbers: dict[tuple[int, int], int] = {}
-        self.frames = np.fromiter((video.frames for video in videos), np.int64, len(videos))
-        sizes = (numbers.setdefault((video.height_px, video.width_px), len(numbers)) for video in videos)
-        self.size = np.fromiter(sizes, np.int32, len(videos))
-        self.first_of_size = tuple(np.unique(self.size, return_index=True)[1].tolist())
-        self.cut: npt.NDArray[np.int64] | None = None
-        if all(video.runs is not None for video in videos):
-            cut = [place for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
-            self.cut = np.array(cut, np.int64)
+        if isinstance(videos, CatalogueVideos):
+            self.frames, sizes, self.cut = videos.frames, _sizes(videos.height_px, videos.width_px), videos.cut
+        else:
+            self.frames, sizes, self.cut = _columns(videos)
+        _, first, self.size = np.unique(sizes, return_index=True, return_inverse=True)
+        self.first_of_size = tuple(first.tolist())
+
+
+def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+    """A number for each size of picture."""
+    return height_px.astype(np.int64) << 32 | width_px
+
+
+def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64] | None]:
+    """Frames, sizes, and which have cuts."""
+    frames, heights, widths = (
+        np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
+    )
+    sizes = _sizes(heights, widths)
+    if any(video.runs is None for video in videos):
+        return frames, sizes, None
+    cut = [place for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
+    return frames, sizes, np.array(cut, np.int64)
 
 
 class SequenceTable:

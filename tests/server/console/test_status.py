@@ -12,7 +12,8 @@ from tests.server.peers import peers
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.counters import Counters
-from v2v_server.catalogue.catalogue import Catalogue, VideoEntry
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.catalogue.videos import VideoEntry
 from v2v_server.console.state import CacheState, ServiceState
 from v2v_server.console.status import StatusLine, summary
 from v2v_server.console.status_log import StatusLog
