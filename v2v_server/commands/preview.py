@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
     out.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
     out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
-    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help=f"of {', '.join(ARRAYS)} (default {','.join(DEFAULT_ARRAYS)})",
     )  # fmt: skip
     add_spec(parser)
-    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted before all was written")
 
 
 def _run(arguments: argparse.Namespace) -> None:

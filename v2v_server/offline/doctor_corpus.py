@@ -9,12 +9,10 @@ from collections.abc import Iterator
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import recipe_setting
-from v2v_server.console.progress import catalogue_progress
-from v2v_server.offline.remake import Remaker
+from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
 Line = tuple[str, str, str, str]
@@ -33,13 +31,9 @@ def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, s
         UsageError: the recipe or the rows say nothing.
     """
     spec = StreamSpec.from_dict({"recipe": recipe_setting(recipe, [])})
-    bounds = Rows.parse(rows)
+    Rows.parse(rows)  # before any work
     try:
-        with catalogue_progress() as progress:
-            catalogue = open_catalogue(
-                videos, rows=bounds, cache_dir=cache_dir, processes=usable_cores(),
-                progress=progress, notice=progress.notice,
-            )  # fmt: skip
+        catalogue = open_shown(videos, list_file=None, rows=rows, cache_dir=cache_dir)
     except CorpusError as error:
         yield "bad", "corpus", str(error), "give a folder, a video or a list file that this user can read"
         return

@@ -6,6 +6,7 @@ trainer gets. A video too short or too small for the recipe is shown with shorte
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,12 @@ from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.remake import remake
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.offline.remake import open_shown, remake
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.rows import Rows
 
 KINDS = (".png", ".mp4", ".gif", ".html")
+_TOLD_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
 
@@ -79,9 +80,16 @@ def preview(
         raise UsageError(f"--out {out}: give a name that ends in {', '.join(KINDS)}")
     if not out.parent.is_dir():  # before any work
         raise UsageError(f"--out {out}: there is no folder {out.parent}")
-    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
+    cameras: list[Camera] = []
+    began = told = time.monotonic()
     try:
-        cameras = [_camera(catalogue, look, spec, with_flow, say) for look in looks]
+        for look in looks:
+            cameras.append(_camera(catalogue, look, spec, with_flow, say))
+            now, left = time.monotonic(), len(looks) - len(cameras)
+            if left and now - told > _TOLD_SECONDS:
+                told, each = now, (now - began) / len(cameras)
+                say(f"{len(cameras)} of {len(looks)} cameras, {1 / each:.1f} a second, {left * each:.0f} s left")
     finally:
         catalogue.close()
     write(out, _content(out.suffix, cameras, title, moments))

@@ -22,9 +22,11 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.console.progress import catalogue_progress
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 
@@ -102,6 +104,17 @@ class Remaker:
         raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: {refusals}")
 
 
+def open_shown(
+    source: str, *, list_file: str | None, rows: str, cache_dir: str | None, scene: bool = False
+) -> Catalogue:
+    """:func:`open_catalogue` for somebody who waits: on all cores, and how far it is on stderr."""
+    with catalogue_progress() as progress:
+        return open_catalogue(
+            source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir,
+            processes=usable_cores(), progress=progress, notice=progress.notice,
+        )  # fmt: skip
+
+
 def open_remaker(
     source: str,
     *,
@@ -113,7 +126,7 @@ def open_remaker(
 ) -> Remaker:
     """From what a user names; errors as of :func:`open_catalogue` and :class:`Remaker`."""
     scene = spec.scene != "off"
-    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     return Remaker(catalogue, spec, arrays)
 
 
@@ -178,7 +191,7 @@ def simulate_to_file(
         if "voxels" not in arrays:
             raise UsageError("--events needs the array voxels")
     scene = stream.scene != "off"
-    catalogue = open_catalogue(source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
     quarantine.verdicts(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
