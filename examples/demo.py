@@ -1,4 +1,5 @@
-"""`make demo`: real clips through a server into a dataset, batches a second and a picture; then a minute of training.
+"""`make demo`: what a network trained on such a stream sees; then real clips through a server
+into a dataset, batches a second and a picture, and a minute of training.
 
 python -m examples.demo --videos DIR --picture out/demo.png
 """
@@ -13,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+from examples.demo_reconstruction import reconstruct
 from examples.demo_training import judge
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -25,6 +27,8 @@ _WARMUP_BATCHES = 2
 _SHOWN = 4
 _VOXELS_PER_CLIP = 10
 _CONFIGURATION = "tiny-cpu"
+_HELD_OUT = "bikes.mp4"
+"""No clip that the shipped network was trained on."""
 
 
 def main() -> int:
@@ -42,6 +46,7 @@ def main() -> int:
     picture.parent.mkdir(parents=True, exist_ok=True)
 
     os.environ.pop("V2V_KEYS", None)  # a key for servers elsewhere; this one asks for none
+    reconstruct(Path(arguments.videos) / _HELD_OUT, picture.with_name("reconstruction.png"))
     with LocalServer(arguments.videos, workers=arguments.workers) as server:
         _stream(server.address, arguments.seconds, arguments.workers, picture)
         run = picture.parent / "training"

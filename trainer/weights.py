@@ -19,6 +19,9 @@ from trainer.models import NETWORKS, VoxelNetwork
 from trainer.unpickle import Placeholder, read_torch_file
 from v2v_protocol.errors import UsageError
 
+SHIPPED = Path(__file__).parent / "shipped" / "firenet.pt"
+"""FireNet as ``firenet-cpu`` trained it, on the stream alone; docs/model-card.md says on what, and what it is worth."""
+
 Plain = str | int | float | bool | None
 
 

@@ -27,7 +27,7 @@ from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
-from trainer.weights import load_network
+from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
@@ -43,11 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> Parser:
     parser = Parser(
-        "v2v-eval", "[CONFIG] --weights FILE --data DIR [flags]",
+        "v2v-eval", "[CONFIG] [--weights FILE] --data DIR [flags]",
         "Reconstruct recordings of event cameras, or find the flow in them, and score that.",
         [
             "v2v-eval paper-discrete --weights runs/e2vid/last.pt --data recordings/",
-            "v2v-eval --weights runs/e2vid/last.pt --data own.h5 --out pictures/ --video",
+            "v2v-eval --data own.h5 --out pictures/ --video",
         ],
     )  # fmt: skip
     what, how, out = parser.group("What"), parser.group("How"), parser.group("Output")
@@ -55,7 +55,10 @@ def _parser() -> Parser:
         "config", nargs="?", metavar="CONFIG",
         help=f"YAML file, or one of {', '.join(sorted(shipped()))}; without it, all recordings of --data",
     )  # fmt: skip
-    what.add_argument("--weights", required=True, metavar="FILE", help="of the network; nothing in it is executed")
+    what.add_argument(
+        "--weights", default=str(SHIPPED), metavar="FILE",
+        help="of the network, nothing in it is executed; default: a FireNet of ours (docs/model-card.md)",
+    )  # fmt: skip
     what.add_argument(
         "--data", required=True, metavar="DIR",
         help="with CONFIG: the folder with one folder a data set; without: a folder of .h5 files, or one of them",

@@ -63,6 +63,13 @@ def test_scores_of_a_converted_bag_equal_those_computed_by_hand(tmp_path: Path, 
     assert (mean["sequence"], mean["mse"], mean["voxels"]) == (None, sequence["mse"], "discrete")
 
 
+def test_without_weights_the_shipped_network_is_taken(tmp_path: Path) -> None:
+    out = tmp_path / "records.json"
+    assert cli.main(["--data", str(random_recording(tmp_path / "a.h5")), "--json", str(out)]) == 0
+    sequence, _ = json.loads(out.read_text())
+    assert (sequence["model"], Path(sequence["weights"]).name) == ("firenet", "firenet.pt")
+
+
 def test_scores_of_every_window_are_written(tmp_path: Path, weights: Path) -> None:
     data = random_recording(tmp_path / "a.h5")
     file = tmp_path / "frames.csv"

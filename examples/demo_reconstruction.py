@@ -1,0 +1,44 @@
+"""What the network that comes with this project makes of a clip that it was not trained on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from trainer.pictures import Video, contact_sheet, draw_events, draw_grey, side_by_side, write_png
+from trainer.weights import SHIPPED, load_network
+from v2v_client import V2VDataset
+
+_RECIPE = {
+    "preset": "noise-free",
+    "threshold": 0.2,
+    "voxels_per_clip": 30,
+    "crop_height_px": 192,
+    "crop_width_px": 256,
+    "pause_probability": 0.0,
+    "flip_probability": 0.0,
+}
+_ROWS = 4
+_FILM_HZ = 10.0
+
+
+def reconstruct(clip: Path, picture: Path) -> None:
+    """Draws events, camera and reconstruction side by side.
+
+    Args:
+        clip: a virtual camera makes its events.
+        picture: PNG of a few moments; the film of all of them comes beside it, as MP4.
+    """
+    network, _ = load_network(SHIPPED)
+    sample = V2VDataset(clip, recipe=_RECIPE)[0].arrays
+    with torch.inference_mode():
+        seen = network.forward_sequence(torch.from_numpy(sample["voxels"])[None].float())[0, :, 0].clamp(0, 1).numpy()
+    target = sample["frames"][:, 0].astype(np.float32) / 255.0
+    film = side_by_side([draw_events(sample["voxels"]), draw_grey(target), draw_grey(seen)])
+    write_png(picture, contact_sheet(film, _ROWS))
+    with Video(picture.with_suffix(".mp4"), _FILM_HZ) as video:
+        for image in film:
+            video.add(image)
+    print(f"picture: {picture} (events, camera, what the shipped network made of the events; time runs down)")

@@ -1,0 +1,46 @@
+"""Weights that are given to others: from a checkpoint, and those that come with the project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from trainer.models import FireNet
+from trainer.run.checkpoint import Checkpoint, save_checkpoint
+from trainer.run.export import main
+from trainer.weights import SHIPPED, load_network
+
+
+def network(seed: int) -> FireNet:
+    torch.manual_seed(seed)
+    return FireNet(base_channels=4)
+
+
+@pytest.mark.parametrize("is_averaged", [True, False])
+def test_the_averaged_weights_are_exported_where_there_are_any(
+    tmp_path: Path, is_averaged: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, average = network(0).state_dict(), network(1).state_dict()
+    config = {"network": {"name": "firenet", "options": {"base_channels": 4}, "weights": ""}}
+    save_checkpoint(tmp_path / "last.pt", Checkpoint(7, 0, model, {}, average if is_averaged else None, None, config))
+    assert main([str(tmp_path / "last.pt"), str(tmp_path / "firenet.pt")]) == 0
+    assert "trained for 7 steps" in capsys.readouterr().out
+    found, name = load_network(tmp_path / "firenet.pt")
+    assert name == "firenet"
+    for key, tensor in found.state_dict().items():
+        assert torch.equal(tensor, (average if is_averaged else model)[key])
+
+
+def test_what_is_no_checkpoint_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(SHIPPED), str(tmp_path / "firenet.pt")]) == 2
+    assert "is no checkpoint of a training run" in capsys.readouterr().err
+    assert not (tmp_path / "firenet.pt").exists()
+
+
+def test_the_shipped_network_loads_and_is_small() -> None:
+    found, name = load_network(SHIPPED)
+    assert (name, found.bins) == ("firenet", 5)
+    assert SHIPPED.stat().st_size < 1_000_000
+    assert all(bool(tensor.isfinite().all()) for tensor in found.state_dict().values())
