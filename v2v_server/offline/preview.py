@@ -82,13 +82,15 @@ def preview(
         raise UsageError(f"--out {out}: there is no folder {out.parent}")
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
-    began = told = time.monotonic()
+    began = told = 0.0
     try:
         for look in looks:
             cameras.append(_camera(catalogue, look, spec, with_flow, say))
             now, left = time.monotonic(), len(looks) - len(cameras)
-            if left and now - told > _TOLD_SECONDS:
-                told, each = now, (now - began) / len(cameras)
+            if len(cameras) == 1:  # it may have waited for kernels to be compiled, and says nothing of the others
+                began = told = now
+            elif left and now - told > _TOLD_SECONDS:
+                told, each = now, (now - began) / (len(cameras) - 1)
                 say(f"{len(cameras)} of {len(looks)} cameras, {1 / each:.1f} a second, {left * each:.0f} s left")
     finally:
         catalogue.close()

@@ -122,9 +122,9 @@ def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
 def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v2v_server.offline.preview._TOLD_SECONDS", 0.0)
     said: list[str] = []
-    shots = [Shot(str(seed), TINY, seed) for seed in range(3)]
+    shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
     preview(
         str(clip), tmp_path / "p.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False, say=said.append
     )
-    assert [line.split(" cameras")[0] for line in said] == ["1 of 3", "2 of 3", f"{tmp_path / 'p.png'}: 3"]
+    assert [line.split(" cameras")[0] for line in said] == ["2 of 4", "3 of 4", f"{tmp_path / 'p.png'}: 4"]
     assert all("a second" in line and "s left" in line for line in said[:2])
