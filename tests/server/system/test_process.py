@@ -149,3 +149,12 @@ def test_who_was_put_to_run_when_nobody_else_does_keeps_to_that() -> None:
 def test_a_machine_whose_calls_are_not_known_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "riscv64")
     assert not process.take_long_turns()
+
+
+def test_what_cataloguing_frees_is_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a million videos it would be a third of what a server then has."""
+    told: list[str] = []
+    monkeypatch.setattr("v2v_server.serve.open_catalogue", lambda *_, **__: told.append("catalogued"))
+    monkeypatch.setattr("v2v_server.serve.give_back_freed_memory", lambda: told.append("handed back"))
+    load_catalogue(ServeConfig(videos="videos"))
+    assert told == ["catalogued", "handed back"]
