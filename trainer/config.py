@@ -110,7 +110,7 @@ class ComputeConfig:
     Attributes:
         device: "auto" takes a GPU if there is one.
         precision: "float32" is IEEE's also on a GPU; "tf32" allows its shorter products; "bfloat16" runs convolutions
-            under autocast, while weights, losses and pictures stay float32.
+            under autocast, while weights, sums of gradients, losses and pictures stay float32.
         pieces: a batch is computed in so many pieces whose gradients are added up: less memory, the same step.
         channels_last: memory format of the network.
         compile: through ``torch.compile``.

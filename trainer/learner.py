@@ -17,6 +17,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from trainer.config import OptimizerConfig, RunConfig, TrainConfig, setting_of
 from trainer.models import NETWORKS, VoxelNetwork
+from trainer.precision import bfloat16_products
 from trainer.run.checkpoint import Checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import TASKS, Task
@@ -72,7 +73,7 @@ class Learner:
         self.optimizer.zero_grad()
         for number, piece in enumerate(pieces, start=1):
             with self._exchanging(number == len(pieces)):
-                with torch.autocast(self.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+                with bfloat16_products(self.device, enabled=config.precision == "bfloat16", share=not config.compile):
                     prediction, _ = self.model(piece.voxels, None, piece.guide)
                     found = self.task.losses(prediction, piece)
                 (found["total"] / len(pieces)).backward()  # type: ignore[no-untyped-call]

@@ -1,0 +1,88 @@
+"""bfloat16: weights are cast once, gradients of many uses are added up in float32."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from trainer.models import NETWORKS
+from trainer.precision import bfloat16_products
+
+CPU = torch.device("cpu")
+USES = 600  # adding 1 to 256 gives 256 in bfloat16
+
+
+class Casts(TorchDispatchMode):
+    """Counts casts from float32 to bfloat16 by the shape of what is cast."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shapes: Counter[tuple[int, ...]] = Counter()
+
+    def __torch_dispatch__(self, function: Any, _types: Any, arguments: Any = (), named: Any = None) -> Any:
+        if function is torch.ops.aten._to_copy.default and (named or {}).get("dtype") == torch.bfloat16:
+            self.shapes[tuple(arguments[0].shape)] += 1
+        return function(*arguments, **(named or {}))
+
+
+def used_often(share: bool, *, view: bool) -> tuple[Tensor, int]:
+    """The gradient of a weight that is used again and again, and how often it was cast."""
+    weight = nn.Parameter(torch.ones(1, 3))
+    with Casts() as casts, bfloat16_products(CPU, enabled=True, share=share):
+        used = weight[:, 1:] if view else weight
+        ones = torch.ones(1, used.shape[1])
+        total = torch.stack([F.linear(ones, used).float() for _ in range(USES)]).sum()
+    total.backward()  # type: ignore[no-untyped-call]
+    assert weight.grad is not None
+    return weight.grad, casts.shapes[tuple(used.shape)] - (0 if used.shape != ones.shape else USES)
+
+
+@pytest.mark.parametrize("view", [False, True])
+@pytest.mark.parametrize(("share", "most"), [(True, 1), (False, USES)])
+def test_gradients_are_added_up_in_float32(share: bool, most: int, view: bool) -> None:
+    gradient, casts = used_often(share, view=view)
+    assert gradient.dtype == torch.float32
+    assert gradient[0, -1] == USES
+    assert casts == most
+
+
+def test_autocast_by_itself_adds_up_in_bfloat16() -> None:
+    weight = nn.Parameter(torch.ones(1, 2))
+    with torch.autocast("cpu", torch.bfloat16):
+        total = torch.stack([F.linear(torch.ones(1, 2), weight).float() for _ in range(USES)]).sum()
+    total.backward()  # type: ignore[no-untyped-call]
+    assert weight.grad is not None
+    assert weight.grad[0, 0] < USES
+
+
+def test_switched_off_changes_nothing() -> None:
+    layer = nn.Linear(3, 3)
+    x = torch.rand(2, 3)
+    with bfloat16_products(CPU, enabled=False):
+        assert torch.equal(layer(x), F.linear(x, layer.weight, layer.bias))
+
+
+def test_parts_outside_autocast_keep_their_weights() -> None:
+    layer = nn.Conv2d(1, 1, 1)
+    with bfloat16_products(CPU, enabled=True), torch.autocast("cpu", enabled=False):
+        assert layer(torch.rand(1, 1, 4, 4)).dtype == torch.float32
+
+
+@pytest.mark.parametrize(("name", "options"), [("firenet", {}), ("hypere2vid", {"base_channels": 4})])
+def test_a_longer_pass_of_a_network_casts_no_weight_more_often(name: str, options: dict[str, Any]) -> None:
+    network = NETWORKS[name](bins=5, **options)
+
+    def casts_of_weights(steps: int) -> int:
+        voxels = torch.ones(1, steps, 5, 16, 16, dtype=torch.int8)
+        with Casts() as casts, bfloat16_products(CPU, enabled=True):
+            network(voxels)[0].sum().backward()
+        return sum(count for shape, count in casts.shapes.items() if shape[-2:] == (3, 3))
+
+    assert casts_of_weights(5) == casts_of_weights(3) > 4
+    assert all(weight.grad.dtype == torch.float32 for weight in network.parameters() if weight.grad is not None)
