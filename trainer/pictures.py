@@ -1,7 +1,6 @@
-"""Drawing: events, grey pictures and flow as colour images, side by side, as PNG and as video. Images are RGB.
+"""Films of events, grey pictures and flow side by side, as PNG and as video. Images are RGB.
 
-Events are drawn as the sum over the bins of a voxel grid: red for more ON, blue for more OFF, white for none. Flow has
-the colour of its direction, the stronger the longer; white is none.
+Events are drawn as the sum over the bins of a voxel grid, all in the colours of :mod:`v2v_pictures.colours`.
 """
 
 from __future__ import annotations
@@ -13,12 +12,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from v2v_pictures import colours, files
 from v2v_protocol.errors import UsageError
 
-ON = (214, 40, 40)
-OFF = (30, 96, 200)
 GAP_PX = 4
 SMALLEST_TILE_PX = 128
+LEAST_COUNT = 1e-3
+"""Less is what rounding leaves of interpolated events that cancel."""
 FULL_COLOUR_QUANTILE = 0.98
 CODEC = "vp09"
 """VP9: the one codec of OpenCV's wheels that browsers show too."""
@@ -27,20 +27,15 @@ Image = npt.NDArray[np.uint8]
 
 
 def draw_events(voxels: npt.NDArray[np.generic]) -> Image:
-    """[..., bins, H, W] signed counts -> [..., H, W, 3]; full colour from the 98th percentile on."""
+    """[..., bins, H, W] signed counts -> [..., H, W, 3], in one scale."""
     counts = voxels.astype(np.float32).sum(axis=-3)
-    strength = np.abs(counts)
-    strongest = np.quantile(strength[strength > 0], FULL_COLOUR_QUANTILE) if strength.any() else 1.0
-    share = np.sqrt(np.clip(strength / strongest, 0, 1))[..., None]  # the root lifts single events out of the white
-    colour = np.where((counts > 0)[..., None], np.array(ON, np.float32), np.array(OFF, np.float32))
-    drawn: Image = np.rint(255 + share * (colour - 255)).astype(np.uint8)
-    return drawn
+    counts[np.abs(counts) < LEAST_COUNT] = 0
+    return colours.draw_events(counts, colours.full_colour([counts]))
 
 
 def draw_grey(pictures: npt.NDArray[np.floating]) -> Image:
     """[..., H, W] in 0 .. 1 (clipped) -> [..., H, W, 3]."""
-    grey = np.rint(np.clip(pictures, 0, 1) * 255).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
+    return colours.draw_grey(pictures)
 
 
 def flow_scale(flow: npt.NDArray[np.floating]) -> float:
@@ -49,13 +44,10 @@ def flow_scale(flow: npt.NDArray[np.floating]) -> float:
 
 
 def draw_flow(flow: npt.NDArray[np.floating], scale: float) -> Image:
-    """[..., 2, H, W] (x, y) px -> [..., H, W, 3]; full colour from ``scale`` on."""
-    x, y = flow[..., 0, :, :], flow[..., 1, :, :]
-    # Three cosines a third of a turn apart: red points right, green down and to the left, blue up and to the left.
-    turns = np.arctan2(y, x)[..., None] - np.array([0.0, 2.0, 4.0]) * np.pi / 3
-    share = np.clip(np.hypot(x, y) / scale, 0, 1)[..., None]
-    drawn: Image = np.rint(255 * (1 - share * (0.5 - 0.5 * np.cos(turns)))).astype(np.uint8)
-    return drawn
+    """[..., 2, H, W] (x, y) px -> [..., H, W, 3]; full colour at ``scale``, darker beyond it."""
+    fields = flow.reshape(-1, *flow.shape[-3:])
+    drawn = np.stack([colours.draw_flow(field, scale) for field in fields])
+    return drawn.reshape(*flow.shape[:-3], *drawn.shape[1:])
 
 
 def side_by_side(panels: Sequence[Image]) -> Image:
@@ -73,18 +65,16 @@ def contact_sheet(film: Image, steps: int = 5) -> Image:
 
 
 def write_png(path: Path, image: Image) -> None:
-    """
+    """As PNG; folders are made.
+
     Raises:
         UsageError: the folder cannot be written to.
     """
-    encoded, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not encoded:
-        raise UsageError(f"{path}: a picture of shape {list(image.shape)} cannot be encoded as PNG")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data.tobytes())
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from error
+    files.write_png(path, image)
 
 
 class Video:

@@ -10,8 +10,6 @@ import pytest
 
 from trainer.pictures import (
     GAP_PX,
-    OFF,
-    ON,
     Video,
     contact_sheet,
     draw_events,
@@ -21,6 +19,7 @@ from trainer.pictures import (
     side_by_side,
     write_png,
 )
+from v2v_pictures.colours import BRIGHTER, DARKER
 from v2v_protocol.errors import UsageError
 
 
@@ -31,11 +30,17 @@ def test_events_are_red_blue_and_white() -> None:
     voxels[0, :, 1, 1] = (2, -2)  # cancels
     drawn = draw_events(voxels)
     assert drawn.shape == (1, 2, 3, 3)
-    assert tuple(drawn[0, 0, 0]) == ON
-    assert tuple(drawn[0, 1, 2]) == OFF
+    assert tuple(drawn[0, 0, 0]) == BRIGHTER
+    assert tuple(drawn[0, 1, 2]) == DARKER
     assert (drawn[0, 0, 1:] == 255).all()
     assert (drawn[0, 1, 1] == 255).all()
     assert (draw_events(np.zeros((1, 2, 2, 3), np.int8)) == 255).all()
+
+
+def test_what_rounding_leaves_of_events_that_cancel_is_white() -> None:
+    voxels = np.array([0.3, 0.4, -0.7], np.float32).reshape(3, 1, 1)
+    assert voxels.sum(axis=-3) != 0
+    assert (draw_events(voxels) == 255).all()
 
 
 def test_grey_is_rounded_and_clipped() -> None:
@@ -47,7 +52,8 @@ def test_flow_is_white_at_rest_and_red_to_the_right() -> None:
     flow = np.zeros((2, 1, 3))
     flow[:, 0, 1], flow[:, 0, 2] = (4, 0), (40, 0)
     drawn = draw_flow(flow, scale=4)
-    assert drawn[0].tolist() == [[255, 255, 255], [255, 64, 64], [255, 64, 64]]
+    assert drawn[0].tolist() == [[255, 255, 255], [255, 0, 0], [191, 0, 0]]
+    assert (draw_flow(np.stack([flow, flow]), scale=4) == drawn).all()
     assert flow_scale(flow) > 4
     assert flow_scale(np.zeros((2, 3, 3))) > 0
 
