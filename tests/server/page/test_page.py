@@ -21,6 +21,7 @@ from v2v_client.local_server import LocalServer
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.alone,  # it is asked how soon things are seen
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here"),
 ]
 
