@@ -1,5 +1,6 @@
 """A folder of files that strangers made, served for real: everything is refused or replaced with a reason, the workers
-stay within bounds, and nothing outside the folder is opened."""
+stay within bounds, and nothing outside the folder is opened by its own name. (A link in the folder is followed, as
+SECURITY.md says: the trace shows it under the name that it has there.)"""
 
 from __future__ import annotations
 
