@@ -10,7 +10,7 @@ CLIPS := .demo/videos
 .PHONY: help demo test test-slow test-old-numpy check docs format clean
 
 help:
-	@echo "make demo            stream real clips through a server into a dataset, train on them; leaves out/*.png"
+	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
 	@echo "make test            the fast tests (under five minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
 	@echo "make test-old-numpy  golden bytes of samples under an older numpy"

@@ -6,6 +6,7 @@ status_log the same as a line that programs read
 farewell   what is said at the end
 progress   how far the catalogue is
 state      the one model of the service, which terminal, page and metrics read
+survey     makes it from the server's parts
 history    totals of the last ten seconds, from which rates and shares follow
 waiting    who waits for whom, in one sentence
 watch      makes the state when somebody looks, and answers

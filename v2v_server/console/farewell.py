@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from v2v_server.console.state import ServiceState, Totals
+from v2v_server.store.cache import GIB
 
-GIB = 1 << 30
 _FAULTS = {
     "refused_candidates": "candidates refused",
     "unavailable": "samples unavailable",
@@ -25,15 +25,15 @@ def farewell(state: ServiceState) -> list[str]:
     clips = f", from {totals.decodes} decoded clips" if totals.decodes < totals.samples else ""
     lines = [
         f"in all {totals.samples} samples ({totals.batches:.1f} batches, {totals.bytes / GIB:.2f} GiB{clips}) in "
-        f"{_span(seconds)}: {rate:.2f} samples/s",
+        f"{span(seconds)}: {rate:.2f} samples/s",
         f"faults {totals.faults}{_faults(totals)}",
     ]
     busy = totals.decode_seconds + totals.simulate_seconds + totals.handover_seconds
     if busy > 0.0:
         lines.append(
-            f"workers spent {_span(busy)} on them: decoding {totals.decode_seconds / busy:.0%}, simulating "
+            f"workers spent {span(busy)} on them: decoding {totals.decode_seconds / busy:.0%}, simulating "
             f"{totals.simulate_seconds / busy:.0%}, handing over {totals.handover_seconds / busy:.0%}; consumers "
-            f"waited {_span(totals.waited_seconds)}"
+            f"waited {span(totals.waited_seconds)}"
         )
     return lines
 
@@ -43,7 +43,8 @@ def _faults(totals: Totals) -> str:
     return f": {', '.join(named)}" if named else ""
 
 
-def _span(seconds: float) -> str:
+def span(seconds: float) -> str:
+    """A time as people read it."""
     if seconds < 120.0:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60.0)

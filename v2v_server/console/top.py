@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from v2v_server.catalogue.files import printable
+from v2v_server.console.farewell import span
 
 _MOST_ROWS = 30
 _COLOURS = {
@@ -97,7 +98,7 @@ def consumers_table(count: int, consumers: Sequence[Mapping[str, Any]]) -> Table
             str(each["epoch"]),
             ProgressBar(total=1.0, completed=share, width=20),
             f"{each['position']}/{each['sequences']}",
-            "" if each["eta_seconds"] is None else _duration(each["eta_seconds"]),
+            "" if each["eta_seconds"] is None else span(each["eta_seconds"]),
             f"{each['batches_per_second']:.2f}",
             f"{each['waiting_share']:.0%}",
             f"{each['in_flight']}+{each['waiting']}",
@@ -143,13 +144,3 @@ def _text(value: str, style: str = "") -> Text:
 
 def _plain(value: int | None) -> str:
     return "" if value is None else str(value)
-
-
-def _duration(seconds: float) -> str:
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 120
-        else f"{seconds / 60:.0f} min"
-        if seconds < 7200
-        else f"{seconds / 3600:.1f} h"
-    )

@@ -18,7 +18,8 @@ from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import Show, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
 from v2v_server.broker.quarantine import Verdict
-from v2v_server.console.state import MOST_SHOWN, STATE_VERSION
+from v2v_server.console.state import STATE_VERSION
+from v2v_server.console.survey import MOST_SHOWN
 from v2v_server.console.watch import ANSWER_SECONDS, MOST_LOOKERS
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -186,13 +185,3 @@ def consumer_state(number: int) -> dict[str, Any]:
         "batches_per_second": 1.0,
         "waiting_share": 0.5,
     }
-
-
-def test_a_browser_that_stops_reading_stops_nobody(served: LocalServer, port: int) -> None:
-    with Consumer(served.address) as consumer, socket.create_connection(("127.0.0.1", port)) as stalled:
-        stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
-        stalled.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        for _ in range(3):
-            told, had = states(port)["time"], consumer.batches
-            until(lambda told=told: states(port)["time"] > told)  # type: ignore[misc]
-            until(lambda had=had: consumer.batches > had)  # type: ignore[misc]
