@@ -48,6 +48,7 @@ class Hello:
         stride: samples from the beginning of one batch of this consumer to that of its next: batch size x ranks x
             loader workers. It settles a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
         name, host: what people shall read of this consumer, "rank 0 of 2" on "gpu-1" for instance.
+        packed: whether it asks for compressed arrays, because a network lies between. It must take both.
     """
 
     spec: Mapping[str, Any]
@@ -58,6 +59,7 @@ class Hello:
     stride: int = 0
     name: str = ""
     host: str = ""
+    packed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +147,7 @@ class SampleHeader:
         cache: "hit" or "miss" where its worker has a cache, "miss: " and a reason where that can keep no more; else "".
         slot: the slot that the lease named, to which this worker writes no more; 0: it named none.
         quarantine: number of the quarantine snapshot that the lease named, as the provenance says it.
+        packed: the raw frames are zstd frames, one for each array.
     """
 
     epoch: int
@@ -159,6 +162,7 @@ class SampleHeader:
     cache: str = ""
     slot: int = 0
     quarantine: int = 0
+    packed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,6 +289,7 @@ class Lease:
         quarantine: number of the quarantine snapshot that let the candidate pass.
         scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.
         arena, slot: where the sample may be put, see :mod:`v2v_protocol.arena`; "" and 0: in the message only.
+        packed: whether arrays that go into the message are to be compressed.
     """
 
     lease: int
@@ -310,6 +315,7 @@ class Lease:
     scene: bytes = b""
     arena: str = ""
     slot: int = 0
+    packed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

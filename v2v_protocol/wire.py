@@ -112,12 +112,14 @@ def encode_sample(
     slot: int = NO_SLOT,
     in_slot: bool = False,
     quarantine: int = 0,
+    pack: Callable[[Buffer], bytes] | None = None,
 ) -> Frames:
-    """A whole SampleHeader message. The arrays are not copied: leave them alone until they are sent.
+    """A whole SampleHeader message. The arrays are not copied (but by ``pack``): leave them alone until they are sent.
 
     Args:
         slot: the slot that the lease named.
         in_slot: the arrays lie there, so the header goes alone.
+        pack: compresses an array's bytes into a zstd frame that states its size; None sends them as they are.
         epoch, index, arrays, provenance, worker, cpu_seconds, decoded, cache, quarantine: see :class:`SampleHeader`.
 
     Raises:
@@ -141,10 +143,12 @@ def encode_sample(
         cache=cache,
         slot=slot,
         quarantine=quarantine,
+        packed=pack is not None and not in_slot,
     )
     if in_slot:
         return encode(header)
-    return [*encode(header), *(array.reshape(-1).view(np.uint8).data for array in arrays.values())]
+    raw = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
+    return [*encode(header), *(raw if pack is None else map(pack, raw))]
 
 
 def encode_map(fields: Mapping[str, Any]) -> bytes:
@@ -202,8 +206,15 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     return message
 
 
-def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, npt.NDArray[Any]]:
+def decode_sample(
+    header: SampleHeader, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
+) -> dict[str, npt.NDArray[Any]]:
     """The arrays behind a SampleHeader, as read-only views of the payload (no copy).
+
+    Args:
+        header, payload: of the sample.
+        unpack: of a packed array's frame and its number of bytes makes these bytes; it raises ProtocolError where the
+            frame holds anything else. None: packed samples are refused.
 
     Raises:
         ProtocolError, LimitExceeded: names, dtypes, shapes and frame lengths do not agree, or break a limit.
@@ -212,9 +223,13 @@ def decode_sample(header: SampleHeader, payload: Sequence[Buffer]) -> dict[str, 
         raise ProtocolError(
             f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
         )
+    if header.packed and unpack is None:
+        raise ProtocolError("sample: its arrays are compressed, which was not asked for")
     arrays: dict[str, npt.NDArray[Any]] = {}
     for (name, (dtype, shape)), raw in zip(layout_of(header).items(), payload, strict=True):
         size = math.prod(shape) * np.dtype(dtype).itemsize
+        if header.packed and unpack is not None:
+            raw = unpack(raw, size)
         if size != len(raw):
             raise ProtocolError(f"sample: array {name!r:.40} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
         array = np.frombuffer(raw, dtype=np.dtype(dtype)).reshape(shape)

@@ -3,7 +3,6 @@ wins). Every message names the flag."""
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
@@ -110,7 +110,7 @@ class ServeConfig:
         Rows.parse(self.rows)
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
-        if self.page and not self.insecure and not _is_loopback(self.page_host):
+        if self.page and not self.insecure and not is_loopback(self.page_host):
             raise UsageError(
                 f"--page-host {self.page_host} can be reached from other machines, and the page asks nobody for a key: "
                 "let it listen at 127.0.0.1 and reach it by `ssh -L`, or type out --insecure if everyone on that "
@@ -261,16 +261,9 @@ def _check_address(flag: str, address: str, *, is_safe: bool) -> None:
     is_number = port.isascii() and port.isdecimal()
     if not colon or not host or not (port in ("*", "0") or (is_number and 0 < int(port) < 65536)):
         raise UsageError(f"{flag} {address!r}: write tcp://HOST:PORT with a port from 1 to 65535, or * for a free one")
-    if not is_safe and not _is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
+    if not is_safe and not is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
         raise UsageError(
             f"{flag} {address} is reachable from other machines, and nothing is encrypted or authenticated: "
             f"bind to 127.0.0.1, give --keys DIR (v2v-keys init makes it), or type out --insecure if everyone on that "
             "network may use this server"
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -93,10 +93,22 @@ def digest(batch: Batch) -> str:
 
 
 def epoch_of(
-    address: str, *, seed: int = 3, epoch: int = 0, batch_size: int = 3, shared_memory: bool = True
+    address: str,
+    *,
+    seed: int = 3,
+    epoch: int = 0,
+    batch_size: int = 3,
+    shared_memory: bool = True,
+    compress: bool = False,
 ) -> list[Batch]:
     """All batches of one epoch under SMALL."""
     dataset = V2VStreamDataset(
-        address, batch_size=batch_size, recipe=SMALL, seed=seed, epoch=epoch, shared_memory=shared_memory
+        address,
+        batch_size=batch_size,
+        recipe=SMALL,
+        seed=seed,
+        epoch=epoch,
+        shared_memory=shared_memory,
+        compress=compress,
     )
     return list(dataset)

@@ -28,11 +28,15 @@ def reference(clips: Path) -> list[str]:
         return [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
 
 
-@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize(("shared", "compress"), [(True, False), (False, False), (False, True), (True, True)])
 def test_another_number_of_workers_and_the_way_samples_travel_change_nothing(
-    server: LocalServer, reference: list[str], shared: bool
+    server: LocalServer, reference: list[str], shared: bool, compress: bool
 ) -> None:
-    got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, shared_memory=shared)]
+    got = [
+        digest(batch)
+        for epoch in (0, 1)
+        for batch in epoch_of(server.address, epoch=epoch, shared_memory=shared, compress=compress)
+    ]
     assert got == reference
     assert len(reference) == len(set(reference))
 

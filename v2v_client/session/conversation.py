@@ -28,6 +28,7 @@ import numpy.typing as npt
 from v2v_client.memory.slots import Answer, Slots
 from v2v_client.position.state import StreamIdentity
 from v2v_client.session.liveness import Patience
+from v2v_client.session.packing import unpack
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.liveness import Liveness
@@ -104,7 +105,7 @@ class Arrival:
 
     Attributes:
         header: what is said of it; its provenance is opened by :meth:`Conversation.provenance`.
-        arrays: read-only views of the received message, by name; None where a worker put them into their slot.
+        arrays: read-only views of what was received, by name; None where a worker put them into their slot.
         slot_is_free: whether no worker writes to its slot any more.
     """
 
@@ -407,7 +408,7 @@ class Conversation:
             )
         again = header.index not in self._asked
         in_message = bool(frames) or header.slot == NO_SLOT
-        arrays = decode_sample(header, frames) if in_message else None
+        arrays = decode_sample(header, frames, unpack) if in_message else None
         answer = self._slots.answered(header.index, header.slot, in_message=in_message)
         if answer is Answer.NOWHERE:
             self.strays += 1

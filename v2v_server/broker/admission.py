@@ -114,6 +114,7 @@ class Admission:
             liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
             quarantine=quarantine,
             since=now,
+            packed=hello.packed,
             name=shown(hello.name),
             host=shown(hello.host),
         )

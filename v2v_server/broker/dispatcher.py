@@ -479,6 +479,7 @@ class Dispatcher:
                 seed=session.seed,
                 arrays=session.arrays,
                 siblings=siblings,
+                packed=session.packed,
             )
             return [ToWorker(worker, encode(lease))]
         except IndexUnreadable as error:

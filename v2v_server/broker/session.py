@@ -54,6 +54,7 @@ class Session:
         quarantine: number of the quarantine snapshot its samples are made under.
         left_at: when its connection ended; None while it has one, as far as is known.
         since: when it was opened.
+        packed: whether it asks for compressed arrays.
         name, host: what it calls itself.
         epoch: that it last asked for samples of.
         position: index after the highest of that epoch that was answered.
@@ -76,6 +77,7 @@ class Session:
     quarantine: int = 0
     left_at: float | None = None
     since: float = 0.0
+    packed: bool = False
     name: str = ""
     host: str = ""
     epoch: int = 0

@@ -34,6 +34,7 @@ def lease_for(
     arrays: tuple[str, ...],
     number: int = 1,
     siblings: tuple[int, ...] = (),
+    packed: bool = False,
 ) -> Lease:
     """The lease for one request.
 
@@ -44,6 +45,7 @@ def lease_for(
         arrays: to be sent.
         number: of the lease.
         siblings: indices that are made from the same clip and follow in leases of their own.
+        packed: whether its consumer asks for compressed arrays.
 
     Raises:
         IndexUnreadable: of the catalogue, just now.
@@ -80,6 +82,7 @@ def lease_for(
         scene=scene,
         arena="" if request.slot is None else request.slot.arena,
         slot=NO_SLOT if request.slot is None else request.slot.number,
+        packed=packed,
     )
 
 
@@ -130,6 +133,16 @@ def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> Sampl
     if header.slot != slot:
         raise ProtocolError(f"it names slot {header.slot}, slot {slot} was lent")
     in_slot = slot != NO_SLOT and len(payload) == 1
-    if header.shapes != form.shapes or not (in_slot or tuple(map(len, payload[1:])) == form.sizes):
+    if header.shapes != form.shapes or not (in_slot or _fits(payload[1:], form.sizes, header.packed)):
         raise ProtocolError("its arrays have other shapes or sizes than were asked")
     return header
+
+
+def _fits(frames: abc.Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
+    """Whether the frames may hold arrays of these bytes. What cannot be compressed grows by a 256th and a little."""
+    lengths = tuple(map(len, frames))
+    if not packed:
+        return lengths == sizes
+    if len(lengths) != len(sizes):
+        return False
+    return all(0 < length <= size + size // 256 + 64 for length, size in zip(lengths, sizes, strict=True))

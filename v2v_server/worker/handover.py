@@ -16,12 +16,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import zstandard
 
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.wire import Frames, encode_sample
+from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,7 @@ def sample_message(
     cpu_seconds: float,
     decoded: bool = True,
     cache: str = "",
+    packed: bool = False,
 ) -> Frames:
     """The frames of a lease's sample. Who sends them writes to the room no more.
 
@@ -67,6 +69,7 @@ def sample_message(
         lease: what was asked.
         room: where its sample was made.
         provenance, worker, cpu_seconds, decoded, cache: see :class:`v2v_protocol.messages.SampleHeader`.
+        packed: arrays that do not lie in a slot are compressed, whatever the lease says of it.
     """
     return encode_sample(
         epoch=lease.epoch,
@@ -80,7 +83,13 @@ def sample_message(
         slot=lease.slot,
         in_slot=room.in_slot,
         quarantine=lease.quarantine,
+        pack=_pack if packed or lease.packed else None,
     )
+
+
+def _pack(raw: Buffer) -> bytes:
+    # Level 1: a twelfth of the bytes is left, and higher levels take longer for little more (v2v-bench tradeoff).
+    return zstandard.ZstdCompressor(level=1, write_checksum=False).compress(raw)
 
 
 def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | None:

@@ -18,6 +18,7 @@ from pathlib import Path
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Lease, WorkerHello
@@ -92,6 +93,7 @@ class Worker:
         self._log = log or Log()
         self._logbook = logbook
         self._clips = Clips(root, cache)
+        self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # that are loaded
         self._handover_seconds = 0.0  # that no result has named yet
         self._memory_bytes, self._weigh_at = 0, -math.inf
@@ -231,6 +233,7 @@ class Worker:
             cpu_seconds=time.process_time() - started,
             decoded=decoded,
             cache=self._clips.said_of_cache(clip) if decoded else "",
+            packed=self._is_remote,
         )
         spent = Spent(
             decode_seconds=has_clip - has_room,
