@@ -30,7 +30,8 @@ from v2v_server.console.state import (
     WorkerState,
 )
 from v2v_server.console.waiting import Shares, Waiting, who_waits
-from v2v_server.store.cache import GIB, used_bytes
+from v2v_server.store.cache import GIB
+from v2v_server.store.used import used_bytes
 from v2v_server.supervise.protocol import Supervisor
 
 MOST_SHOWN = 1000

@@ -6,6 +6,7 @@ packing   compressing these
 writer    writing a file, frame by frame
 reader    reading a crop of some frames
 encoding  how a prepared corpus holds its pictures
+used      how many bytes a folder holds that many processes fill
 cache     a folder of pieces that fills itself
 clips     the pixels of a video, wherever they are
 """

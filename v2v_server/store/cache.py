@@ -17,11 +17,10 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -33,6 +32,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
 from v2v_server.store.reader import StoreFile
+from v2v_server.store.used import PARTIAL, counted, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
@@ -49,7 +49,6 @@ _EXPECTED_BITS = 4
 """Of a pixel, at most: what is not known before it is written."""
 _REST_SECONDS = 60.0
 """A cache that could not be written to is left alone for so long."""
-_USED, _PARTIAL = "used", "partial"
 
 
 def piece_frames(rows: int, width_px: int) -> int:
@@ -229,7 +228,7 @@ class Cache:
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
         """Writes a piece, and gives it its name if there is room."""
-        partial = self._folder / _PARTIAL / secrets.token_hex(8)
+        partial = self._folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             with StoreWriter(partial, head, QUICK) as writer:
@@ -237,7 +236,7 @@ class Cache:
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
-            with _locked(self._folder) as used:
+            with locked_use(self._folder) as used:
                 if path.exists() or used.bytes + writer.bytes > self._most_bytes:
                     return
                 path.parent.mkdir(exist_ok=True)
@@ -250,7 +249,7 @@ class Cache:
     def _remove(self, path: Path, why: str) -> None:
         """Removes a piece that cannot be read, so that it is made anew."""
         self.trouble = f"a damaged piece was removed: {why}"
-        with contextlib.suppress(OSError), _locked(self._folder) as used:
+        with contextlib.suppress(OSError), locked_use(self._folder) as used:
             size = path.stat().st_size
             path.unlink()
             used.add(-size)
@@ -269,24 +268,6 @@ class _Piece:
     end: int
 
 
-@dataclass(slots=True)
-class _Used:
-    bytes: int
-
-    def add(self, more: int) -> None:
-        """Counts so many more."""
-        self.bytes = max(0, self.bytes + more)
-
-
-def used_bytes(folder: Path) -> int:
-    """How much a cache holds; 0 where that cannot be told."""
-    try:
-        text = (folder / _USED).read_bytes()
-    except OSError:
-        return 0
-    return int(text) if text.isdigit() else 0
-
-
 def make_cache(folder: Path) -> None:
     """Makes the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
     it did not keep.
@@ -296,39 +277,18 @@ def make_cache(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder) as used:
-            used.bytes = _counted(folder)
+        with locked_use(folder) as used:
+            used.bytes = counted(folder)
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
 
 
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[_Used]:
-    """The number of bytes that are there, for one process at a time."""
-    with open(os.open(folder / _USED, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        text = file.read(64)
-        used = _Used(int(text) if text.isdigit() else _counted(folder))
-        yield used
-        file.seek(0)
-        file.write(b"%020d" % used.bytes)
-        file.truncate()
-
-
 def _remove_abandoned(folder: Path) -> None:
     """Removes what workers that are gone have left half-written: those that live hold locks."""
-    for path in (folder / _PARTIAL).iterdir():
+    for path in (folder / PARTIAL).iterdir():
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
-
-
-def _counted(folder: Path) -> int:
-    sizes = 0
-    for below in folder.iterdir():
-        if below.is_dir() and below.name != _PARTIAL:
-            sizes += sum(path.stat().st_size for path in below.iterdir())
-    return sizes
 
 
 def _window(cut: Cut, index: FrameIndex) -> Window:

@@ -22,7 +22,8 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.store.cache import Cache, make_cache, piece_frames, used_bytes
+from v2v_server.store.cache import Cache, make_cache, piece_frames
+from v2v_server.store.used import used_bytes
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
 
