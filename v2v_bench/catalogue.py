@@ -72,7 +72,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int) -> None:
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = examine(str(folder), ids[0])
+    known = examine(folder, ids[0])
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))

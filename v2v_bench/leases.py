@@ -54,7 +54,7 @@ def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Pat
                     spec=spec, seed=0, arrays=DEFAULT_ARRAYS, siblings=siblings,
                 )  # fmt: skip
 
-        yield catalogue.root, leases()
+        yield catalogue.folder, leases()
     finally:
         catalogue.close()
 

@@ -35,7 +35,10 @@ class ServeConfig:
     """
 
     videos: str = text(
-        "", "folder of videos (searched recursively), a video, or a list file", metavar="DIR", group="Videos"
+        "",
+        "folder of videos (searched recursively), a video, a list file, or s3://bucket/prefix (extra cloud)",
+        metavar="DIR",
+        group="Videos",
     )
     list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
@@ -46,6 +49,13 @@ class ServeConfig:
         metavar="DIR",
     )
     cache_gib: float = number(100.0, 0.0, 1e6, "at most so much lies in --cache", unit="GiB", metavar="N")
+    copies: str = text(
+        "", "folder that videos are fetched to from object storage; without it one in the user's cache", metavar="DIR"
+    )
+    copies_gib: float = number(
+        100.0, 0.001, 1e6, "at most so much lies in --copies; what was not read for longest goes", unit="GiB",
+        metavar="N",
+    )  # fmt: skip
     list_refused: bool = switch(False, "name every video that cannot be used at the start, not only the first five")
     workers: tuple[int, int] = bounds(
         (2, 2), 0, MOST_WORKERS,

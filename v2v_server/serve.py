@@ -29,6 +29,7 @@ from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, r
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
 from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
@@ -39,7 +40,6 @@ from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import make_cache
-from v2v_server.store.clips import check_file
 from v2v_server.supervise.engines import make_supervisor
 from v2v_server.supervise.protocol import Supervisor
 from v2v_server.supervise.scaling import Scaling
@@ -81,6 +81,8 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             list_file=config.list or None,
             rows=Rows.parse(config.rows),
             cache_dir=config.cache_dir or None,
+            copies=config.copies or None,
+            copies_gib=config.copies_gib,
             scene=config.spec.scene != "off",
             # A host whose workers are all elsewhere has its cores to itself.
             processes=min(config.most_workers or cores, cores),
@@ -133,6 +135,8 @@ def serve(config: ServeConfig) -> None:
         folder = Path(config.cache).absolute()
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
+    if isinstance(catalogue.root, Copies):
+        worker_flags += ["--copies", str(catalogue.root.folder), "--copies-gib", str(config.copies_gib)]
     label = f"w{secrets.token_hex(4)}"
     stop = threading.Event()
     with _stop_on_signals(stop):
@@ -325,10 +329,10 @@ class Server:
         return written
 
     def _look_for(self, missing: LookFor) -> bool:
-        """Whether this host has the video as it was catalogued. If so, the operator is told of the host that has not,
+        """Whether the video is here as it was catalogued. If so, the operator is told of the host that has it not,
         once in a while: all workers of a host fail alike."""
         try:
-            check_file(self._catalogue.path(missing.video), missing.fingerprint)
+            self._catalogue.check(missing.video, missing.fingerprint)
         except VideoChanged:
             self._catalogue.doubt(missing.video)
             return False
@@ -338,8 +342,10 @@ class Server:
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
             name = missing.identity.decode(errors="replace")
+            is_local = not isinstance(self._catalogue.root, Copies)
             self._say(
-                f"worker {name} failed on {missing.video}, which is on this host as it was catalogued: "
+                f"worker {name} failed on {missing.video}, which "
+                f"{'is on this host as it was catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; others make the sample, and it gets no work for {REST_SECONDS:g} s. Look at "
                 "--videos on its host",
                 "warning",

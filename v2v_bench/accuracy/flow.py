@@ -213,7 +213,7 @@ def _jobs(catalogue: Catalogue, samples: int) -> Iterator[tuple[Path, Any, int, 
     spec = StreamSpec(recipe=preset("paper"))
     schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
     if not schedule.count:
-        raise UsageError(f"--corpus {catalogue.root}: no clip of {spec.recipe.frames_needed} frames or more")
+        raise UsageError(f"--corpus {catalogue.folder}: no clip of {spec.recipe.frames_needed} frames or more")
     for number in range(samples):
         epoch, index = divmod(number, schedule.count)
         sequence = schedule.candidate(0, epoch, index, 0)

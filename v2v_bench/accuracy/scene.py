@@ -146,7 +146,7 @@ def measure(catalogue: Catalogue, off: StreamSpec, auto: StreamSpec, most: int) 
             for spec in (off, auto)
         ]  # fmt: skip
         try:
-            yield _measured(leases, catalogue.root)
+            yield _measured(leases, catalogue.folder)
         except VideoError as error:
             print(f"left out: {error}", file=sys.stderr)
 

@@ -109,11 +109,13 @@ def _seconds(catalogue: Catalogue) -> float:
 def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> None:
     if catalogue.prepared is not None:
         raise UsageError(
-            f"--videos {catalogue.root} is a prepared corpus: give its source, which this command prepares"
+            f"--videos {catalogue.folder} is a prepared corpus: give its source, which this command prepares"
         )
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
     if not table.count:
-        raise CorpusError(f"--videos {catalogue.root}: no video gives a sequence of {spec.recipe.frames_needed} frames")
+        raise CorpusError(
+            f"--videos {catalogue.folder}: no video gives a sequence of {spec.recipe.frames_needed} frames"
+        )
     unusable = {refusal.video for refusal in table.refusals}
     distinct = {video.fingerprint: video for video in reversed(catalogue.videos) if video.id not in unusable}
     folder.mkdir(parents=True)

@@ -74,7 +74,7 @@ def knobs(catalogue: Catalogue, spec: StreamSpec, places: int) -> dict[str, Knob
         spec: the exact one.
         places: how many to time and to compare.
     """
-    root = catalogue.root
+    root = catalogue.folder
     leases = leases_of(catalogue, spec, places)
     views = [seen(root, lease) for lease in leases]
     samples = [make(lease, lease.indices[:1], root)[0] for lease in leases]
@@ -100,7 +100,7 @@ def _kernel_work(kernel: Any, views: Sequence[Seen]) -> Work:
 def _grid(catalogue: Catalogue, spec: StreamSpec, places: int) -> dict[str, Knob]:
     recipe = spec.recipe
     still_standing = dataclasses.replace(spec, recipe=recipe.replace(pause_probability=0.0))
-    views = [seen(catalogue.root, lease) for lease in leases_of(catalogue, still_standing, places)]
+    views = [seen(catalogue.folder, lease) for lease in leases_of(catalogue, still_standing, places)]
     strided = recipe.replace(frame_stride=2, voxels_per_clip=recipe.voxels_per_clip // 2)
     half = recipe.replace(
         resize_scale=(0.5, 0.5), crop_height_px=recipe.crop_height_px // 2, crop_width_px=recipe.crop_width_px // 2
@@ -118,7 +118,7 @@ def _grid(catalogue: Catalogue, spec: StreamSpec, places: int) -> dict[str, Knob
     made = {}
     for name, changed in (("stride 2", strided), ("resize 0.5", half)):
         leases = leases_of(catalogue, dataclasses.replace(spec, recipe=changed), places)
-        made[name] = Knob(making(catalogue.root, leases), errors=errors[name])
+        made[name] = Knob(making(catalogue.folder, leases), errors=errors[name])
     return made
 
 
@@ -185,7 +185,7 @@ def _flows(catalogue: Catalogue, spec: StreamSpec, places: int) -> dict[str, Kno
         records = flow.accuracy(name, estimators[name], every)
         error = next(record["error_mean_px"] for record in records if record["context"] == "margin 64")
         leases = leases_of(catalogue, dataclasses.replace(spec, flow_method=name), places, (*DEFAULT_ARRAYS, "flow"))
-        made[f"flow {name}"] = Knob(making(catalogue.root, leases), figures={"endpoint_error_px": error})
+        made[f"flow {name}"] = Knob(making(catalogue.folder, leases), figures={"endpoint_error_px": error})
     return made
 
 

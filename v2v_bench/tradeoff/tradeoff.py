@@ -57,7 +57,7 @@ def measured(corpus: Mapping[str, Form], spec: StreamSpec, places: int, until: f
         until: reading of ``time.monotonic`` at which the timing ends.
     """
     chosen = settings([name for name in corpus if name != SOURCE])
-    sources = {name: (form.clips.root, leases_of(form.clips, spec, places)) for name, form in corpus.items()}
+    sources = {name: (form.clips.folder, leases_of(form.clips, spec, places)) for name, form in corpus.items()}
     say(f"comparing {len(sources)} forms of the corpus")
     tallies = accuracy(sources, SOURCE)
     recipe = spec.recipe
@@ -130,7 +130,7 @@ def work(asked: argparse.Namespace) -> int:
         records = measured(corpus, spec, asked.places, begun + _SHARE_OF_SETTINGS * budget)
         source = corpus[SOURCE].clips
         say("measuring diversity and the other knobs")
-        records += diversity(source.root, leases_of(source, spec, asked.places))
+        records += diversity(source.folder, leases_of(source, spec, asked.places))
         others = knobs(source, spec, -(-asked.places // 3))
         slow, quick = (
             {n: knob.work for n, knob in others.items() if knob.quick == is_quick} for is_quick in (False, True)

@@ -145,7 +145,7 @@ class Quarantine:
         return max((number for number in self._clearings if number <= snapshot), default=0)
 
 
-def quarantine_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+def quarantine_path(root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None) -> Path:
     """The file of a corpus's quarantine: beside the catalogue's index."""
     index = index_path(root, cache_dir)
     return index.with_name(index.name.replace("catalogue-", "quarantine-")).with_suffix(".jsonl")

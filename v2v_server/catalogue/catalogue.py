@@ -18,6 +18,7 @@ from v2v_server.catalogue.files import (
     UNPRINTABLE,
     VIDEO_SUFFIXES,
     Notice,
+    bucket_files,
     corpus_root,
     is_said,
     printable,
@@ -31,7 +32,8 @@ from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
-from v2v_server.store.clips import STORE_FORMAT
+from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
+from v2v_server.store.clips import STORE_FORMAT, check_file
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
 from v2v_server.video.frame_index import FrameIndex, unseekable
@@ -50,7 +52,7 @@ class Catalogue:
     """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
 
     Attributes:
-        root: the folder that ids are relative to, resolved.
+        root: the folder that ids are relative to, resolved; or their copies, of videos in object storage.
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
         refusals: files, folders and lines of the list that give no video, by id.
@@ -62,7 +64,7 @@ class Catalogue:
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
     """
 
-    root: Path
+    root: Path | Copies
     rows: Rows
     videos: Videos
     refusals: tuple[Refusal, ...]
@@ -78,14 +80,42 @@ class Catalogue:
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
     _long: dict[str, FrameIndex] = field(repr=False, compare=False, default_factory=dict)
 
+    @property
+    def folder(self) -> Path:
+        """The root, for what works on folders only.
+
+        Raises:
+            CorpusError: the videos lie in object storage.
+        """
+        if isinstance(self.root, Copies):
+            raise CorpusError(f"{self.root}: is no folder of this host, which this needs: copy the videos to one first")
+        return self.root
+
     def path(self, id: str) -> Path:
         """Where the video lies.
 
         Raises:
-            CorpusError: no such id in this catalogue.
+            CorpusError: no such id in this catalogue, or the videos lie in object storage.
         """
         self._fingerprint(id)
-        return self.root / id
+        return self.folder / id
+
+    def check(self, id: str, fingerprint: str) -> None:
+        """Make sure that the video is here as it was catalogued. In object storage it is if nothing else can be told,
+        and it is asked for only once.
+
+        Raises:
+            CorpusError: no such id in this catalogue.
+            VideoError: it is another one, is gone, or (on a disk) cannot be read.
+        """
+        if not isinstance(self.root, Copies):
+            return check_file(self.path(id), fingerprint)
+        self._fingerprint(id)
+        with suppress(sqlite3.Error):
+            known = self._store.state(id)
+            if known is not None and known[0] >= 0 and not self.root.is_there(id, *known):
+                raise VideoChanged(id, None, f"is gone from {self.root}, or changed there")
+        return None
 
     def frame_index(self, id: str) -> FrameIndex:
         """The frames of a video, read from the index on disk.
@@ -197,6 +227,8 @@ class Catalogue:
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""
         self._store.close()
+        if isinstance(self.root, Copies):
+            self.root.let_go()
 
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)
@@ -211,6 +243,8 @@ def open_catalogue(
     list_file: str | os.PathLike[str] | None = None,
     rows: Rows | None = None,
     cache_dir: str | os.PathLike[str] | None = None,
+    copies: str | os.PathLike[str] | None = None,
+    copies_gib: float = COPIES_GIB,
     scene: bool = False,
     processes: int = 1,
     progress: Progress | None = None,
@@ -219,11 +253,14 @@ def open_catalogue(
     """Take in a corpus: probe what is new or changed, forget what is gone.
 
     Args:
-        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder.
+        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder; or
+            an address in object storage, ``s3://bucket/prefix``, see :mod:`v2v_server.cloud`.
         list_file: a list that restricts the folder ``source`` to the videos it names.
         rows: which rows may be used; all when None.
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
             ``~/.cache/v2v``.
+        copies: folder for copies of videos from object storage; None takes one where the index lies.
+        copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
             :mod:`v2v_server.catalogue.scene`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
@@ -234,9 +271,14 @@ def open_catalogue(
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
             be used.
     """
+    root: Path | Copies
+    bucket, manifest = copies_of(os.fspath(source), copies, copies_gib, cache_dir), None
     try:
-        root, listed = _wanted(Path(source), list_file)
-        manifest = find_manifest(root)
+        if bucket is not None:
+            root, listed = bucket, None if list_file is None else read_list(list_file)
+        else:
+            root, listed = _wanted(Path(source), list_file)
+            manifest = find_manifest(root)
     except OSError as error:  # a folder that this user may not enter, a share that has gone
         raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
     refused: dict[str, str] = {}
@@ -273,10 +315,10 @@ def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Pat
     return folder, (ListEntry(source.name),)
 
 
-def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
-    """The videos below a folder."""
+def _found(root: Path | Copies, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
+    """The videos below a folder, or an address."""
     ids = []
-    for id in video_files(root, refused):
+    for id in bucket_files(root.listed, refused) if isinstance(root, Copies) else video_files(root, refused):
         ids.append(id)
         if notice is not None and is_said(len(ids)):
             notice(f"looking for videos: {len(ids)} so far")
@@ -284,7 +326,7 @@ def _found(root: Path, refused: dict[str, str], notice: Notice | None) -> tuple[
 
 
 def _snapshot(
-    root: Path,
+    root: Path | Copies,
     rows: Rows,
     records: Records,
     listed: Sequence[ListEntry],

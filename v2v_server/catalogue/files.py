@@ -8,12 +8,13 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.cloud.copies import Copies
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -45,6 +46,20 @@ def video_files(root: Path, refused: dict[str, str]) -> Iterator[str]:
         refused: receives, by relative path, why a folder or file cannot be taken in.
     """
     yield from _below(root, "", frozenset(), refused)
+
+
+def bucket_files(names: Iterable[str], refused: dict[str, str]) -> Iterator[str]:
+    """Those of the names of objects below an address that :func:`video_files` would take from a folder."""
+    for name in names:
+        parts = name.split("/")
+        if f".{name.rpartition('.')[2].lower()}" not in VIDEO_SUFFIXES or any(part.startswith(".") for part in parts):
+            continue
+        if printable(name) != name:
+            refused[printable(name)] = UNPRINTABLE
+        elif "" in parts:
+            refused[name] = "has an empty part between two slashes"
+        else:
+            yield name
 
 
 def _below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused: dict[str, str]) -> Iterator[str]:
@@ -105,7 +120,7 @@ def corpus_root(source: Path) -> Path:
 
 
 def regular_files(
-    root: Path, ids: Sequence[str], refused: dict[str, str], notice: Notice | None = None
+    root: Path | Copies, ids: Sequence[str], refused: dict[str, str], notice: Notice | None = None
 ) -> tuple[str, ...]:
     """Those of the ids of a list that do not name something else than a file.
 
@@ -118,6 +133,9 @@ def regular_files(
         refused: receives, by id, why one cannot be taken in.
         notice: told how far it is.
     """
+
+    if isinstance(root, Copies):
+        return tuple(ids)
 
     def may_be_read(id: str) -> bool:
         try:

@@ -134,6 +134,15 @@ class Store:
         row = self._database.execute(query, (id, fingerprint)).fetchone()
         return None if row is None else row[0]
 
+    def state(self, id: str) -> tuple[int, int] | None:
+        """Size and time of the last modification of a file when it was probed; None if it is not known.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        row = self._database.execute("SELECT size_bytes, mtime_ns FROM video WHERE id = ?", (id,)).fetchone()
+        return None if row is None else (row[0], row[1])
+
     def looked_at(self, look: str) -> dict[str, str]:
         """Fingerprint by id of the files whose scene is known.
 

@@ -23,6 +23,7 @@ from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.catalogue.files import answers
 from v2v_server.catalogue.index_file import IndexRow
 from v2v_server.catalogue.scene import Scene
+from v2v_server.cloud.copies import Copies
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import is_same_file
@@ -213,12 +214,17 @@ def find_manifest(root: Path) -> Manifest | None:
     return read_manifest(root) if (root / MANIFEST_NAME).exists() else None
 
 
-def refuse_prepared_below(root: Path, ids: Iterable[str]) -> None:
+def refuse_prepared_below(root: Path | Copies, ids: Iterable[str]) -> None:
     """Make sure that no video of an ordinary corpus comes from a prepared folder, whose rows are cut already.
 
     Raises:
         CorpusError: one does.
     """
+    if isinstance(root, Copies):
+        found = [name for name in root.listed if name.rpartition("/")[2] == MANIFEST_NAME]
+        if found:
+            raise CorpusError(f"{root}: {found[0]} makes it a prepared corpus: copy that to a disk")
+        return
 
     def is_prepared(folder: PurePosixPath) -> bool:
         try:

@@ -14,12 +14,13 @@ from itertools import chain, islice, pairwise
 from operator import itemgetter
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError
 from v2v_server.catalogue.columns import CHUNK, Records, joined
 from v2v_server.catalogue.files import Notice, answers, is_said
 from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
+from v2v_server.cloud.copies import Copies
+from v2v_server.system.process import cache_folder
 
 _WRITE_EVERY = 256
 
@@ -27,34 +28,18 @@ Progress = Callable[[int, int], None]
 """(files probed so far, files to probe)."""
 
 
-def index_path(root: Path, cache_dir: str | os.PathLike[str] | None) -> Path:
+def index_path(root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None) -> Path:
     """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: none was chosen, and this user has no home folder.
     """
-    if cache_dir is not None:
-        folder = Path(cache_dir)
-    elif chosen := os.environ.get("V2V_CACHE_DIR"):
-        folder = Path(chosen)
-    else:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or _home() / ".cache") / "v2v"
     name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
-    return folder / f"catalogue-{name}.sqlite3"
-
-
-def _home() -> Path:
-    try:
-        return Path.home()
-    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
-        raise CorpusError(
-            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
-            "V2V_CACHE_DIR"
-        ) from error
+    return cache_folder(cache_dir) / f"catalogue-{name}.sqlite3"
 
 
 def up_to_date(
-    root: Path,
+    root: Path | Copies,
     ids: Sequence[str],
     path: Path,
     looking: Looking | None,
@@ -67,7 +52,7 @@ def up_to_date(
     The index is in memory, with a note, where the file cannot serve.
 
     Args:
-        root: the folder that ids are relative to.
+        root: the folder, or what lies in object storage, that ids are relative to.
         ids: of the videos to know.
         path: of the index.
         looking: how to look at what the videos show; None does not.
@@ -86,7 +71,7 @@ def up_to_date(
 
 def _refreshed(
     path: Path | None,
-    root: Path,
+    root: Path | Copies,
     ids: Sequence[str],
     looking: Looking | None,
     processes: int,
@@ -128,14 +113,17 @@ def _known(store: Store, ids: Sequence[str]) -> tuple[Records, array[int], list[
     return records, states, unasked
 
 
-def _stale(root: Path, ids: Sequence[str], states: array[int], notice: Notice | None) -> list[str]:
+def _stale(root: Path | Copies, ids: Sequence[str], states: array[int], notice: Notice | None) -> list[str]:
     """Those of the ids whose files are new or changed."""
-    folder = os.path.join(root, "")
+    folder, listed = os.path.join(root, ""), root.listed if isinstance(root, Copies) else None
 
     def is_unchanged(place: int) -> bool:
         size, mtime, ctime = states[3 * place : 3 * place + 3]
         if size < 0:
             return False
+        if listed is not None:
+            state = listed.get(ids[place])
+            return state is not None and (state.size_bytes, state.mark, 0) == (size, mtime, ctime)
         try:
             status = os.stat(folder + ids[place])
         except OSError:
@@ -151,8 +139,10 @@ def _stale(root: Path, ids: Sequence[str], states: array[int], notice: Notice | 
     return stale
 
 
-def _gone(root: Path, ids: Iterable[str], notice: Notice | None) -> list[str]:
+def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> list[str]:
     """Those of the ids of which there is no file any more. One that cannot be looked at today is not gone."""
+    if isinstance(root, Copies):
+        return [id for id in ids if id not in root.listed]
 
     def is_gone(id: str) -> bool:
         try:

@@ -7,7 +7,6 @@ fingerprint and the rows it was taken of.
 from __future__ import annotations
 
 import hashlib
-import os
 from base64 import b64decode
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
@@ -16,11 +15,12 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.catalogue.index_file import IndexRow, Store
 from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
+from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
@@ -52,7 +52,7 @@ class Looking:
     def take_in(
         self,
         store: Store,
-        root: Path,
+        root: Path | Copies,
         records: Mapping[str, IndexRow],
         processes: int,
         progress: Callable[[int, int], None] | None,
@@ -99,7 +99,7 @@ class Looking:
         return runs, sha.hexdigest()[:32]
 
     def _found(
-        self, store: Store, root: Path, missing: list[IndexRow], processes: int
+        self, store: Store, root: Path | Copies, missing: list[IndexRow], processes: int
     ) -> Generator[tuple[IndexRow, Scene], None, None]:
         by_id = {record.id: record for record in missing}
         left = []
@@ -113,9 +113,9 @@ class Looking:
         def jobs() -> Iterator[_ToLookAt]:
             for record in left:
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _ToLookAt(record.id, index, self._window(record))
+                yield _ToLookAt(record.id, record.fingerprint, index, self._window(record))
 
-        look = partial(_look_at, os.fspath(root))
+        look = partial(_look_at, root)
         suspects = []
         for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS, 2 * LARGEST_MEMORY_BYTES):
             if isinstance(scene, Died) and scene.overdue_seconds:
@@ -147,11 +147,12 @@ class Looking:
 @dataclass(frozen=True, slots=True)
 class _ToLookAt:
     id: str
+    fingerprint: str
     index: bytes
     window: Window | None
 
 
-def _look_at(root: str, job: _ToLookAt) -> bytes:
+def _look_at(root: Path | Copies, job: _ToLookAt) -> bytes:
     """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
     decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.
@@ -160,12 +161,12 @@ def _look_at(root: str, job: _ToLookAt) -> bytes:
     seen = Look()
     if job.index and job.window is not None:
         try:
-            for picture in islice(
-                pictures_of(Path(root, job.id), FrameIndex.from_bytes(job.index), job.window), MOST_FRAMES
-            ):
-                seen.add(picture)
+            with lent(root, job.id, job.fingerprint) as path:
+                pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
+                for picture in islice(pictures, MOST_FRAMES):
+                    seen.add(picture)
         except VideoError as error:
-            if isinstance(error.__cause__, OSError):
+            if isinstance(error, VideoUnreadable) or isinstance(error.__cause__, OSError):
                 return b""
             return seen.scene().to_bytes()  # whoever is served what lies behind finds the same error
     return seen.scene().to_bytes()

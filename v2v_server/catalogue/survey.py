@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Generator, Iterable
 from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
@@ -22,21 +22,21 @@ LARGEST_MEMORY_BYTES = 2 << 30
 """What a process may allocate to examine a file: enough for 16 pictures of the largest size, or a list of 2**24 frames.
 A file of some kB can claim a thousand million frames, for which a demuxer would make room."""
 
-Examine = Callable[[str, str], IndexRow]
+Examine = Callable[[Path | Copies, str], IndexRow]
 """(root, id) -> what is known of that file; see :func:`examine`."""
 
 
-def examine(root: str, id: str) -> IndexRow:
+def examine(root: Path | Copies, id: str) -> IndexRow:
     """What is known of one file. Never raises: what goes wrong is the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is looked at again next time.
     """
-    path = Path(root, id)
     try:
-        before = _state(path)
-        mark = fingerprint(path)
-        facts = _facts(path)
-        if _state(path) != before:
+        before = _state(root, id)
+        with lent(root, id, "") as path:
+            mark = fingerprint(path)
+            facts = _facts(path)
+        if _state(root, id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
@@ -61,9 +61,11 @@ def examine(root: str, id: str) -> IndexRow:
     )
 
 
-def _state(path: Path) -> tuple[int, int, int]:
-    """Size in bytes, and the times of the last modification and change of status."""
-    status = path.stat()
+def _state(root: Path | Copies, id: str) -> tuple[int, int, int]:
+    """Size in bytes, and the times of the last modification and change of status, or what stands for them."""
+    if isinstance(root, Copies):
+        return root.state(id)
+    status = (root / id).stat()
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
@@ -88,7 +90,7 @@ def _facts(path: Path) -> VideoFacts:
 
 
 def survey(
-    root: Path,
+    root: Path | Copies,
     ids: Iterable[str],
     processes: int,
     examine: Examine = examine,
@@ -100,14 +102,14 @@ def survey(
     killed from outside, or the memory may not have sufficed for it and its neighbours.
 
     Args:
-        root: the folder that ids are relative to.
+        root: the folder, or what lies in object storage, that ids are relative to.
         ids: relative paths.
         processes: processes to probe in, spawned and ended here; 0 probes in this one, where a file that crashes the
             decoder takes the caller along.
         examine: what is done with each file; must be picklable.
         longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
     """
-    look = partial(examine, os.fspath(root))
+    look = partial(examine, root)
     suspects: list[str] = []
     for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
         if isinstance(found, Died) and found.overdue_seconds:
@@ -120,12 +122,12 @@ def survey(
         yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 
-def _culprit(root: Path, id: str, death: Died) -> IndexRow:
+def _culprit(root: Path | Copies, id: str, death: Died) -> IndexRow:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return IndexRow(id, *_state(Path(root, id)), problem=why)
-    except OSError:
+        return IndexRow(id, *_state(root, id), problem=why)
+    except (OSError, VideoUnreadable):
         return IndexRow(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again

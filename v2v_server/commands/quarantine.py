@@ -18,6 +18,7 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
 from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
 from v2v_server.catalogue.files import corpus_root
+from v2v_server.cloud.bucket import is_url
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    file = quarantine_path(corpus_root(Path(arguments.videos)), arguments.cache_dir)
+    source: str = arguments.videos
+    file = quarantine_path(corpus_root(Path(source)) if not is_url(source) else source.rstrip("/"), arguments.cache_dir)
     quarantine = read_quarantine(file)
     if arguments.clear and quarantine.verdicts(quarantine.latest):
         _clear(file, quarantine)

@@ -10,6 +10,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.catalogue.files import corpus_root
+from v2v_server.cloud.copies import COPIES_GIB, copies_of
 from v2v_server.store.cache import GIB, Cache, make_cache
 from v2v_server.system.log import LOG_FORMATS, Log
 from v2v_server.worker.process import run_worker, unshared_name
@@ -23,10 +24,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     work = parser.group("Work")
     work.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
-    work.add_argument("--videos", required=True, metavar="DIR", help="the corpus on this host: what the server's is")
+    work.add_argument(
+        "--videos", required=True, metavar="DIR", help="the corpus on this host: what the server's is, or s3://..."
+    )
     work.add_argument("--name", help="how its name begins in logs (default: host and process id)")
     work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
     work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
+    work.add_argument(
+        "--copies",
+        metavar="DIR",
+        help="folder of this host that videos are fetched to from s3:// (default: in the user's cache)",
+    )
+    work.add_argument(
+        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help="at most so much lies there (100)"
+    )
     work.add_argument("--keys", metavar="FILE", help="its key, see v2v-keys (default: what V2V_KEYS names)")
     work.add_argument(
         "--log-format", choices=LOG_FORMATS, default="text", help="text for people, or json, an object a line (text)"
@@ -39,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> None:
     # Its own workers a server names itself, and knows them by it.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
-    root = corpus_root(Path(arguments.videos))
+    copies = copies_of(arguments.videos, arguments.copies, arguments.copies_gib)
+    root = copies or corpus_root(Path(arguments.videos))
     cache = None
     if arguments.cache is not None:
         if not arguments.cache_gib >= 0:

@@ -98,7 +98,7 @@ def prepare(
     refuse_overlap(catalogue, target, single)
     header = Header(
         str(catalogue.rows), encoding.codec, encoding.size, encoding.quality, encoding.gop, len(catalogue.videos),
-        catalogue.root.name, catalogue.digest,
+        catalogue.folder.name, catalogue.digest,
     )  # fmt: skip
     made: dict[str, PreparedVideo] = {}
     not_looked_at = []

@@ -35,7 +35,7 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
     Raises:
         CorpusError: they do, or the source is prepared itself.
     """
-    root = catalogue.root
+    root = catalogue.folder
     if catalogue.prepared is not None:
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
     below = target != root and target.is_relative_to(root)

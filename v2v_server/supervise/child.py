@@ -21,12 +21,12 @@ _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
-def start_child(address: str, root: Path, name: str, flags: Sequence[str], logbook: Logbook) -> subprocess.Popen[bytes]:
+def start_child(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> subprocess.Popen[bytes]:
     """A worker in a process of its own, which dies with this one.
 
     Args:
         address: where the server listens for workers.
-        root: the corpus folder.
+        root: the corpus, a folder or an address.
         name: of the worker, which no other has.
         flags: more of them.
         logbook: for the lease it is at.
@@ -43,11 +43,11 @@ def start_child(address: str, root: Path, name: str, flags: Sequence[str], logbo
     )
 
 
-def command(address: str, root: Path, name: str) -> list[str]:
+def command(address: str, root: str, name: str) -> list[str]:
     """The program of one worker."""
     return [
         *(sys.executable, "-m", "v2v_server.commands.worker"),
-        *("--connect", address, "--videos", str(root), "--name", name),
+        *("--connect", address, "--videos", root, "--name", name),
         *("--parent-pid", str(os.getpid())),
     ]
 

@@ -6,17 +6,18 @@ from importlib import import_module
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError
+from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Supervisor
 
 
-def make_supervisor(config: ServeConfig, root: Path, label: str, flags: list[str]) -> Supervisor:
+def make_supervisor(config: ServeConfig, root: Path | Copies, label: str, flags: list[str]) -> Supervisor:
     """The supervisor that the configuration asks for.
 
     Args:
         config: of the server.
-        root: the corpus folder.
+        root: the corpus folder, or the copies of what is in object storage.
         label: prefix of the workers' names, unique to this server.
         flags: more of them for each worker.
 
@@ -24,7 +25,7 @@ def make_supervisor(config: ServeConfig, root: Path, label: str, flags: list[str
         UsageError: its engine is not installed, or there is no cluster.
     """
     if config.engine == "local":
-        return Pool(root, label, flags)
+        return Pool(str(root), label, flags)
     try:
         engine = import_module("v2v_server.supervise.ray_workers")
     except ModuleNotFoundError as error:
@@ -34,5 +35,5 @@ def make_supervisor(config: ServeConfig, root: Path, label: str, flags: list[str
             "--engine ray needs the Python package ray, which is not installed; the extra 'ray' brings it: "
             "pip install '.[server,ray]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
-    supervisor: Supervisor = engine.RayWorkers(root, label, flags, config.ray_address, config.ray_labels)
+    supervisor: Supervisor = engine.RayWorkers(str(root), label, flags, config.ray_address, config.ray_labels)
     return supervisor

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import signal
 import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.supervise.child import hung, is_stopped, out_of_memory_kills, post_mortem, start_child, status_of
@@ -54,17 +54,17 @@ class Pool:
     """Keeps a number of worker processes running: a :class:`v2v_server.supervise.protocol.Supervisor`.
 
     Args:
-        root: the corpus folder.
+        root: the corpus, a folder or an address.
         label: prefix of the workers' names, unique to this server.
         flags: more of them for each worker.
     """
 
-    def __init__(self, root: Path, label: str, flags: Sequence[str] = ()) -> None:
+    def __init__(self, root: str | os.PathLike[str], label: str, flags: Sequence[str] = ()) -> None:
         self._flags = flags
         self._posts: list[_Post] = []
         self._leaving: list[_Post] = []  # too many: told to leave
         self._numbered = 0
-        self._root = root
+        self._root = os.fspath(root)
         self._address = ""
         self._label = label
         self._restarts = Restarts()

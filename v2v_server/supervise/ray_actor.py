@@ -11,7 +11,6 @@ import subprocess
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import ray
 
@@ -43,12 +42,12 @@ class RayWorker:
     """The actor.
 
     Args:
-        root: the corpus folder on its node.
+        root: the corpus, a folder of its node or an address.
         flags: more of them for the worker.
     """
 
     def __init__(self, root: str, flags: Sequence[str]) -> None:
-        self._root, self._flags = Path(root), list(flags)
+        self._root, self._flags = root, list(flags)
         self._lock = threading.Lock()
         self._child: tuple[str, subprocess.Popen[bytes], Logbook] | None = None
         self._memory_kills = out_of_memory_kills()

@@ -17,7 +17,6 @@ import socket
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import ray
@@ -66,7 +65,7 @@ class RayWorkers:
     """Keeps a number of workers running on a cluster: a :class:`v2v_server.supervise.protocol.Supervisor`.
 
     Args:
-        root: the corpus folder, which every node has under this path.
+        root: the corpus, a folder that every node has under this path, or an address.
         label: prefix of the workers' names, unique to this server.
         flags: more of them for each worker.
         address: of the cluster, HOST:PORT; "auto" is the one that this host is a node of.
@@ -78,13 +77,13 @@ class RayWorkers:
 
     def __init__(
         self,
-        root: Path,
+        root: str,
         label: str,
         flags: Sequence[str] = (),
         address: str = "auto",
         selector: dict[str, str] | None = None,
     ) -> None:
-        self._arguments = str(root), list(flags)
+        self._arguments = root, list(flags)
         self._label = label
         self._selector = selector or {}
         self._address = ""

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from v2v_protocol import allocator
+from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
 _TURN_SECONDS = 0.1  # the longest that Linux grants
@@ -149,3 +150,23 @@ def die_with_parent(parent_pid: int) -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:
         os._exit(1)
+
+
+def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
+    """Where this user's indexes and copies lie: what was chosen, else ``$V2V_CACHE_DIR``, else
+    ``$XDG_CACHE_HOME/v2v``, else ``~/.cache/v2v``.
+
+    Raises:
+        CorpusError: none was chosen, and this user has no home folder.
+    """
+    if chosen is None:
+        chosen = os.environ.get("V2V_CACHE_DIR") or None
+    if chosen is not None:
+        return Path(chosen)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
+    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
+        raise CorpusError(
+            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
+            "V2V_CACHE_DIR"
+        ) from error

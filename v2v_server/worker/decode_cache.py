@@ -10,6 +10,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
+from v2v_server.cloud.copies import Copies
 from v2v_server.store.cache import Cache
 from v2v_server.worker.produce import Decoded, decode_for
 
@@ -18,11 +19,11 @@ class Clips:
     """Decodes for leases, and for their siblings along with them.
 
     Args:
-        root: folder that the catalogue's ids are relative to, on this host.
+        root: folder that the catalogue's ids are relative to, on this host; or their copies, from object storage.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
     """
 
-    def __init__(self, root: Path, cache: Cache | None = None) -> None:
+    def __init__(self, root: Path | Copies, cache: Cache | None = None) -> None:
         self._root = root
         self._cache = cache
         self._kept: dict[tuple[object, ...], Decoded] = {}

@@ -23,6 +23,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
+from v2v_server.cloud.copies import Copies
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.log import Log
@@ -51,6 +52,8 @@ from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
+_SOON_FETCHED_BYTES = 32 << 20
+"""A video up to this size is waited for with its leases in hand; they are for others while a larger one comes."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; a routing identity has 255 at most."""
 _MORE = int(zmq.SNDMORE)
@@ -66,7 +69,7 @@ class Worker:
 
     Args:
         name: unique name, also its routing identity.
-        root: the corpus folder on this host.
+        root: the corpus folder on this host, or the copies of what is in object storage.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: where what is decoded is kept for later epochs; None keeps nothing.
@@ -81,7 +84,7 @@ class Worker:
     def __init__(
         self,
         name: str,
-        root: Path,
+        root: Path | Copies,
         address: str,
         logbook: int | None = None,
         cache: Cache | None = None,
@@ -93,6 +96,8 @@ class Worker:
         self._log = log or Log()
         self._logbook = logbook
         self._clips = Clips(root, cache)
+        self._copies = root if isinstance(root, Copies) else None
+        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be had
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # that are loaded
         self._handover_seconds = 0.0  # that no result has named yet
@@ -101,8 +106,11 @@ class Worker:
             WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
             address,
             Tools(
-                is_ready=lambda lease: kernels_of(lease) <= self._kernels,
-                is_compiled=lambda lease: all(map(is_compiled, kernels_of(lease) - self._kernels)),
+                is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
+                is_compiled=lambda lease: (
+                    all(map(is_compiled, kernels_of(lease) - self._kernels))
+                    and (self._has_video(lease) or _size_bytes(lease) <= _SOON_FETCHED_BYTES)
+                ),
                 is_decoded=self._clips.has,
             ),
             is_watched=logbook is not None,
@@ -173,6 +181,7 @@ class Worker:
                 for variant in kernels_of(lease) - self._kernels:
                     load_in_turn(variant)
                     self._kernels.add(variant)
+                self._fetch(lease)
                 return conversation.loaded(time.monotonic())
             case Make(lease):
                 if not self._clips.has(lease):
@@ -190,6 +199,22 @@ class Worker:
                 return conversation.made(frames, now, spent)
             case _:
                 return []  # Leave
+
+    def _has_video(self, lease: Lease) -> bool:
+        """Whether there is nothing to wait for: its video is on this host, or could not be had, which is to be said."""
+        if self._copies is None or self._clips.has(lease):
+            return True
+        video = lease.video, lease.fingerprint
+        return (self._unfetched is not None and self._unfetched[0] == video) or self._copies.has(*video)
+
+    def _fetch(self, lease: Lease) -> None:
+        """Before the lease is begun: nobody is to blame for the time that a network takes."""
+        if self._copies is None or self._has_video(lease):
+            return
+        try:
+            self._copies.fetch(lease.video, lease.fingerprint)
+        except VideoError as error:
+            self._unfetched = (lease.video, lease.fingerprint), error
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """The first frames of all messages that are there."""
@@ -212,6 +237,9 @@ class Worker:
         Raises:
             VideoError: its video cannot give it.
         """
+        if self._unfetched is not None and self._unfetched[0] == (lease.video, lease.fingerprint):
+            error, self._unfetched = self._unfetched[1], None
+            raise error
         began = time.monotonic()
         room = room_for(lease, sample_layout(lease))
         has_room = time.monotonic()
@@ -266,9 +294,15 @@ def unshared_name(beginning: str | None) -> str:
     return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 
+def _size_bytes(lease: Lease) -> int:
+    """Of its video, which begins the fingerprint."""
+    size = lease.fingerprint.partition("-")[0]
+    return int(size) if size.isdecimal() else 0
+
+
 def run_worker(
     address: str,
-    root: Path,
+    root: Path | Copies,
     name: str | None,
     parent_pid: int | None,
     logbook: int | None = None,
@@ -280,7 +314,7 @@ def run_worker(
 
     Args:
         address: where the server listens for workers.
-        root: the corpus folder on this host.
+        root: the corpus folder on this host, or the copies of what is in object storage.
         name: unique name; by default host, process id and something random.
         parent_pid: the server, when this is one of its own processes: we die with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.

@@ -22,6 +22,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
+from v2v_server.cloud.copies import Copies, lent
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.variants import Variant, variants
@@ -96,13 +97,15 @@ def draft_of(lease: Lease, index: int) -> Draft:
     return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
 
 
-def decode_for(lease: Lease, indices: Sequence[int], root: Path, cache: Cache | None = None) -> tuple[Decoded, ...]:
+def decode_for(
+    lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
+) -> tuple[Decoded, ...]:
     """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
 
     Args:
         lease: the work.
         indices: of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to, on this host.
+        root: folder that the catalogue's ids are relative to, on this host; or their copies, from object storage.
         cache: where what is decoded is kept, and read by later epochs; None keeps nothing.
 
     Raises:
@@ -111,16 +114,17 @@ def decode_for(lease: Lease, indices: Sequence[int], root: Path, cache: Cache | 
     """
     drafts = [draft_of(lease, index) for index in indices]
     spec = drafts[0].spec
-    path = _below(root, lease.video)
+    _refuse_outside(lease.video)
     try:
         index, cuts = _frame_index(lease, spec.recipe.frames_needed), [draft.cut for draft in drafts]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
-        if cache is not None and not is_store_file(path):
-            rows = Rows.parse(lease.rows).bounds(lease.height_px)
-            clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
-        if clips is None:
-            clips = clips_of(path, lease.fingerprint, *what)
+        with lent(root, lease.video, lease.fingerprint) as path:
+            if cache is not None and not is_store_file(path):
+                rows = Rows.parse(lease.rows).bounds(lease.height_px)
+                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+            if clips is None:
+                clips = clips_of(path, lease.fingerprint, *what)
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
@@ -249,9 +253,8 @@ def _refusals(lease: Lease) -> tuple[Refusal, ...]:
     return tuple(Refusal(**item) for item in lease.refusals["refusals"])
 
 
-def _below(root: Path, video: str) -> Path:
-    """The file of a catalogue id, which may not lead out of the root whatever a message says."""
+def _refuse_outside(video: str) -> None:
+    """A catalogue id may not lead out of the root, whatever a message says."""
     relative = PurePosixPath(video)
     if relative.is_absolute() or ".." in relative.parts:
         raise ProtocolError(f"video id {video!r} leads out of the corpus folder")
-    return root.joinpath(relative)

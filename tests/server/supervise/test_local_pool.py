@@ -451,7 +451,7 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
 
 
 def test_the_programs_of_real_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    command = child_module.command("tcp://127.0.0.1:5556", Path("/a folder"), "w-0.1")
+    command = child_module.command("tcp://127.0.0.1:5556", "/a folder", "w-0.1")
     assert command[:3] == [sys.executable, "-m", "v2v_server.commands.worker"]
     assert command[3:] == [
         *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
