@@ -113,7 +113,8 @@ class Catalogue:
         self._fingerprint(id)
         with suppress(sqlite3.Error):
             known = self._store.state(id)
-            if known is not None and known[0] >= 0 and not self.root.is_there(id, *known):
+            # A row in doubt (size -1) was found wanting before.
+            if known is None or known[0] < 0 or not self.root.is_there(id, *known):
                 raise VideoChanged(id, None, f"is gone from {self.root}, or changed there")
         return None
 

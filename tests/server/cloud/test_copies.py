@@ -204,10 +204,10 @@ def test_many_at_once(store: Path) -> None:
     marks = {name: fingerprint(store / name) for name in ("a.mp4", "b.mp4", "deep/c.mp4")}
     backwards = dict(reversed(marks.items()))
     with multiprocessing.get_context("spawn").Pool(2) as processes:
-        told = [processes.apply_async(_read, (made, order, 40)) for order in (marks, backwards)]
+        told = [processes.apply_async(_read, (made, order, 100)) for order in (marks, backwards)]
         for each in told:
             assert each.get(60) == {(name, bytes([number]) * SIZE) for number, name in enumerate(marks)}
-    assert len(files(made)) == 2
+    assert 1 <= len(files(made)) <= 2
 
 
 def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:

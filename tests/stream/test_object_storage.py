@@ -1,0 +1,157 @@
+"""A stream from a bucket of a real object server (moto's, on this host): the same bytes, each video fetched once."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import UsageError
+
+moto = pytest.importorskip("moto.server", reason="moto[server] is not installed")
+pytest.importorskip("s3fs", reason="the extra 'cloud' is not installed")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+
+URL = "s3://corpus/videos"
+
+
+class Bucket:
+    """The server, what was fetched from it, and the files of the bucket."""
+
+    def __init__(self) -> None:
+        self.fetched: list[str] = []
+        self._server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+        self._server.start()
+        host, port = self._server.get_host_and_port()
+        self.address = f"http://{host}:{port}"
+        handler = logging.Handler()
+        handler.emit = self._note  # type: ignore[method-assign]
+        logging.getLogger("werkzeug").setLevel(logging.INFO)
+        logging.getLogger("werkzeug").addHandler(handler)
+        self._handler = handler
+
+    def _note(self, record: logging.LogRecord) -> None:
+        found = re.search(r'"?GET /corpus/videos/([^? ]+)(\?\S*)? HTTP', record.getMessage())
+        if found:
+            self.fetched.append(unquote(found[1]))
+
+    def client(self) -> Any:
+        import boto3
+
+        return boto3.client("s3", endpoint_url=self.address, region_name="us-east-1")
+
+    def fill(self, folder: Path) -> None:
+        client = self.client()
+        client.create_bucket(Bucket="corpus")
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                client.upload_file(str(path), "corpus", f"videos/{path.relative_to(folder).as_posix()}")
+        self.fetched.clear()
+
+    def delete(self, id: str) -> None:
+        self.client().delete_object(Bucket="corpus", Key=f"videos/{id}")
+
+    def stop(self) -> None:
+        logging.getLogger("werkzeug").removeHandler(self._handler)
+        self._server.stop()
+
+
+@pytest.fixture
+def bucket(clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bucket]:
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "test-key", "AWS_SECRET_ACCESS_KEY": "test-secret", "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true", "V2V_CACHE_DIR": str(tmp_path / "cache"), "AWS_CONFIG_FILE": "/none",
+        "AWS_SHARED_CREDENTIALS_FILE": "/none",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    running = Bucket()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", running.address)
+    try:
+        running.fill(clips)
+        yield running
+    finally:
+        running.stop()
+
+
+def digests(address: str, epoch: int) -> list[str]:
+    return [digest(batch) for batch in epoch_of(address, epoch=epoch)]
+
+
+def forget_copies(tmp_path: Path) -> None:
+    """As on another host, which has the index only."""
+    shutil.rmtree(tmp_path / "cache" / "copies")
+
+
+def test_the_bytes_are_those_of_the_folder_and_each_video_is_fetched_once(
+    clips: Path, bucket: Bucket, tmp_path: Path
+) -> None:
+    ids = sorted(path.relative_to(clips).as_posix() for path in clips.rglob("*") if path.is_file())
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
+        reference = [digests(local.address, epoch) for epoch in range(2)]
+    with LocalServer(URL, workers=2, flags=SMALL_FLAGS) as server:
+        assert sorted(bucket.fetched) == ids, "the catalogue fetches each video once"
+        assert [digests(server.address, epoch) for epoch in range(2)] == reference
+    assert len(bucket.fetched) == len(ids), "workers find the copies"
+    forget_copies(tmp_path)
+    bucket.fetched.clear()
+    with LocalServer(URL, workers=3, flags=SMALL_FLAGS) as server:
+        assert bucket.fetched == [], "the ETags say that nothing changed"
+        assert digests(server.address, 0) == reference[0]
+        assert sorted(bucket.fetched) == ids, "workers of one host fetch each video once"
+        assert digests(server.address, 1) == reference[1]
+        assert len(bucket.fetched) == len(ids), "the second epoch fetches nothing"
+
+
+def test_a_server_that_is_started_again_mid_epoch_goes_on(clips: Path, bucket: Bucket) -> None:
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
+        reference = digests(local.address, 0)
+    with LocalServer(URL, workers=2, flags=SMALL_FLAGS) as server:
+        stream = iter(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3))
+        batches = [next(stream), next(stream)]
+        state = batches[-1].resume_state
+    bucket.fetched.clear()
+    with LocalServer(URL, workers=1, flags=SMALL_FLAGS) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)
+        dataset.load_state_dict(state)
+        batches += list(dataset)
+    assert [digest(batch) for batch in batches] == reference
+    assert bucket.fetched == []
+
+
+def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path: Path) -> None:
+    with LocalServer(URL, workers=2, flags=SMALL_FLAGS) as server:
+        forget_copies(tmp_path)
+        (tmp_path / "cache" / "copies" / "partial").mkdir(parents=True)
+        bucket.delete("a.mp4")
+        batches = epoch_of(server.address)
+        refusals = {each.video: each.reason for batch in batches for item in batch.provenance for each in item.refusals}
+        assert refusals == {"a.mp4": f"is not in {URL} any more"}
+    shown = subprocess.run(
+        [sys.executable, "-m", "v2v_server.commands.quarantine", "--videos", URL],
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    assert "holds 0 verdicts" in shown.stdout
+    with LocalServer(URL, workers=0, flags=[*SMALL_FLAGS, "--list-refused"]) as server:
+        assert "6 videos in s3://corpus/videos" in server.last_lines()
+
+
+def test_no_credentials_are_one_clear_message(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    with pytest.raises(UsageError) as raised, LocalServer(URL, workers=1, flags=SMALL_FLAGS):
+        pass
+    said = str(raised.value)
+    assert "access is denied" in said
+    assert "AWS_PROFILE" in said
+    assert said.count("\n") == 0
