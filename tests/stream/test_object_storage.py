@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -15,6 +17,7 @@ from urllib.parse import unquote
 import pytest
 
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError
@@ -59,6 +62,15 @@ class Bucket:
                 client.upload_file(str(path), "corpus", f"videos/{path.relative_to(folder).as_posix()}")
         self.fetched.clear()
 
+    def pause(self) -> None:
+        """From now on nobody answers."""
+        self._server.stop()
+
+    def go_on(self) -> None:
+        host, _, port = self.address.removeprefix("http://").rpartition(":")
+        self._server = moto.ThreadedMotoServer(ip_address=host, port=int(port), verbose=False)
+        self._server.start()
+
     def delete(self, id: str) -> None:
         self.client().delete_object(Bucket="corpus", Key=f"videos/{id}")
 
@@ -91,6 +103,12 @@ def digests(address: str, epoch: int) -> list[str]:
 def forget_copies(tmp_path: Path) -> None:
     """As on another host, which has the index only."""
     shutil.rmtree(tmp_path / "cache" / "copies")
+    (tmp_path / "cache" / "copies" / "partial").mkdir(parents=True)
+
+
+def all_lines(server: LocalServer) -> str:
+    assert server._errors is not None
+    return os.pread(server._errors.fileno(), 1 << 20, 0).decode(errors="replace")
 
 
 def test_the_bytes_are_those_of_the_folder_and_each_video_is_fetched_once(
@@ -132,7 +150,6 @@ def test_a_server_that_is_started_again_mid_epoch_goes_on(clips: Path, bucket: B
 def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path: Path) -> None:
     with LocalServer(URL, workers=2, flags=SMALL_FLAGS) as server:
         forget_copies(tmp_path)
-        (tmp_path / "cache" / "copies" / "partial").mkdir(parents=True)
         bucket.delete("a.mp4")
         batches = epoch_of(server.address)
         refusals = {each.video: each.reason for batch in batches for item in batch.provenance for each in item.refusals}
@@ -144,6 +161,19 @@ def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path:
     assert "holds 0 verdicts" in shown.stdout
     with LocalServer(URL, workers=0, flags=[*SMALL_FLAGS, "--list-refused"]) as server:
         assert "6 videos in s3://corpus/videos" in server.last_lines()
+
+
+def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp_path: Path) -> None:
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as local:
+        reference = digests(local.address, 0)
+    with LocalServer(URL, workers=1, flags=SMALL_FLAGS) as server, ThreadPoolExecutor(1) as thread:
+        forget_copies(tmp_path)
+        bucket.pause()
+        epoch = thread.submit(digests, server.address, 0)
+        until(lambda: "which is not known to be gone or changed: cannot be fetched after 3 tries" in all_lines(server))
+        bucket.go_on()
+        assert epoch.result(120) == reference
+        assert "passed over" not in all_lines(server)
 
 
 def test_no_credentials_are_one_clear_message(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:

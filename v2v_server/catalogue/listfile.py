@@ -2,7 +2,8 @@
 
 The columns after the path may be left out from the right. A single threshold holds for both polarities. Paths may hold
 spaces, since no path ends in a number of its own; ``#`` at the beginning of a line makes it a comment. In a ``.csv``
-file commas separate the columns, and a first line whose first column reads ``path`` is its heading.
+file commas separate the columns, and a first line whose first column reads ``path`` is its heading. WebVid's own tables
+(``videoid,contentUrl,duration,page_dir,name``) name ``page_dir/videoid.mp4``, as its downloaders write them.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
     columns = _comma_columns if Path(path).suffix.lower() == ".csv" else _space_columns
     entries: dict[str, int] = {}
     found: list[ListEntry] = []
+    webvid: list[int] = []
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -63,7 +65,10 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
             fields = columns(line.strip())
             if not found and fields[0].lower() == "path":
                 continue
-            entry = _entry(fields)
+            if not found and {"videoid", "page_dir"} <= set(fields):
+                webvid = [fields.index("page_dir"), fields.index("videoid")]
+                continue
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields)
             if entry.id in entries:
                 raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
         except (ValueError, csv.Error) as error:
@@ -92,6 +97,12 @@ def _words_from_the_right(line: str) -> Iterator[str]:
             return
         yield match[0]
         line = line[: match.start()]
+
+
+def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
+    if len(fields) <= max(folder, video):
+        raise ValueError(f"{len(fields)} columns, fewer than the heading has")
+    return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
 def _entry(fields: list[str]) -> ListEntry:

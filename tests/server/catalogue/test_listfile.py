@@ -58,6 +58,13 @@ def test_nonsense_names_its_line(tmp_path: Path, line: str, why: str) -> None:
         read_list(written(tmp_path, f"good.mp4 5\n{line}\n"))
 
 
+def test_webvids_own_table(tmp_path: Path) -> None:
+    rows = 'videoid,contentUrl,duration,page_dir,name\n21179416,https://x/1.mp4,PT00H00M11S,006001_006050,"A, b"\n'
+    assert [entry.id for entry in read_list(written(tmp_path, rows, "list.csv"))] == ["006001_006050/21179416.mp4"]
+    with pytest.raises(CorpusError, match="line 3: 2 columns, fewer than the heading has"):
+        read_list(written(tmp_path, rows + "1,2\n", "list.csv"))
+
+
 @pytest.mark.parametrize(
     ("line", "why"), [("a.mp4,ten", "not a number"), ("a.mp4,1,2,3,4", "5 columns"), ('"a', "line 1")]
 )
