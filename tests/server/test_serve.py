@@ -82,13 +82,12 @@ def served(
     supervisor: ToySupervisor | None = None,
     transport: Queues | None = None,
     clock: Callable[[], float] | None = None,
+    check: Callable[[str, str], None] | None = None,
     **settings: Any,
 ) -> Server:
     """A server that has made one turn."""
     doubted: list[str] = []
-    catalogue = SimpleNamespace(
-        path=lambda video: folder / video, doubted=doubted, doubt=doubted.append, root=folder, videos=(), refusals=()
-    )
+    catalogue = SimpleNamespace(check=check, doubted=doubted, doubt=doubted.append, root=folder, videos=(), refusals=())
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),
@@ -124,17 +123,14 @@ def test_a_record_that_cannot_be_written_is_said_and_the_server_goes_on(
 
 
 @pytest.mark.parametrize("found", [True, False])
-def test_what_is_looked_for_is_reported(
-    found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def check(path: Path, fingerprint: str) -> None:
+def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def check(id: str, fingerprint: str) -> None:
         if not found:
             raise VideoChanged("a.mp4", None, "another file")
 
-    monkeypatch.setattr(serve_module, "check_file", check)
     missing = LookFor("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
     dispatcher = Scripted([missing, missing])
-    server = served(dispatcher, tmp_path)
+    server = served(dispatcher, tmp_path, check=check)
     assert dispatcher.told == [("looked for", missing, found)] * 2
     assert cast(Any, server)._catalogue.doubted == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
