@@ -11,10 +11,11 @@ import os
 import socket
 import stat
 import struct
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from v2v_protocol.errors import KeyRefused
 
@@ -123,6 +124,16 @@ def write_private(file: Path, content: str) -> None:
     """
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as opened:
         opened.write(content)
+
+
+def nameless_key(key: PeerKey) -> IO[bytes]:
+    """A key file without a name, in memory where the system can: who is handed it reads it as ``/dev/fd/NUMBER``."""
+    in_memory = hasattr(os, "memfd_create")
+    file = os.fdopen(os.memfd_create("v2v-key"), "w+b") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
+    os.fchmod(file.fileno(), 0o600)
+    file.write(json.dumps(asdict(key)).encode())
+    file.flush()
+    return file
 
 
 class Handshakes:

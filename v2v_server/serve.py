@@ -138,15 +138,16 @@ def serve(config: ServeConfig) -> None:
     if isinstance(catalogue.root, Copies):
         worker_flags += ["--copies", str(catalogue.root.folder), "--copies-gib", str(config.copies_gib)]
     label = f"w{secrets.token_hex(4)}"
+    keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with _stop_on_signals(stop):
-        supervisor = make_supervisor(config, catalogue.root, label, worker_flags)
+        supervisor = make_supervisor(config, catalogue.root, label, worker_flags, keys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
             most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
             most_queued_bytes=config.max_credit_bytes,
-            keys=KeyFolder(Path(config.keys)) if config.keys else None,
+            keys=keys,
             local_bind=_private_address(label),
         )
         page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None

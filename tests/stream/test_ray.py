@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +21,8 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_protocol.keys import read_key
+from v2v_server.keys.folder import KeyFolder
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.filterwarnings("ignore")]
@@ -157,3 +163,105 @@ def raylet_of(process: psutil.Process) -> int:
 
 def pid_of_raylet(node: Any) -> int:
     return int(node.all_processes["raylet"][0].process.pid)
+
+
+def session_of(cluster: Any) -> Path:
+    """Where Ray keeps logs and all else of a cluster."""
+    return Path(cluster.head_node.get_session_dir_path())
+
+
+def holding(folder: Path, secret: bytes) -> list[str]:
+    """Files below a folder with that text."""
+    found = []
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.is_symlink() and secret in path.read_bytes():
+            found.append(path.name)
+    return found
+
+
+def test_workers_on_a_cluster_get_a_key_that_is_written_down_nowhere(
+    clips: Path, cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = KeyFolder(tmp_path / "keys")
+    keys.init()
+    keys.new("gpu", "consumer", tmp_path / "gpu.key")
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
+        reference = [digest(batch) for batch in epoch_of(local.address)]
+    monkeypatch.setenv("V2V_KEYS", str(tmp_path / "gpu.key"))
+    with LocalServer(clips, workers=2, flags=[*flags_for(cluster), "--keys", str(tmp_path / "keys")]) as server:
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+        workers()[0].kill()
+        until(lambda: len(workers()) == 2)
+        flags = [process.cmdline() for process in workers()]
+        files = [f"/proc/{process.pid}/fd/{Path(line[line.index('--keys') + 1]).name}" for process, line in
+                 zip(workers(), flags, strict=True)]  # fmt: skip
+        lent = [read_key(Path(file)) for file in files]
+        assert {(key.side, key.name[:4]) for key in lent} == {("worker", "ray-")}
+        (secret,) = {key.secret.encode() for key in lent}
+        for process in [*psutil.Process().children(recursive=True), psutil.Process()]:
+            with contextlib.suppress(psutil.Error):
+                shown = " ".join([*process.cmdline(), *process.environ().values()])
+                assert secret.decode() not in shown, process.name()
+        said = log_of(server)
+        session = session_of(cluster)
+        assert secret.decode() not in said
+        assert holding(session, lent[0].name.removeprefix("ray-").encode()), "these are the logs of another cluster"
+        assert holding(session, secret) == []
+        assert holding(tmp_path, secret) == []
+    assert holding(session, secret) == []
+    (session / "logs" / "planted").write_bytes(b"x" + secret)
+    assert holding(session, secret) == ["planted"]
+
+
+def test_ray_train_goes_on_where_a_rank_was_lost(clips: Path, cluster: Any, tmp_path: Path) -> None:
+    pytest.importorskip("ray.train", reason="ray[train] is not installed", exc_type=ImportError)
+    seen = tmp_path / "seen"
+    seen.mkdir()
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        # A global batch is two ranks' of two.
+        batches = [batch for epoch in range(2) for batch in epoch_of(server.address, epoch=epoch, batch_size=4)]
+        expected = sorted((batch.epoch, index) for batch in batches for index in batch.indices)
+        running = subprocess.Popen(
+            [
+                sys.executable, "-m", "examples.ray_train", "--connect", server.address, "--storage",
+                str(tmp_path / "storage"), "--seen", str(seen), "--epochs", "2",
+                "--recipe", json.dumps(SMALL.to_dict()),
+            ],
+            env={**os.environ, "RAY_ADDRESS": cluster.address}, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            until(lambda: len(notes(seen)) >= 10)
+            rank = next(
+                process for process in psutil.Process().children(recursive=True)
+                if any("TrainWorker" in part for part in process.cmdline())
+            )  # fmt: skip
+            rank.kill()
+            printed, _ = running.communicate(timeout=200)
+        finally:
+            running.kill()
+            running.wait()
+    assert running.returncode == 0, printed
+    trained: dict[tuple[int, int], tuple[int, list[int]]] = {}
+    for rank_number, note in notes(seen):
+        samples = note["epoch"], note["indices"]
+        assert trained.setdefault((rank_number, note["step"]), samples) == samples, "a step came again as another one"
+    assert sorted((epoch, index) for epoch, indices in trained.values() for index in indices) == expected
+    begun: dict[tuple[int, int], int] = {}
+    for rank_number, note in notes(seen):
+        begun.setdefault((rank_number, note["process"]), note["step"])
+    (one, again), (other, other_again) = (
+        [at for (number, _), at in begun.items() if number == each] for each in (0, 1)
+    )
+    assert (one, other) == (1, 1)
+    assert again == other_again > 1, "both ranks were started again, from one checkpoint"
+    assert json.loads(printed.splitlines()[-1])["step"] * 2 == len(trained) == len(batches) * 2
+
+
+def notes(seen: Path) -> list[tuple[int, dict[str, Any]]]:
+    """(rank, what it noted of a step); a line that is being written is none yet."""
+    return [
+        (int(path.stem), json.loads(line))
+        for path in seen.glob("*.jsonl")
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)
+        if line.endswith("\n")
+    ]

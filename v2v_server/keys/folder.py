@@ -5,7 +5,8 @@
     worker/NAME         public key of a worker
 
 What is given to a peer (:mod:`v2v_protocol.keys`) is written elsewhere; its secret is not kept here. To revoke a key is
-to remove its file: a running server looks twice a second.
+to remove its file: a running server looks twice a second. What a server lends to workers that it starts on other hosts
+is in its memory only.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class KeyFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._server = path / "server.key"
+        self._lent: dict[str, dict[str, str]] = {side: {} for side in SIDES}
 
     def init(self) -> None:
         """Makes the folder and the server's keys.
@@ -88,6 +90,17 @@ class KeyFolder:
         except OSError as error:
             raise UsageError(f"{error.filename}: {error.strerror}") from error
 
+    def lend(self, name: str, side: str) -> PeerKey:
+        """A key that nobody writes down: it lets in until this object is gone.
+
+        Raises:
+            KeyRefused: the server has no keys.
+        """
+        server, _ = self.server_keys()
+        public, secret = (key.decode() for key in zmq.curve_keypair())
+        self._lent[side][public] = name
+        return PeerKey(side, name, server.decode(), public, secret)
+
     def revoke(self, name: str) -> list[str]:
         """Removes the keys of that name; returns their sides.
 
@@ -114,7 +127,7 @@ class KeyFolder:
 
     def allowed(self) -> dict[str, dict[str, str]]:
         """Of each side: names by public key."""
-        return {side: self._of(side) for side in SIDES}
+        return {side: self._of(side) | self._lent[side] for side in SIDES}
 
     def _of(self, side: str) -> dict[str, str]:
         found: dict[str, str] = {}

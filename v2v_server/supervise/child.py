@@ -3,6 +3,7 @@ local pool, and an engine's actor on another host."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import psutil
 
+from v2v_protocol.keys import PeerKey, nameless_key
 from v2v_protocol.programs import environment
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.worker.logbook import Logbook
@@ -21,7 +23,9 @@ _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
-def start_child(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> subprocess.Popen[bytes]:
+def start_child(
+    address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
+) -> subprocess.Popen[bytes]:
     """A worker in a process of its own, which dies with this one.
 
     Args:
@@ -30,17 +34,23 @@ def start_child(address: str, root: str, name: str, flags: Sequence[str], logboo
         name: of the worker, which no other has.
         flags: more of them.
         logbook: for the lease it is at.
+        key: its key, which it gets in a nameless file: neither command line, environment nor disk shows it.
 
     Raises:
         OSError: it cannot be started.
     """
-    return subprocess.Popen(
-        [*command(address, root, name), *flags, "--logbook-fd", str(logbook.descriptor)],
-        stdin=subprocess.DEVNULL,
-        pass_fds=(logbook.descriptor,),
-        env=environment() | _ONE_THREAD,
-        process_group=0,
-    )
+    with contextlib.ExitStack() as open_here:
+        handed = [logbook.descriptor]
+        if key is not None:
+            handed.append(open_here.enter_context(nameless_key(key)).fileno())
+            flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
+        return subprocess.Popen(
+            [*command(address, root, name), *flags, "--logbook-fd", str(logbook.descriptor)],
+            stdin=subprocess.DEVNULL,
+            pass_fds=handed,
+            env=environment() | _ONE_THREAD,
+            process_group=0,
+        )
 
 
 def command(address: str, root: str, name: str) -> list[str]:

@@ -8,11 +8,14 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
+from v2v_server.keys.folder import KeyFolder
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Supervisor
 
 
-def make_supervisor(config: ServeConfig, root: Path | Copies, label: str, flags: list[str]) -> Supervisor:
+def make_supervisor(
+    config: ServeConfig, root: Path | Copies, label: str, flags: list[str], keys: KeyFolder | None = None
+) -> Supervisor:
     """The supervisor that the configuration asks for.
 
     Args:
@@ -20,6 +23,7 @@ def make_supervisor(config: ServeConfig, root: Path | Copies, label: str, flags:
         root: the corpus folder, or the copies of what is in object storage.
         label: prefix of the workers' names, unique to this server.
         flags: more of them for each worker.
+        keys: of the server, which lends one to workers on other hosts.
 
     Raises:
         UsageError: its engine is not installed, or there is no cluster.
@@ -35,5 +39,6 @@ def make_supervisor(config: ServeConfig, root: Path | Copies, label: str, flags:
             "--engine ray needs the Python package ray, which is not installed; the extra 'ray' brings it: "
             "pip install '.[server,ray]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
-    supervisor: Supervisor = engine.RayWorkers(str(root), label, flags, config.ray_address, config.ray_labels)
+    key = None if keys is None else keys.lend(f"ray-{label}", "worker")
+    supervisor: Supervisor = engine.RayWorkers(str(root), label, flags, config.ray_address, config.ray_labels, key)
     return supervisor

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import ray
 
+from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Loss
 from v2v_server.supervise.child import out_of_memory_kills, post_mortem, start_child, status_of
 from v2v_server.worker.logbook import Logbook
@@ -44,9 +45,11 @@ class RayWorker:
     Args:
         root: the corpus, a folder of its node or an address.
         flags: more of them for the worker.
+        key: of the worker; None: what ``V2V_KEYS`` names on its node.
     """
 
-    def __init__(self, root: str, flags: Sequence[str]) -> None:
+    def __init__(self, root: str, flags: Sequence[str], key: PeerKey | None = None) -> None:
+        self._key = key
         self._root, self._flags = root, list(flags)
         self._lock = threading.Lock()
         self._child: tuple[str, subprocess.Popen[bytes], Logbook] | None = None
@@ -67,7 +70,7 @@ class RayWorker:
             logbook = Logbook()
             with contextlib.ExitStack() as undo:
                 undo.callback(logbook.close)
-                process = start_child(address, self._root, name, self._flags, logbook)
+                process = start_child(address, self._root, name, self._flags, logbook, self._key)
                 undo.pop_all()
             self._child = name, process, logbook
         returncode = process.wait()

@@ -24,6 +24,7 @@ from ray.autoscaler.sdk import request_resources
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.supervise.child import STOPPED, hung
 from v2v_server.supervise.protocol import Death
@@ -70,6 +71,7 @@ class RayWorkers:
         flags: more of them for each worker.
         address: of the cluster, HOST:PORT; "auto" is the one that this host is a node of.
         selector: labels of the nodes that may have workers.
+        key: of the workers; None: what ``V2V_KEYS`` names on each node.
 
     Raises:
         UsageError: there is no cluster.
@@ -82,8 +84,9 @@ class RayWorkers:
         flags: Sequence[str] = (),
         address: str = "auto",
         selector: dict[str, str] | None = None,
+        key: PeerKey | None = None,
     ) -> None:
-        self._arguments = root, list(flags)
+        self._arguments = root, list(flags), key
         self._label = label
         self._selector = selector or {}
         self._address = ""

@@ -287,3 +287,14 @@ def test_a_server_whose_words_were_lost_is_asked_again(tmp_path: Path, sockets: 
 def test_a_folder_without_keys_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"server.key cannot be read"):
         Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=KeyFolder(tmp_path))
+
+
+def test_a_lent_key_is_a_workers_and_on_no_disk(folder: KeyFolder, tmp_path: Path) -> None:
+    key = folder.lend("ray-1", "worker")
+    allowed = folder.allowed()
+    assert allowed["worker"][key.public] == "ray-1"
+    assert key.public not in allowed["consumer"]
+    assert key.public not in KeyFolder(folder.path).allowed()["worker"]
+    for path in tmp_path.rglob("*"):
+        if path.is_file():
+            assert key.secret.encode() not in path.read_bytes()
