@@ -1,0 +1,47 @@
+"""Clips from photographs: smooth, of a fixed size, the same for the same seed."""
+
+import sys
+
+import av
+import cv2
+import numpy as np
+import pytest
+from skimage import data
+
+from examples import pan_photographs
+
+
+def test_a_camera_without_speed_stands_still():
+    steps = pan_photographs.motion(np.random.default_rng(0), 0.0)
+    np.testing.assert_allclose(steps, np.broadcast_to(np.eye(3), steps.shape), atol=1e-12)
+
+
+def test_motion_begins_at_rest_position_and_never_jumps():
+    steps = pan_photographs.motion(np.random.default_rng(1), 2.0)
+    np.testing.assert_allclose(steps[0], np.eye(3), atol=1e-12)
+    middle = steps @ [pan_photographs.WIDTH / 2, pan_photographs.HEIGHT / 2, 1]
+    path = middle[:, :2] / middle[:, 2:]
+    jumps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    assert jumps.mean() > 0.1
+    assert jumps.max() < 15
+
+
+def test_a_folder_of_photographs_becomes_clips(tmp_path, monkeypatch):
+    cv2.imwrite(str(tmp_path / "cat.png"), data.chelsea()[..., ::-1])
+    monkeypatch.setattr(pan_photographs, "FRAMES", 12)
+    for name in ("a", "b"):
+        monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / name), "--clips", "1", "--seed", "3"])
+        pan_photographs.main()
+    a, b = (tmp_path / name / "pan_0000.mp4" for name in ("a", "b"))
+    assert a.read_bytes() == b.read_bytes()
+    with av.open(str(a)) as file:
+        frames = [frame.to_ndarray(format="gray") for frame in file.decode(video=0)]
+    assert len(frames) == 12
+    assert frames[0].shape == (pan_photographs.HEIGHT, pan_photographs.WIDTH)
+    assert np.abs(frames[0].astype(int) - frames[11]).mean() > 1
+
+
+def test_a_folder_without_photographs_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="no photograph"):
+        pan_photographs.main()
