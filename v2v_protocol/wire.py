@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import msgpack
@@ -53,6 +53,8 @@ LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
+_ENCRYPTION_BYTES = 64
+"""CURVE adds 33 to a frame."""
 _MOST_ARRAYS = 8
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
@@ -204,6 +206,19 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
         raise type(error)(f"{name}.{key}: {error}") from None
     message: Message = cls(**fields)
     return message
+
+
+def largest_packed_bytes(size: int) -> int:
+    """Most that an array of so many bytes takes compressed: noise grows by a 256th and a little."""
+    return size + size // 256 + 64
+
+
+def largest_frame_bytes(sizes: Iterable[int]) -> int:
+    """Most that ZeroMQ counts for a frame of a sample with arrays of these sizes, compressed and encrypted or not.
+
+    What is larger cuts its sender off (MAXMSGSIZE), so a byte too few here is a stream that never begins.
+    """
+    return max(LARGEST_HEADER_BYTES, *(largest_packed_bytes(size) + _ENCRYPTION_BYTES for size in sizes))
 
 
 def decode_sample(

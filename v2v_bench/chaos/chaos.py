@@ -206,7 +206,7 @@ def show(record: dict[str, Any], recoveries: dict[str, list[float]], console: Co
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
-    parser = _parser()
+    parser = parser_of_chaos(__doc__, "python -m v2v_bench.chaos.chaos")
     asked = parser.parse_args(arguments)
     try:
         return _run(asked)
@@ -217,10 +217,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _parser() -> argparse.ArgumentParser:
-    first, _, rest = (__doc__ or "").partition("\n\n")
+def parser_of_chaos(doc: str | None, prog: str) -> argparse.ArgumentParser:
+    """Its flags, for a command of that docstring and name."""
+    first, _, rest = (doc or "").partition("\n\n")
     parser = argparse.ArgumentParser(
-        prog="python -m v2v_bench.chaos.chaos",
+        prog=prog,
         description=first,
         epilog=rest,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -261,13 +262,18 @@ def _run(asked: argparse.Namespace) -> int:
         cache = folder / "decoded" if asked.cache else None
         fleet = Fleet(folder, videos, asked.workers, asked.consumers, asked.lease_deadline_seconds, clip_cache=cache)
         most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1
-        return _torment_and_judge(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)
+        return torment_and_judge(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)
     finally:
         if asked.keep is None:
             shutil.rmtree(folder)
 
 
-def _torment_and_judge(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) -> int:
+def torment_and_judge(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) -> int:
+    """Starts a fleet, torments it for ``asked.minutes``, prints and writes what came of it; returns the exit status.
+
+    Raises:
+        UsageError: it does not come up, or cannot be checked.
+    """
     shared = shared_memory()
     try:
         fleet.start()

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_bench.chaos.log import BatchLine, LifeLine, LogWriter, sighting
+from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import V2VError
 from v2v_protocol.spec import StreamSpec
 
@@ -102,6 +103,7 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
         rank=0,
         world_size=1,
         timeout_seconds=timeout_seconds,
+        shared_memory=not leaves_host(address),  # another host may be played by this one (v2v_bench/link)
         **asked.spec,
     )
     state_path = folder / "state.json"

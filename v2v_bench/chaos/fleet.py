@@ -86,6 +86,8 @@ class Fleet:
         server_module: what is run as the server.
         server_flags: more of its flags.
         clip_cache: folder of decoded clips, for the server's own workers; None: they keep none.
+        host: where the server listens.
+        elsewhere: what the commands of consumers and further workers begin with, to run them on another host.
 
     Attributes:
         failures: processes that ended unasked.
@@ -100,6 +102,8 @@ class Fleet:
     server_module: str = "v2v_server"
     server_flags: tuple[str, ...] = ()
     clip_cache: Path | None = None
+    host: str = "127.0.0.1"
+    elsewhere: tuple[str, ...] = ()
     failures: list[Failure] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
@@ -114,13 +118,14 @@ class Fleet:
     def __post_init__(self) -> None:
         for name in ("tmp", "cache", "server"):
             (self.folder / name).mkdir(parents=True)
-        self._address, self._worker_address = (f"tcp://127.0.0.1:{port}" for port in free_ports(2))
+        self._address, self._worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
         self.server = Process("server", self._server_command(), self.folder / "server")
         self.crowd = []
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
             command = [
+                *self.elsewhere,
                 sys.executable,
                 "-X",
                 "faulthandler",
@@ -221,7 +226,8 @@ class Fleet:
         self._added += 1
         folder = self.folder / name
         folder.mkdir()
-        command = [sys.executable, "-m", "v2v_server.commands.worker", "--connect", self._worker_address]
+        command = [*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"]
+        command += ["--connect", self._worker_address]
         place = Process(f"worker {name}", [*command, "--videos", str(self.videos), "--name", name], folder)
         self._spawn(place)
         self.further_workers.append(place)
@@ -327,7 +333,7 @@ class Fleet:
                 left.append(f"zombie {child.pid}")
         for port in self.ports:
             with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                if probe.connect_ex((self.host, port)) == 0:
                     left.append(f"port {port} still listens")
         left += [f"file {path.relative_to(self.folder)}" for path in sorted(self.tmp.rglob("*")) if path.is_file()]
         left += [

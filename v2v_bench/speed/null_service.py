@@ -44,7 +44,7 @@ class NullService:
 
 @contextmanager
 def null_service(
-    recipe: Recipe, *, workers: int, sequences: int = 240, flags: Sequence[str] = ()
+    recipe: Recipe, *, workers: int, sequences: int = 240, flags: Sequence[str] = (), samples: Path | None = None
 ) -> Iterator[NullService]:
     """A server over small videos, which are catalogued and never opened again, with null workers.
 
@@ -53,6 +53,7 @@ def null_service(
         workers: null workers.
         sequences: least number in an epoch; an epoch's end costs a consumer a new session.
         flags: for ``v2v-serve``; they must give that recipe.
+        samples: folder of what they send, ``NAME.npy`` of each array; None: ones.
 
     Raises:
         ServerLost, UsageError: the server, or the null workers, do not start.
@@ -77,7 +78,7 @@ def null_service(
                 "--workers",
                 str(workers),
             ]
-            command += ["--parent-pid", str(os.getpid())]
+            command += ["--parent-pid", str(os.getpid()), *([] if samples is None else ["--samples", str(samples)])]
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
             try:
                 # A consumer that came earlier would get the credit of a server without workers.

@@ -1,4 +1,5 @@
-"""Server workers that make nothing: every lease is answered at once with constant arrays of the right shapes.
+"""Server workers that make nothing: every lease is answered at once with constant arrays of the right shapes, or with
+samples that were made before (``--samples``).
 
     python -m v2v_bench.speed.null_worker --connect ADDRESS --workers 64
 
@@ -15,9 +16,12 @@ import signal
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import zmq
 
 from v2v_protocol import NUMERICS_VERSION
@@ -40,6 +44,9 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
 from v2v_server.system.process import die_with_parent, keep_freed_memory
 from v2v_server.worker.handover import room_for, sample_message
 from v2v_server.worker.produce import sample_layout
+
+Ready = Mapping[str, npt.NDArray[Any]]
+"""Samples that were made before: [samples, ...] of each array."""
 
 CREDIT = 2
 """Leases that each of them holds at a time, like a real worker."""
@@ -68,9 +75,11 @@ class NullWorkers:
     Args:
         address: where the server listens for workers.
         count: how many.
+        samples: see :func:`answer`.
     """
 
-    def __init__(self, address: str, count: int) -> None:
+    def __init__(self, address: str, count: int, samples: Ready | None = None) -> None:
+        self._samples = samples
         self._context = zmq.Context()
         self._poller = zmq.Poller()
         self._names: dict[zmq.Socket[bytes], str] = {}
@@ -147,15 +156,17 @@ class NullWorkers:
         if self._begun.get(link) != lease.lease:
             link.send_multipart(encode(Begun(lease.lease)))
         begins = self._begun[link] = leases[0].lease if leases else 0
-        link.send_multipart([*encode(Result(lease.lease, begins)), *answer(lease, self._names[link])], copy=False)
+        frames = answer(lease, self._names[link], self._samples)
+        link.send_multipart([*encode(Result(lease.lease, begins)), *frames], copy=False)
 
 
-def answer(lease: Lease, name: str) -> list[Any]:
+def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:
     """The frames of a whole sample message that fits the lease.
 
     Args:
         lease: what was asked.
         name: of the worker.
+        samples: arrays to send, in turn, of the leases' form; None sends ones.
     """
     index = lease.indices[0]
     provenance = Provenance(
@@ -173,8 +184,11 @@ def answer(lease: Lease, name: str) -> list[Any]:
     )
     room = room_for(lease, sample_layout(lease))
     # Memory that nobody wrote to is one page of zeros to the kernel, and nearly free to send.
-    for array in room.arrays.values():
-        array.fill(1)
+    for array_name, array in room.arrays.items():
+        if samples is None:
+            array.fill(1)
+        else:
+            np.copyto(array, samples[array_name][index % len(samples[array_name])])
     return sample_message(lease, room, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
 
 
@@ -185,14 +199,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="the server's --worker-bind")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="how many (default 1)")
+    parser.add_argument("--samples", type=Path, metavar="DIR", help="what they send: NAME.npy of each array")
     parser.add_argument("--parent-pid", type=int, metavar="PID", help="end when this process does")
     asked = parser.parse_args(arguments)
     if asked.parent_pid is not None:
         die_with_parent(asked.parent_pid)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    samples = None if asked.samples is None else {file.stem: np.load(file) for file in asked.samples.glob("*.npy")}
     try:
-        NullWorkers(asked.connect, asked.workers).run()
+        NullWorkers(asked.connect, asked.workers, samples).run()
     except (V2VError, zmq.ZMQError) as error:
         print(f"null_worker: {error}", file=sys.stderr)
         return 2

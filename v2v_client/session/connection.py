@@ -23,7 +23,7 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.messages import Hello, SampleHeader
 from v2v_protocol.sample import Layout, Provenance
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
 """How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
@@ -122,7 +122,7 @@ class Connection:
                 self._link.connect(self._largest_frame_bytes)
                 self._await_welcome()
                 self._leave(self._open_link())
-            self._largest_frame_bytes = max(LARGEST_HEADER_BYTES, *self._conversation.form.sizes)
+            self._largest_frame_bytes = largest_frame_bytes(self._conversation.form.sizes)
             self._open_link().connect(self._largest_frame_bytes)
             self._await_welcome()
             self._listening.pause(self._clock())  # until here we listened

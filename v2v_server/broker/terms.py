@@ -17,7 +17,7 @@ from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease, SampleHeader
 from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import decode
+from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.leases import Request
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.videos import VideoEntry
@@ -139,10 +139,10 @@ def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> Sampl
 
 
 def _fits(frames: abc.Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
-    """Whether the frames may hold arrays of these bytes. What cannot be compressed grows by a 256th and a little."""
+    """Whether the frames may hold arrays of these bytes."""
     lengths = tuple(map(len, frames))
     if not packed:
         return lengths == sizes
     if len(lengths) != len(sizes):
         return False
-    return all(0 < length <= size + size // 256 + 64 for length, size in zip(lengths, sizes, strict=True))
+    return all(0 < length <= largest_packed_bytes(size) for length, size in zip(lengths, sizes, strict=True))

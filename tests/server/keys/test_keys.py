@@ -20,11 +20,12 @@ from v2v_client.session.link import Link
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
 from v2v_protocol.keys import Handshakes, key_for, mechanism_of, read_key
 from v2v_protocol.messages import Ping, Pong
-from v2v_protocol.wire import encode
+from v2v_protocol.wire import encode, largest_frame_bytes
 from v2v_server.broker.actions import ToConsumer
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main
 from v2v_server.keys.folder import KeyFolder
+from v2v_server.worker.handover import pack
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a door")
 
@@ -86,6 +87,21 @@ def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Link]
     assert isinstance(arrival, FromConsumer)
     assert sockets.send(ToConsumer(arrival.identity, encode(Pong())))
     until(lambda: link.receive(0.1))
+
+
+@pytest.mark.parametrize("frame", [bytes(1 << 21), pack(os.urandom(1 << 21))], ids=["raw", "compressed noise"])
+def test_the_largest_array_passes_encrypted(sockets: Sockets, tmp_path: Path, frame: bytes) -> None:
+    """ZeroMQ's limit counts what CURVE adds to a frame; samples of the paper's size never came without compression."""
+    link = Link(sockets.address, str(tmp_path / "gpu1.key"))
+    try:
+        link.connect(largest_frame_bytes([1 << 21]))
+        link.send(encode(Ping()))
+        arrival = next_from(sockets, FromConsumer)
+        assert isinstance(arrival, FromConsumer)
+        assert sockets.send(ToConsumer(arrival.identity, [*encode(Pong()), frame]))
+        until(lambda: link.receive(0.1))
+    finally:
+        link.close()
 
 
 def test_who_has_no_key_is_told_what_to_do(sockets: Sockets, consumer: Callable[..., Link]) -> None:
