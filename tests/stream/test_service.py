@@ -23,6 +23,7 @@ from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.serve import main as serve
+from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
 
 @pytest.fixture
@@ -78,6 +79,13 @@ def test_a_refused_want_changes_nothing(raw: tuple[zmq.Socket[bytes], str]) -> N
     assert outside.code == "range"
     dealer.send_multipart(encode(Want(0, (0,))))
     assert len(dealer.recv_multipart()) == 2
+
+
+def test_every_worker_is_under_a_limit_of_memory(server: LocalServer) -> None:
+    def limits() -> set[int]:
+        return {worker.rlimit(psutil.RLIMIT_DATA)[0] for worker in server_workers(server.pid)}
+
+    until(lambda: limits() == {LARGEST_MEMORY_BYTES})
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -3,8 +3,8 @@
     v2v-bench link --videos CLIPS --mbit 1000 --turns 3
 
 The consumer is in a network namespace of its own, behind a cable of that rate (`v2v_bench/link/cable.py`), which a
-plain TCP connection proves first. Null workers send samples of the paper's recipe that were made before from the
-videos, so that not making them but the link is what bounds: they are compressed anew each time.
+plain TCP connection proves first. Null workers send samples of the paper's recipe that were made from the videos, and
+compressed, before: so that not making them but the link is what bounds.
 
     link busy     bytes that went over the cable, of what it can carry: below some 90 % something else was the bound
     x raw         batches/s of compressed samples over those of raw ones within a turn; median of the turns

@@ -40,9 +40,9 @@ from v2v_protocol.messages import (
     WorkerHello,
 )
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, encode_sample
 from v2v_server.system.process import die_with_parent, keep_freed_memory
-from v2v_server.worker.handover import room_for, sample_message
+from v2v_server.worker.handover import pack, room_for, sample_message
 from v2v_server.worker.produce import sample_layout
 
 Ready = Mapping[str, npt.NDArray[Any]]
@@ -182,14 +182,31 @@ def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:
         decoder="none",
         quarantine=lease.quarantine,
     )
+    if samples is not None:
+        return _ready_message(lease, name, provenance, samples)
     room = room_for(lease, sample_layout(lease))
     # Memory that nobody wrote to is one page of zeros to the kernel, and nearly free to send.
-    for array_name, array in room.arrays.items():
-        if samples is None:
-            array.fill(1)
-        else:
-            np.copyto(array, samples[array_name][index % len(samples[array_name])])
+    for array in room.arrays.values():
+        array.fill(1)
     return sample_message(lease, room, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
+
+
+_packed: dict[int, list[bytes]] = {}
+
+
+def _ready_message(lease: Lease, name: str, provenance: Provenance, samples: Ready) -> list[Any]:
+    """A sample that was made before, and is compressed once only."""
+    index = lease.indices[0]
+    number = index % len(samples[lease.arrays[0]])
+    arrays = {each: samples[each][number] for each in lease.arrays}
+    if lease.packed and number not in _packed:
+        _packed[number] = [pack(array.reshape(-1).view("uint8").data) for array in arrays.values()]
+    ready = iter(_packed.get(number, ()))
+    return encode_sample(
+        epoch=lease.epoch, index=index, arrays=arrays, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0,
+        decoded=True, cache="", slot=lease.slot, in_slot=False, quarantine=lease.quarantine,
+        pack=(lambda raw: next(ready)) if lease.packed else None,
+    )  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,7 +10,6 @@ import contextlib
 import math
 import multiprocessing
 import os
-import resource
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
 from v2v_protocol.errors import UsageError
-from v2v_server.system.process import die_with_parent
+from v2v_server.system.process import die_with_parent, limit_memory
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -215,9 +214,7 @@ def _interrupt_held_back() -> Iterator[None]:
 def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int, memory_bytes: int) -> None:
     die_with_parent(parent_pid)
     if memory_bytes:
-        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        at_most = memory_bytes if hard == resource.RLIM_INFINITY else min(memory_bytes, hard)
-        resource.setrlimit(resource.RLIMIT_DATA, (at_most, hard))
+        limit_memory(memory_bytes)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
     connection.send(None)  # begun: what ends this process from here on is no fault of its start
     while True:

@@ -80,6 +80,19 @@ def open_many_files() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
+def limit_memory(most_bytes: int) -> None:
+    """More is refused to whatever in this process asks for it: a decoder, by a file that claims what it has not.
+
+    What is shared with other processes does not count (a consumer's slots), nor what is only reserved.
+
+    Args:
+        most_bytes: at most; a lower limit that the process has already stays.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    at_most = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (at_most, hard))
+
+
 def usable_cores() -> int:
     """How many cores this process may use: those that a batch system, a container or ``taskset`` gave it, and no more
     than the processor time that a container may spend amounts to; those of the machine where the system does not say.

@@ -31,6 +31,7 @@ from v2v_server.system.process import (
     die_with_parent,
     give_way,
     keep_freed_memory,
+    limit_memory,
     resident_bytes,
     take_long_turns,
 )
@@ -54,6 +55,8 @@ from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
 """A video up to this size is waited for with its leases in hand; they are for others while a larger one comes."""
+LARGEST_MEMORY_BYTES = 8 << 30
+"""Four times the frames of the largest clip that a lease may have; who needs more ends, and its sample is refused."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; a routing identity has 255 at most."""
 _MORE = int(zmq.SNDMORE)
@@ -330,6 +333,7 @@ def run_worker(
         die_with_parent(parent_pid)
     key_for(address, "worker", keys)  # a wrong one is said at once
     keep_freed_memory()
+    limit_memory(LARGEST_MEMORY_BYTES)
     # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
     # Compile or load the kernels first: a worker that has said hello can work at full speed.

@@ -86,6 +86,21 @@ def test_a_container_is_given_processor_time_instead_of_cores(monkeypatch: pytes
         assert process.usable_cores() == cores
 
 
+def test_a_limit_of_memory_only_ever_becomes_lower() -> None:
+    said = _in_a_process(
+        "import resource\n"
+        "from v2v_server.system.process import limit_memory\n"
+        "resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))\n"
+        "limit_memory(2 << 30)\n"
+        "print(resource.getrlimit(resource.RLIMIT_DATA)[0])\n"
+        "limit_memory(1 << 29)\n"
+        "print(resource.getrlimit(resource.RLIMIT_DATA)[0])\n"
+        "try: bytearray(1 << 29)\n"
+        "except MemoryError: print('refused')\n"
+    )
+    assert said == [str(1 << 30), str(1 << 29), "refused"]
+
+
 def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:
     said = _in_a_process(
         "import resource\n"
