@@ -72,12 +72,13 @@ def test_a_decoder_that_gives_way_is_noticed(monkeypatch: pytest.MonkeyPatch, wr
 
 
 @pytest.mark.slow
-def test_a_live_server_under_attack(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("keyed", "messages"), [(False, 4000), (True, 1500)])
+def test_a_live_server_under_attack(tmp_path: Path, keyed: bool, messages: int) -> None:
     clips = tmp_path / "clips"
     clips.mkdir()
     for number in range(4):
         # Wide and long enough for the paper's recipe as well.
         write_clip(clips / f"{number}.mp4", panned_luma(201, 128, 160, step=(1, 1 + number)), gop=12)
-    record = fuzz.fuzz_live(clips, 4000, 1, tmp_path / "run", remakes=50)
+    record = fuzz.fuzz_live(clips, messages, 1, tmp_path / "run", remakes=50, keyed=keyed)
     assert fuzz.gave_way(record) == []
     assert record["healthy_batches_under_attack"] > 0

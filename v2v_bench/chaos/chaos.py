@@ -238,6 +238,7 @@ def parser_of_chaos(doc: str | None, prog: str) -> argparse.ArgumentParser:
         "--lease-deadline-seconds", type=float, default=10.0, metavar="S", help="the server's watchdog (default 10)"
     )
     parser.add_argument("--cache", action="store_true", help="the server keeps decoded clips, and they are spoiled")
+    parser.add_argument("--keys", action="store_true", help="the server takes nobody without a key: all is encrypted")
     parser.add_argument("--remakes", type=int, default=300, help="samples that the checker makes again (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the record there")
@@ -260,7 +261,8 @@ def _run(asked: argparse.Namespace) -> int:
             videos = folder / "clips"
             webvid_like(asked.footage, videos, gop=12, frames=300, clips=len(asked.footage))
         cache = folder / "decoded" if asked.cache else None
-        fleet = Fleet(folder, videos, asked.workers, asked.consumers, asked.lease_deadline_seconds, clip_cache=cache)
+        counts = asked.workers, asked.consumers
+        fleet = Fleet(folder, videos, *counts, asked.lease_deadline_seconds, clip_cache=cache, keyed=asked.keys)
         most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1
         return torment_and_judge(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)
     finally:

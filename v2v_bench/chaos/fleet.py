@@ -23,7 +23,9 @@ from pathlib import Path
 import psutil
 
 from v2v_bench.chaos.consumer import log_path
+from v2v_bench.chaos.keyring import KeyRing
 from v2v_protocol.errors import UsageError
+from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 
 MARK = "V2V_CHAOS_RUN"
 _STOP_SECONDS = 30.0
@@ -43,6 +45,7 @@ class Process:
         folder: its log goes here.
         process: None when it is not there.
         expected: its end was caused on purpose.
+        side: whose key it comes with, where the server takes nobody without: "consumer", "worker", "" for none.
     """
 
     name: str
@@ -50,6 +53,7 @@ class Process:
     folder: Path
     process: subprocess.Popen[bytes] | None = None
     expected: bool = False
+    side: str = ""
 
     @property
     def pid(self) -> int | None:
@@ -88,6 +92,7 @@ class Fleet:
         clip_cache: folder of decoded clips, for the server's own workers; None: they keep none.
         host: where the server listens.
         elsewhere: what the commands of consumers and further workers begin with, to run them on another host.
+        keyed: the server takes nobody without a key, and all is encrypted.
 
     Attributes:
         failures: processes that ended unasked.
@@ -104,12 +109,14 @@ class Fleet:
     clip_cache: Path | None = None
     host: str = "127.0.0.1"
     elsewhere: tuple[str, ...] = ()
+    keyed: bool = False
     failures: list[Failure] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
     server: Process = field(init=False)
     further_workers: list[Process] = field(init=False, default_factory=list)
     crowd: list[Process] = field(init=False)
+    keys: KeyRing | None = field(init=False)
     _address: str = field(init=False)
     _worker_address: str = field(init=False)
     _awaited: bool = field(init=False, default=False)
@@ -118,24 +125,16 @@ class Fleet:
     def __post_init__(self) -> None:
         for name in ("tmp", "cache", "server"):
             (self.folder / name).mkdir(parents=True)
+        self.keys = KeyRing.made(self.folder / "keys") if self.keyed else None
         self._address, self._worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
         self.server = Process("server", self._server_command(), self.folder / "server")
         self.crowd = []
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
-            command = [
-                *self.elsewhere,
-                sys.executable,
-                "-X",
-                "faulthandler",
-                "-m",
-                "v2v_bench.chaos.consumer",
-                "--address",
-                self._address,
-            ]
-            command += ["--profile", str(number), "--folder", str(folder)]
-            self.crowd.append(Process(f"consumer {number}", command, folder))
+            command = [*self.elsewhere, sys.executable, "-X", "faulthandler", "-m", "v2v_bench.chaos.consumer"]
+            command += ["--address", self._address, "--profile", str(number), "--folder", str(folder)]
+            self.crowd.append(Process(f"consumer {number}", command, folder, side="consumer"))
 
     @property
     def port_file(self) -> Path:
@@ -146,6 +145,11 @@ class Fleet:
     def cache(self) -> Path:
         """Folder of the catalogue index."""
         return self.folder / "cache"
+
+    @property
+    def tally(self) -> Path:
+        """As many bytes as handshakes were refused to hostile peers."""
+        return self.folder / "tally"
 
     @property
     def tmp(self) -> Path:
@@ -178,6 +182,7 @@ class Fleet:
             *("--parent-pid", str(os.getpid())),
             *self.server_flags,
             *(() if self.clip_cache is None else ("--cache", str(self.clip_cache), "--cache-gib", "4")),
+            *(() if self.keys is None else ("--keys", str(self.keys.server))),
         ]
 
     # --- living -------------------------------------------------------------------------------------------------------
@@ -227,20 +232,23 @@ class Fleet:
         folder = self.folder / name
         folder.mkdir()
         command = [*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"]
-        command += ["--connect", self._worker_address]
-        place = Process(f"worker {name}", [*command, "--videos", str(self.videos), "--name", name], folder)
+        command += ["--connect", self._worker_address, "--videos", str(self.videos), "--name", name]
+        place = Process(f"worker {name}", command, folder, side="worker")
         self._spawn(place)
         self.further_workers.append(place)
 
     def peers(self, kind: str) -> subprocess.Popen[bytes]:
         """Hostile peers of that kind (:mod:`v2v_bench.chaos.hostile`); whoever asks ends them."""
         command = [sys.executable, "-m", "v2v_bench.chaos.hostile", "--address", self._address, "--kind", kind]
+        if self.keys is not None:
+            command += ["--worker-address", self._worker_address, "--revoked", str(self.keys.revoked)]
+            command += ["--tally", str(self.tally)]
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env=os.environ | {MARK: self.token, "TMPDIR": str(self.tmp)},
+            env=self._environment("consumer"),
             start_new_session=True,
             preexec_fn=last_in_line,
         )
@@ -283,8 +291,12 @@ class Fleet:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env=os.environ | {MARK: self.token, "TMPDIR": str(self.tmp)},
+                env=self._environment(place.side),
             )
+
+    def _environment(self, side: str) -> dict[str, str]:
+        key = "" if self.keys is None or not side else str(getattr(self.keys, side))
+        return os.environ | {MARK: self.token, "TMPDIR": str(self.tmp), KEY_VARIABLE: key}
 
     # --- the end ------------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,10 @@
     look       asks for the state of the service without a pause, and never reads
     idle       takes connections, half of them in the middle of the handshake, and says nothing
     slow       no enemy: a stream that is allowed and takes long (flow on whole pictures, long clips)
+    refused    only with keys: comes with a key that nobody knows, with a revoked one, and with a consumer's to the port
+               of the workers, and begins anew as soon as it is turned away
 
+Where `V2V_KEYS` names a consumer's key, they come with it; only `parts` speaks plainly, and `idle` does not get so far.
 Whoever is cut off connects again. Nothing is checked here: what counts is what happens to others.
 """
 
@@ -25,21 +28,26 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NoReturn
 
 import zmq
 
+from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
+from v2v_protocol.keys import key_for, read_key
 from v2v_protocol.messages import Hello, See, Want
 from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
 
 PEERS = 8
-IDLE_EACH = 100
-"""Connections of each idle peer."""
-_GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL" + bytes(16 + 1 + 31)
+IDLE_EACH = 125
+"""Connections of each idle peer: a thousand in all."""
+_GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
 _READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
+_TURNED_AWAY_MS = 2000
 SLOW_RECIPE = "paper-flow"
 SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
 
@@ -91,7 +99,7 @@ def idle(address: str, number: int) -> None:
             host, _, port = address.removeprefix("tcp://").rpartition(":")
             links.append(socket.create_connection((host, int(port)), timeout=5.0))
             if count % 2:
-                links[-1].sendall(_GREETING)
+                links[-1].sendall(_greeting(address))
         time.sleep(2.0)
     finally:
         for link in links:
@@ -108,18 +116,54 @@ def slow(address: str, number: int) -> None:
         pass
 
 
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """See the module.
+
+    Args:
+        worker_address: the other port.
+        revoked: file of a revoked consumer's key.
+        tally: grows by a byte for every handshake that the server refused.
+    """
+
+    worker_address: str
+    revoked: Path
+    tally: Path
+
+    def __call__(self, address: str, number: int) -> None:
+        known, revoked = read_key(Path(os.environ[KEY_VARIABLE])), read_key(self.revoked)
+        public, secret = (half.decode() for half in zmq.curve_keypair())
+        unknown = replace(known, public=public, secret=secret)
+        for key, where in ((unknown, address), (revoked, address), (known, self.worker_address)):
+            peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
+            monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+            try:
+                peer.setsockopt(zmq.LINGER, 0)
+                key.secure(peer)
+                peer.connect(where)
+                if monitor.poll(_TURNED_AWAY_MS):
+                    with self.tally.open("ab") as file:
+                        file.write(b".")
+            finally:
+                peer.disable_monitor()
+                peer.close()
+
+
 KINDS: dict[str, Callable[[str, int], None]] = {
     each.__name__: each for each in (parts, headers, hello, leave, look, idle, slow)
 }
+REFUSED = "refused"
 
 
-def attack(address: str, kind: str) -> NoReturn:
+def attack(address: str, kind: str, refused: Refused | None = None) -> NoReturn:
     """Sets :data:`PEERS` peers on a server, again when cut off, as long as this process lives."""
+
+    act = KINDS[kind] if refused is None else refused
 
     def live(number: int) -> NoReturn:
         while True:
             with suppress(OSError, zmq.ZMQError):  # cut off, or the server is gone for now
-                KINDS[kind](address, number)
+                act(address, number)
             time.sleep(0.01)
 
     for number in range(1, 1 if kind == "slow" else PEERS):
@@ -127,12 +171,17 @@ def attack(address: str, kind: str) -> NoReturn:
     live(0)
 
 
+def _greeting(address: str) -> bytes:
+    """The 64 bytes with which a peer says how it wants to speak: as that address asks for, or else plainly."""
+    return _GREETING % (b"CURVE" if address and key_for(address, "consumer", None) else b"NULL").ljust(20, b"\0")
+
+
 @contextmanager
 def _raw(address: str) -> Iterator[socket.socket]:
     """A peer that speaks ZMTP by hand, past the handshake."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((host, int(port)), timeout=5.0) as peer:
-        peer.sendall(_GREETING + _READY)
+        peer.sendall(_greeting("") + _READY)
         yield peer
 
 
@@ -146,6 +195,8 @@ def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
         peer.setsockopt(zmq.LINGER, 0)
         peer.setsockopt(zmq.RCVHWM, 1)
         peer.setsockopt(zmq.SNDTIMEO, 2000)
+        if key := key_for(address, "consumer", None):
+            key.secure(peer)
         peer.connect(address)
         yield peer
     finally:
@@ -156,10 +207,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m v2v_bench.chaos.hostile", description=__doc__)
     parser.add_argument("--address", required=True)
-    parser.add_argument("--kind", required=True, choices=KINDS)
+    parser.add_argument("--kind", required=True, choices=(*KINDS, REFUSED))
+    parser.add_argument("--worker-address", help="for refused: the other port")
+    parser.add_argument("--revoked", type=Path, help="for refused: a revoked key")
+    parser.add_argument("--tally", type=Path, help="for refused: a file that grows by a byte with every refusal")
     asked = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    attack(asked.address, asked.kind)
+    refused = Refused(asked.worker_address, asked.revoked, asked.tally) if asked.kind == REFUSED else None
+    attack(asked.address, asked.kind, refused)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_bench.chaos.fleet import Fleet
-from v2v_bench.chaos.hostile import KINDS, PEERS
+from v2v_bench.chaos.hostile import KINDS, PEERS, REFUSED
 from v2v_bench.corpus import webvid_like
 from v2v_bench.speed.memory import rss_mib
 from v2v_protocol.errors import UsageError, V2VError
@@ -139,31 +139,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--footage", type=Path, nargs="+", required=True, metavar="FILE", help="clips are made of these"
     )
-    parser.add_argument("--kinds", default=",".join(KINDS), metavar="KIND,KIND", help=f"default {','.join(KINDS)}")
+    parser.add_argument("--kinds", metavar="KIND,KIND", help=f"default {','.join(KINDS)}; with --keys {REFUSED} too")
+    parser.add_argument("--keys", action="store_true", help="the server takes nobody without a key: all is encrypted")
     parser.add_argument("--turns", type=int, default=3, help="default 3")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each spell (default 8)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
     asked = parser.parse_args(arguments)
-    kinds = asked.kinds.split(",")
-    unknown = [kind for kind in kinds if kind not in KINDS]
+    possible = (*KINDS, REFUSED) if asked.keys else tuple(KINDS)
+    kinds = asked.kinds.split(",") if asked.kinds else possible
+    unknown = [kind for kind in kinds if kind not in possible]
     if unknown or asked.turns < 1 or asked.seconds <= 0:
-        print(f"siege: --kinds of {', '.join(KINDS)}; --turns 1 or more; --seconds more than 0", file=sys.stderr)
+        print(f"siege: --kinds of {', '.join(possible)}; --turns 1 or more; --seconds more than 0", file=sys.stderr)
         return 2
     try:
         with tempfile.TemporaryDirectory(prefix="v2v-siege-") as folder:
             clips = Path(folder) / "clips"
             webvid_like(asked.footage, clips, gop=12, frames=300, clips=len(asked.footage))
-            fleet = Fleet(Path(folder), clips, 1, 2, 60.0, server_flags=("--max-credit-bytes", str(CREDIT_MIB << 20)))
+            credit = ("--max-credit-bytes", str(CREDIT_MIB << 20))
+            fleet = Fleet(Path(folder), clips, 1, 2, 60.0, server_flags=credit, keyed=asked.keys)
             fleet.crowd[:1] = []  # the consumer of small samples; the paper's stays
             try:
                 fleet.start()
                 records = besiege(fleet, kinds, asked.turns, asked.seconds)
+                refusals = fleet.tally.stat().st_size if fleet.tally.exists() else 0
             finally:
                 fleet.kill()
     except (V2VError, OSError) as error:
         print(f"siege: {error}", file=sys.stderr)
         return 2
     _show(records)
+    if REFUSED in kinds:
+        print(f"handshakes refused: {refusals}")
     if asked.json is not None:
         write_json(asked.json, records)
     bars = [text for record in records for text in missed(record)]

@@ -114,7 +114,9 @@ def _peak_mib() -> float:
     return peak / (MIB if sys.platform == "darwin" else 1024.0)
 
 
-def fuzz_live(videos: Path, messages: int, seed: int, folder: Path, remakes: int = 100) -> dict[str, Any]:
+def fuzz_live(
+    videos: Path, messages: int, seed: int, folder: Path, remakes: int = 100, keyed: bool = False
+) -> dict[str, Any]:
     """Attacks a server while a healthy consumer streams from it; a flat record.
 
     Args:
@@ -123,20 +125,21 @@ def fuzz_live(videos: Path, messages: int, seed: int, folder: Path, remakes: int
         seed: of the messages.
         folder: a new one, for logs.
         remakes: samples of the healthy consumer that are made again.
+        keyed: the server takes nobody without a key, and the attackers have one for each port.
 
     Raises:
         UsageError: the server does not come up.
     """
     server = "v2v_bench.fuzz.trimming_server"
-    fleet = Fleet(folder, videos, workers=1, consumers=1, lease_deadline_seconds=10.0, server_module=server)
+    fleet = Fleet(folder, videos, 1, 1, lease_deadline_seconds=10.0, server_module=server, keyed=keyed)
     try:
         fleet.start()
         pid = fleet.server.pid or 0
         # What the first messages need (arenas of Python and of threads, caches) is not what a leak would be.
-        with Attack(*fleet.addresses, random.Random(seed)) as warm_up:
+        with Attack(*fleet.addresses, random.Random(seed), fleet.keys) as warm_up:
             warm_up.send(max(1, messages // 10))
         before = _settled_mib(pid)
-        with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up")) as attack:
+        with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up"), fleet.keys) as attack:
             began, committed = time.monotonic(), fleet.committed()[0]
             attack.send(messages - messages // 10)
             longest = attack.longest_seconds
@@ -221,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=100_000, help="through the decoder (default 100000)")
     parser.add_argument("--live", type=int, default=0, help="through a live server (default 0)")
     parser.add_argument("--videos", type=Path, metavar="DIR", help="with --live: corpus of the server")
+    parser.add_argument("--keys", action="store_true", help="with --live: by attackers who have keys; all is encrypted")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="with --live: keep its logs in this new folder")
@@ -232,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if asked.live:
             folder = Path(tempfile.mkdtemp(prefix="v2v-fuzz-")) if asked.keep is None else asked.keep
             try:
-                records.append(fuzz_live(asked.videos, asked.live, asked.seed, folder))
+                records.append(fuzz_live(asked.videos, asked.live, asked.seed, folder, keyed=asked.keys))
             finally:
                 if asked.keep is None:
                     shutil.rmtree(folder)

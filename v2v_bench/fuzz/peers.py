@@ -22,9 +22,11 @@ from types import TracebackType
 import zmq
 
 from v2v_bench.chaos.consumer import profile
+from v2v_bench.chaos.keyring import KeyRing
 from v2v_bench.fuzz.frames import FrameFuzzer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError
+from v2v_protocol.keys import read_key
 from v2v_protocol.messages import Begun, Goodbye, Hello, Lease, Message, Ping, Pong, Result, Want, WorkerHello
 from v2v_protocol.wire import Buffer, decode, encode, encode_sample
 
@@ -38,13 +40,18 @@ class Attack:
     Args:
         address, worker_address: of the server.
         random_source: of everything that is sent.
+        keys: to come with; None: without.
 
     Attributes:
         sent: messages, by who sent them.
         longest_seconds: the longest that the server took to answer a Ping between two bursts.
     """
 
-    def __init__(self, address: str, worker_address: str, random_source: random.Random) -> None:
+    def __init__(
+        self, address: str, worker_address: str, random_source: random.Random, keys: KeyRing | None = None
+    ) -> None:
+        files = {} if keys is None else {address: keys.consumer, worker_address: keys.worker}
+        self._keys = {where: read_key(file) for where, file in files.items()}
         self._address = address
         self._worker_address = worker_address
         self._random = random_source
@@ -92,6 +99,8 @@ class Attack:
         peer.setsockopt(zmq.ROUTING_ID, b"hostile-%d" % self._names)
         peer.setsockopt(zmq.LINGER, 1000)
         peer.setsockopt(zmq.SNDHWM, 0)
+        if self._keys:
+            self._keys[address].secure(peer)
         peer.connect(address)
         return peer
 

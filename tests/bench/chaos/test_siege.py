@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 
 import psutil
@@ -11,7 +12,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 from v2v_bench.chaos.fleet import Fleet
-from v2v_bench.chaos.hostile import KINDS
+from v2v_bench.chaos.hostile import KINDS, REFUSED
 from v2v_bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
@@ -58,6 +59,26 @@ def test_an_attack_arrives(tmp_path: Path, corpus: Path) -> None:
         finally:
             peers.kill()
             peers.wait()
+    finally:
+        fleet.kill()
+
+
+@pytest.mark.slow
+def test_wrong_keys_are_turned_away_while_a_right_one_streams(tmp_path: Path, corpus: Path) -> None:
+    fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0, keyed=True)
+    del fleet.crowd[0]
+    try:
+        fleet.start()
+        peers = fleet.peers(REFUSED)
+        try:
+            until(lambda: fleet.tally.exists() and fleet.tally.stat().st_size >= 30)  # of each of the three kinds
+            before = fleet.committed()[0]
+            until(lambda: fleet.committed()[0] > before + 1)
+        finally:
+            peers.kill()
+            peers.wait()
+        fleet.look(time.monotonic())
+        assert not fleet.failures
     finally:
         fleet.kill()
 

@@ -1,0 +1,36 @@
+"""The keys of a fleet whose server takes nobody without one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2v_server.keys.folder import KeyFolder
+
+
+@dataclass(frozen=True, slots=True)
+class KeyRing:
+    """Files of keys.
+
+    Attributes:
+        server: the server's folder.
+        consumer, worker: of those who may come.
+        revoked: of a consumer who may not any more.
+    """
+
+    server: Path
+    consumer: Path
+    worker: Path
+    revoked: Path
+
+    @classmethod
+    def made(cls, folder: Path) -> KeyRing:
+        """New keys in a folder that is made for them."""
+        folder.mkdir()
+        server = KeyFolder(folder / "server")
+        server.init()
+        files = [folder / f"{name}.key" for name in ("consumer", "worker", "revoked")]
+        for file, side in zip(files, ("consumer", "worker", "consumer"), strict=True):
+            server.new(file.stem, side, file)
+        server.revoke("revoked")
+        return cls(folder / "server", *files)
