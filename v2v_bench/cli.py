@@ -28,6 +28,7 @@ BENCHMARKS = {
     "kernel": "speed.kernel",
     "transport": "speed.transport",
     "scaling": "speed.scaling",
+    "fleet": "fleet.fleet",
     "gpu_feed": "speed.gpu_feed",
     "released": "speed.released",
     "watched": "speed.watched",
