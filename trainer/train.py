@@ -11,11 +11,11 @@ from pathlib import Path
 
 import torch
 
-from trainer.config import StreamConfig, keys
+from trainer.config import StreamConfig, TrainConfig, keys
 from trainer.config_file import load_config, shipped, show_config
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
-from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, require_same_run, require_writable
+from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
 from v2v_client.local_server import LocalServer, recipe_flags
@@ -122,6 +122,17 @@ def _lacks_bfloat16() -> bool:
     return torch.backends.cpu.get_cpu_capability() == "AVX2"
 
 
+def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | None) -> tuple[int, int]:
+    """The steps so far, and the signal that ended the run or 0. What was learned with is freed on return."""
+    learner = build(config, mine)
+    if mine.first:
+        require_writable(out)
+    recipe = learner.task.asked.recipe(config.stream.resolved_recipe)
+    with serving(config.stream, recipe, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
+        steps = train(config, learner, address, mine, stop, out, resume)
+    return steps, stop.signal
+
+
 def run(arguments: argparse.Namespace) -> int:
     """One run; returns the exit status.
 
@@ -153,16 +164,11 @@ def run(arguments: argparse.Namespace) -> int:
                 "--set compute.precision=float32",
                 file=sys.stderr,
             )
-        learner = build(config, mine)
+        steps, signal = _trained(config, mine, out, resume)
         if mine.first:
-            require_writable(out)
-        recipe = learner.task.asked.recipe(config.stream.resolved_recipe)
-        with serving(config.stream, recipe, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
-            steps = train(config, learner, address, mine, stop, out, resume)
-        if mine.first:
-            why = f"ended by signal {stop.signal}" if stop.signal else "done"
+            why = f"ended by signal {signal}" if signal else "done"
             print(f"{why} after step {steps}: {out / LAST}")
-    return SIGNAL_STATUS + stop.signal if stop.signal else 0
+    return SIGNAL_STATUS + signal if signal else 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
+import weakref
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -309,6 +311,31 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
         if error:
             raise error
     assert left == ([] if error else [True])
+
+
+def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model of several ranks knows its group, and lies in a circle of references."""
+
+    class Model:
+        def __init__(self) -> None:
+            self.myself = self
+
+    def trained() -> weakref.ref[Model]:
+        return weakref.ref(Model())
+
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
+    known = []
+    monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: known.append(model()))
+    gc.disable()  # not by chance
+    try:
+        with ranks("cpu"):
+            model = trained()
+            assert model() is not None
+    finally:
+        gc.enable()
+    assert known == [None]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

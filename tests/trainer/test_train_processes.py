@@ -76,6 +76,7 @@ def test_two_ranks_train_as_one_with_twice_the_batch(server: FakeServer, tmp_pat
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("done after step 2") == 1  # only the first rank speaks
     again = arguments(tmp_path, server.address, "both", f"both/{LAST}", stream__batch_size=3, run__steps=5)
+    command = [*torchrun, "-m", "tests.trainer.one_rank"]
     done = subprocess.run([*command, *again], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     one, two = losses(alone), losses(tmp_path / "both")

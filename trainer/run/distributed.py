@@ -6,6 +6,7 @@ A process group of two backends: NCCL moves gradients between GPUs, gloo moves t
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.distributed.nn.functional  # before there is a group: its functions keep the one of then as their default
 from torch import Tensor, distributed
 
 from v2v_protocol.errors import UsageError
@@ -72,6 +74,9 @@ def on_gpu(device: str) -> bool:
 def ranks(device: str) -> Iterator[Ranks]:
     """This process's place, from the variables that torchrun sets.
 
+    Whatever knows the group (a DistributedDataParallel above all) must be out of scope at the end of the block: the
+    group ends with the last that knows it, not before.
+
     Args:
         device: "auto", "cpu" or "cuda".
 
@@ -95,6 +100,10 @@ def ranks(device: str) -> Iterator[Ranks]:
         return
     distributed.init_process_group("cpu:gloo,cuda:nccl" if with_gpu else "gloo")
     yield Ranks(distributed.get_rank(), world_size, mine, hosts=-(-world_size // here))
+    # The group's threads free the tensors of the last exchange, for which they need the interpreter. One that is late
+    # and finds it ending aborts the process ("terminate called without an active exception"). So the group must be
+    # gone, and its threads joined, before that: models lie in reference cycles, which only a collection ends.
+    gc.collect()
     # Not on the way out of an error: NCCL would wait for ranks that wait for this one, and nobody would read the error.
     # A process that ends leaves the group by itself.
     distributed.destroy_process_group()
