@@ -86,7 +86,8 @@ def _parser() -> Parser:
     what.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
     how.add_argument(
         "--as-published", action="store_true",
-        help="event_idx as stored, times cut to us: as the released code does, faults included",
+        help="event_idx as stored, times cut to us, EVAID's cuts a picture later: as the released code does, faults "
+        "included",
     )  # fmt: skip
     windows = how.add_mutually_exclusive_group()
     windows.add_argument(
@@ -95,6 +96,9 @@ def _parser() -> Parser:
         "whose end is nearest, at most half a window away",
     )  # fmt: skip
     windows.add_argument("--window-events", type=int, metavar="N", help="the same with windows of so many events")
+    windows.add_argument(
+        "--window-pictures", type=int, default=1, metavar="N", help="windows from a picture to the N-th after it (1)"
+    )
     windows.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
     how.add_argument("--size", metavar="WxH", help="of the sensor, for recordings without pictures")
     how.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
@@ -141,6 +145,7 @@ def _run(arguments: argparse.Namespace) -> int:
             "as_published": run.as_published,
             "cuts": arguments.cuts,
             "reconstruction_hz": run.fps,
+            "window_pictures": run.window_pictures,
             "window_seconds": run.window_seconds,
             "window_events": run.window_events,
             "stretch": run.stretch,
@@ -205,6 +210,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         as_published=arguments.as_published,
         use_cuts=arguments.cuts == "paper",
         fps=arguments.fps,
+        window_pictures=arguments.window_pictures,
         window_seconds=arguments.window_seconds,
         window_events=arguments.window_events,
         size=_size(arguments.size),

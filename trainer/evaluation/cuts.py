@@ -20,11 +20,13 @@ class DataSet:
         name: as in the paper's tables.
         folder: under the folder of data.
         cuts: first and last second by sequence; None scores all of it.
+        published_later: by how many pictures the released conversion cuts later.
     """
 
     name: str
     folder: str
     cuts: Mapping[str, Cut | None]
+    published_later: int = 0
 
 
 HQF = (
@@ -48,6 +50,8 @@ DATA_SETS = {
                 "outdoor": (0.0, 1.4),
                 "playball": (25.0, 30.0),
             },
+            # It takes the picture at the end as well, and then drops the first one.
+            published_later=1,
         ),
         DataSet(
             "IJRR",

@@ -11,7 +11,7 @@ import numpy as np
 
 from trainer import pictures
 from trainer.evaluation import layout
-from trainer.evaluation.cuts import Cut, DataSet
+from trainer.evaluation.cuts import DataSet
 from trainer.evaluation.metrics import Metric
 from trainer.evaluation.pictures import chosen_steps, draw_step
 from trainer.evaluation.readers import EventWindow, Recording
@@ -58,6 +58,7 @@ class Run:
         as_published: see :mod:`trainer.evaluation.readers`.
         use_cuts: False scores all of each recording.
         fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
+        window_pictures: windows from a picture to the one that is so many on.
         window_seconds, window_events: windows of so long, or of so many events, in place of those between pictures.
         size: of the sensor, see :class:`Recording`.
         drawing: pictures and videos.
@@ -71,6 +72,7 @@ class Run:
     as_published: bool = False
     use_cuts: bool = True
     fps: float | None = None
+    window_pictures: int = 1
     window_seconds: float | None = None
     window_events: int | None = None
     size: tuple[int, int] | None = None
@@ -98,20 +100,21 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
     Raises:
         UsageError: see :class:`Recording`.
     """
-    for sequence, path in find_recordings(data, data_set).items():
+    for path in find_recordings(data, data_set).values():
         with Recording(path, as_published=run.as_published, size=run.size) as recording:
-            _windows(run, recording, data_set.cuts[sequence])
+            _windows(run, recording, data_set)
 
 
-def _windows(run: Run, recording: Recording, cut: Cut | None) -> list[EventWindow]:
+def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
     if run.fps is not None:
         return recording.regular_windows(run.fps)
-    cut = cut if run.use_cuts else None
+    cut = data_set.cuts[recording.name] if run.use_cuts else None
     if run.window_seconds is not None:
         return recording.windows_of_seconds(run.window_seconds, cut)
     if run.window_events is not None:
         return recording.windows_of_events(run.window_events, cut)
-    return recording.windows(cut)
+    later = data_set.published_later if run.as_published else 0
+    return recording.windows(cut, pictures=run.window_pictures, later=later)
 
 
 def evaluate_data_set(
@@ -122,22 +125,19 @@ def evaluate_data_set(
     Raises:
         UsageError: see :class:`Recording` and :func:`reconstruct`.
     """
-    return [
-        evaluate_sequence(run, path, data_set.name, data_set.cuts[sequence], advance)
-        for sequence, path in find_recordings(data, data_set).items()
-    ]
+    return [evaluate_sequence(run, path, data_set, advance) for path in find_recordings(data, data_set).values()]
 
 
 def evaluate_sequence(
-    run: Run, path: Path, data_set: str, cut: Cut | None, advance: Advance = lambda _sequence, _done, _total: None
+    run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> SequenceScore:
     """Score, and draw, one recording."""
     with Recording(path, as_published=run.as_published, size=run.size) as recording:
-        windows = _windows(run, recording, cut)
+        windows = _windows(run, recording, data_set)
         scorer = SequenceScorer(run.metrics)
         rows = []
         shown = chosen_steps(len(windows), run.drawing.rows)
-        with _video(run.drawing, data_set, recording.name, windows) as video:
+        with _video(run.drawing, data_set.name, recording.name, windows) as video:
             steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device, stretch=run.stretch)
             for number, step in enumerate(steps):
                 scorer.add(step)
@@ -149,8 +149,8 @@ def evaluate_sequence(
                         video.add(image)
                 advance(recording.name, number + 1, len(windows))
         if run.drawing.folder is not None:
-            pictures.write_png(run.drawing.folder / data_set / f"{recording.name}.png", np.vstack(rows))
-        return scorer.score(data_set, recording.name, recording.repaired_images)
+            pictures.write_png(run.drawing.folder / data_set.name / f"{recording.name}.png", np.vstack(rows))
+        return scorer.score(data_set.name, recording.name, recording.repaired_images)
 
 
 @contextlib.contextmanager

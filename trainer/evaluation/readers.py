@@ -231,27 +231,38 @@ class Recording:
             )
         return int(stated[0]), int(stated[1])
 
-    def windows(self, cut: tuple[float, float] | None = None) -> list[EventWindow]:
-        """Windows between consecutive pictures.
+    def windows(
+        self, cut: tuple[float, float] | None = None, *, pictures: int = 1, later: int = 0
+    ) -> list[EventWindow]:
+        """Windows from picture to picture.
 
         Args:
             cut: from which second on and before which, counted from the first picture of the recording; None takes
                 all pictures.
+            pictures: how many pictures on a window ends; those between are not looked at.
+            later: by how many pictures the cut begins and ends later.
 
         Raises:
-            UsageError: fewer than two pictures in the cut, or the recording ends before the cut does.
+            UsageError: fewer than two pictures in the cut, or the recording ends before the cut does; ``pictures`` not
+                above 0.
         """
+        if pictures < 1:
+            raise UsageError(f"windows of {pictures} pictures: give at least 1")
         if not self.images:
             raise UsageError(f"{self.path} has no pictures to compare with; --fps reconstructs without")
-        images = self._images_in(cut)
+        found = self._images_in(cut, later)
+        images = found[::pictures]
         if len(images) < 2:
-            raise UsageError(f"{self.path}: {len(images)} pictures in the cut {cut}; two or more make a window")
+            raise UsageError(
+                f"{self.path}: {len(found)} pictures{'' if cut is None else f' in the cut {cut}'}; "
+                f"{pictures + 1} or more make a window"
+            )
         return [
             EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
             for one, other in itertools.pairwise(images)
         ]
 
-    def _images_in(self, cut: tuple[float, float] | None) -> list[Image]:
+    def _images_in(self, cut: tuple[float, float] | None, later: int = 0) -> list[Image]:
         images = list(self.images)
         if cut is not None and images:
             start, end = cut
@@ -262,7 +273,8 @@ class Recording:
                     f"{self.path} lasts {last:.2f} s, and the cut is from {start:g} to {end:g} s: if it is already "
                     "cut, give --cuts none"
                 )
-            images = [image for image in images if start <= image.time - zero < end]
+            since = [image.time - zero for image in images]
+            images = images[bisect.bisect_left(since, start) + later : bisect.bisect_left(since, end) + later]
         return images
 
     def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[EventWindow]:

@@ -81,7 +81,10 @@ def test_scores_of_every_window_are_written(tmp_path: Path, weights: Path) -> No
     assert [float(line["seconds"]) for line in lines] == pytest.approx([1.02, 1.04, 1.06, 1.08, 1.1])
 
 
-@pytest.mark.parametrize(("flag", "value", "frames"), [("--window-seconds", 0.03, 3), ("--window-events", 200, 3)])
+@pytest.mark.parametrize(
+    ("flag", "value", "frames"),
+    [("--window-seconds", 0.03, 3), ("--window-events", 200, 3), ("--window-pictures", 2, 2)],
+)
 def test_windows_need_not_end_at_pictures(tmp_path: Path, weights: Path, flag: str, value: float, frames: int) -> None:
     sequence, _ = evaluate("--weights", weights, "--data", random_recording(tmp_path / "a.h5"), flag, value)
     assert sequence["frames"] == frames
@@ -98,6 +101,23 @@ def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path
     assert (ours[0]["events"], published[0]["events"]) == (28, 27)
     assert ours[0]["mse"] != published[0]["mse"]
     assert published[0]["as_published"] is True
+
+
+@pytest.mark.parametrize(("folder", "name", "cut"), [("evaid", "outdoor", 1.4), ("ijrr", "slider_depth", 2.5)])
+def test_as_published_evaid_is_cut_a_picture_later(
+    tmp_path: Path, weights: Path, folder: str, name: str, cut: float
+) -> None:
+    """Its script keeps the picture at the end, and then drops the first one; the other scripts do neither."""
+    random_recording(tmp_path / folder / f"{name}.h5", images=30, period=0.125)
+    per_frame, last = tmp_path / "frames.csv", {}
+    for flags in ((), ("--as-published",)):
+        given = ("paper-discrete", "--weights", weights, "--data", tmp_path, "--metrics", "mse")
+        evaluate(*given, "--per-frame", per_frame, *flags)
+        seconds = [float(line["seconds"]) for line in csv.DictReader(per_frame.read_text().splitlines())]
+        last[flags] = seconds[-1], len(seconds)
+    ends, count = 1 + 0.125 * np.array([np.ceil(cut / 0.125) - 1, np.ceil(cut / 0.125)]), last[()][1]
+    assert last[()] == (pytest.approx(ends[0]), count)
+    assert last["--as-published",] == (pytest.approx(ends[int(folder == "evaid")]), count)
 
 
 @pytest.mark.parametrize("name", ["a.hdf5", "a.hdf", "a"])
@@ -134,7 +154,7 @@ def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.Ca
         tmp_path / "out",
     )
     frames = {(record["data_set"], record["sequence"]): record["frames"] for record in records}
-    # The clock starts at 1 s: multiples of 0.1 are inexact, cuts take both ends.
+    # The clock starts at 1 s: multiples of 0.1 are inexact.
     assert frames == {
         ("HQF", "desk"): 4,
         ("HQF", None): 4,

@@ -131,8 +131,29 @@ def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
         assert len(opened.windows((0.0, 60.0))) == 50
         with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the cut is from 5 to 20 s.*--cuts none"):
             opened.windows((5.0, 20.0))
-        with pytest.raises(UsageError, match="two or more"):
+        with pytest.raises(UsageError, match=r"1 pictures in the cut .* 2 or more"):
             opened.windows((4.96, 5.5))
+
+
+def test_a_later_cut_begins_and_ends_so_many_pictures_on(tmp_path: Path) -> None:
+    with Recording(random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)) as opened:
+        for cut, first, last in (((1.05, 3.05), 12, 31), ((0.0, 60.0), 1, 50)):
+            windows = opened.windows(cut, later=1)
+            assert (windows[0].begin, windows[-1].end) == (opened.images[first].time, opened.images[last].time)
+
+
+def test_windows_end_at_every_third_picture(tmp_path: Path) -> None:
+    with Recording(random_recording(tmp_path / "a.h5", images=12, events=500)) as opened:
+        windows = opened.windows(pictures=3)
+        assert [window.target for window in windows] == [opened.images[place] for place in (3, 6, 9)]
+        one_by_one = opened.windows()[:9]
+        assert [len(opened.events(window)) for window in windows] == [
+            sum(len(opened.events(part)) for part in one_by_one[start : start + 3]) for start in (0, 3, 6)
+        ]
+        with pytest.raises(UsageError, match="12 pictures; 13 or more"):
+            opened.windows(pictures=12)
+        with pytest.raises(UsageError, match="at least 1"):
+            opened.windows(pictures=0)
 
 
 def test_windows_of_time_have_the_picture_nearest_to_their_end(tmp_path: Path) -> None:

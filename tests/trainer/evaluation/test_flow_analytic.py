@@ -1,0 +1,106 @@
+"""Known flow in files of MVSEC's layout, through converter and command: AEE and 3PE by hand, in both conventions.
+
+columns   0: no depth   1: no flow   2-5: flow (length, 0), by field and part of the rows
+events    window 0, 1: rows 0-49 of column 2 (part A), rows 100-119 of column 3 (part B), rows 190-199 of column 4
+          (the hood), every row of column 0; two that cancel in column 5
+          window 2: none
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from tests.trainer.evaluation.test_flow import constant
+from trainer.convert.cli import main as convert
+from trainer.evaluation.cli import main as evaluate
+
+HEIGHT, WIDTH = 200, 6
+PARTS = {"A": (0, 100), "B": (100, 190), "hood": (190, 200)}
+LENGTHS = {"A": (1.0, 5.0, 2.0, 7.0), "B": (4.0, 0.5, 6.0, 1.0), "hood": (30.0, 20.0, 10.0, 40.0)}
+"""px, of fields 0 .. 3; there are three windows."""
+WITH_EVENTS = {"A": 50, "B": 20, "hood": 10}
+"""Pixels with known flow and events, in windows 0 and 1."""
+PREDICTED = 2.0
+
+
+def write_raw(folder: Path, name: str) -> Path:
+    times = 1000.0 + 0.05 * np.arange(4)
+    places = [
+        *((0, row, 1) for row in range(HEIGHT)),
+        *((2, row, 1) for row in range(50)),
+        *((3, row, -1) for row in range(100, 120)),
+        *((4, row, 1) for row in range(190, 200)),
+        (5, 0, 1), (5, 0, -1),
+    ]  # fmt: skip
+    events = [(x, y, time + 0.02, p) for time in times[:2] for x, y, p in places]
+    flow, depth = np.zeros((4, 2, HEIGHT, WIDTH)), np.ones((4, HEIGHT, WIDTH), np.float32)
+    for part, (first, end) in PARTS.items():
+        flow[:, 0, first:end] = np.array(LENGTHS[part])[:, None, None]
+    flow[..., 1] = 0
+    depth[..., 0] = np.nan
+    with h5py.File(folder / f"{name}_data.hdf5", "w") as file:
+        file["davis/left/events"] = np.array(events, float)
+        file["davis/left/image_raw"] = np.zeros((4, HEIGHT, WIDTH), np.uint8)
+        file["davis/left/image_raw_ts"] = times
+        file["davis/left/image_raw_event_inds"] = np.array([0, 0, len(places), 2 * len(places) - 1])
+    with h5py.File(folder / f"{name}_gt.hdf5", "w") as file:
+        file["davis/left/flow_dist"], file["davis/left/depth_image_raw"] = flow, depth
+        file["davis/left/depth_image_raw_ts"] = times
+    return folder / f"{name}_data.hdf5"
+
+
+def by_hand(predicted: float, fields: tuple[int, ...], counted: tuple[str, ...]) -> dict[str, float]:
+    """Fields of the windows; a window without events scores 0 if it is among the fields' three."""
+    four_columns = {part: 4 * (PARTS[part][1] - PARTS[part][0]) for part in counted}
+    with_events = {part: WITH_EVENTS[part] for part in counted}
+    found = {}
+    for kind, pixels, number in (("dense", four_columns, 3), ("sparse", with_events, 2)):
+        errors = [{part: abs(LENGTHS[part][field] - predicted) for part in counted} for field in fields[:number]]
+        weight = sum(pixels.values())
+        found[f"aee_{kind}"] = [sum(pixels[part] * each[part] for part in counted) / weight for each in errors]
+        found[f"3pe_{kind}"] = [
+            100 * sum(pixels[part] * (each[part] > 3) for part in counted) / weight for each in errors
+        ]
+    return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+@pytest.mark.parametrize("name", ["indoor_flying1", "outdoor_day1"])
+@pytest.mark.parametrize("as_published", [False, True])
+def test_aee_and_3pe_of_a_constant_prediction_and_of_none(tmp_path: Path, name: str, as_published: bool) -> None:
+    data, weights, out = tmp_path / "data" / "mvsec", tmp_path / "a.pth", tmp_path / "a.json"
+    assert not convert([str(write_raw(tmp_path, name)), "--out", str(data)])
+    torch.save(constant(PREDICTED, 0.0).state_dict(), weights)
+    flags = ["--as-published"] if as_published else []
+    given = ["--weights", str(weights), "--data", str(tmp_path / "data"), "--cuts", "none", "--json", str(out)]
+    assert not evaluate(["mvsec-flow", *given, *flags])
+    found = {record["predictor"]: record for record in json.loads(out.read_text())}
+    whole = as_published or name.startswith("indoor")
+    counted = ("A", "B", "hood") if whole else ("A", "B")
+    for who, predicted in (("network", PREDICTED), ("zeros", 0.0)):
+        expected = by_hand(predicted, (1, 2, 3) if as_published else (0, 1, 2), counted)
+        if as_published:  # the window without events scores 0
+            expected = {key: value * 2 / 3 if "sparse" in key else value for key, value in expected.items()}
+        assert found[who]["windows"] == 3
+        assert {key: found[who][key] for key in expected} == pytest.approx(expected, rel=1e-5)
+
+
+def test_zeros_by_hand() -> None:
+    """What the test above expects, for two cases in plain numbers."""
+    # Dense, outdoors: 400 px of A, 360 of B; fields 0, 1, 2.
+    right = by_hand(0.0, (0, 1, 2), ("A", "B"))
+    assert right["aee_dense"] == pytest.approx(
+        ((400 * 1 + 360 * 4) + (400 * 5 + 360 * 0.5) + (400 * 2 + 360 * 6)) / 760 / 3
+    )
+    assert right["3pe_dense"] == pytest.approx(100 * (360 + 400 + 360) / 760 / 3)
+    # Sparse, as published: 50, 20 and 10 px of fields 1 and 2.
+    published = by_hand(0.0, (1, 2, 3), ("A", "B", "hood"))
+    assert published["aee_sparse"] == pytest.approx(
+        ((50 * 5 + 20 * 0.5 + 10 * 20) + (50 * 2 + 20 * 6 + 10 * 10)) / 80 / 2
+    )
+    assert published["3pe_sparse"] == pytest.approx(100 * ((50 + 10) + (20 + 10)) / 80 / 2)
