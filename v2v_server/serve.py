@@ -26,7 +26,7 @@ from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
-from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
+from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
@@ -36,6 +36,7 @@ from v2v_server.console.progress import catalogue_progress
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
+from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
@@ -235,6 +236,8 @@ class Server:
                 case ConsumerGone(identity):
                     self._dispatcher.consumer_gone(identity, now)
                     self._give_back_at = min(self._give_back_at, now + _GIVE_BACK_SECONDS)
+                case TurnedAway():
+                    self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
             for identity, seconds in self._supervisor.stopped(now).items():
@@ -401,6 +404,19 @@ class Server:
         if identity is not None:
             about["sample"] = asdict(identity)
         self._log.say(text, level, **about)
+
+
+def _turned_away(news: TurnedAway) -> str:
+    times = f"turned away, {AWAY_SECONDS:g} s at a time, until that ends; what is at work goes on"
+    if news.address:
+        return (
+            f"{news.address} opens connections for {news.side}s and says nothing on them: new ones from there are "
+            f"{times}"
+        )
+    return (
+        f"connections for {news.side}s are gone before they can be asked where they come from: hosts that have not "
+        f"spoken here within the hour are {times}"
+    )
 
 
 def _private_address(label: str) -> str:

@@ -8,11 +8,16 @@
     leave      says Hello under a new name and goes, again and again: its sessions stay behind
     look       asks for the state of the service without a pause, and never reads
     idle       takes connections, half of them in the middle of the handshake, and says nothing
+    flood      bytes that are no ZeroMQ's, as fast as they are taken
+    trickle    takes connections and says a handshake on each, a byte at a time, without ever ending it
     slow       no enemy: a stream that is allowed and takes long (flow on whole pictures, long clips)
     refused    only with keys: comes with a key that nobody knows, with a revoked one, and with a consumer's to the port
                of the workers, and begins anew as soon as it is turned away
+    handshakes only with keys: the first message of a handshake, recorded once and sent again and again, each time over
+               a new connection: it costs its sender nothing, and the server its arithmetic
 
-Where `V2V_KEYS` names a consumer's key, they come with it; only `parts` speaks plainly, and `idle` does not get so far.
+They come from 127.0.0.2 to a server at 127.0.0.1, so that what it holds against hosts strikes them and not others.
+Where `V2V_KEYS` names a consumer's key, they come with it; only `parts` speaks plainly, and some do not get so far.
 Whoever is cut off connects again. Nothing is checked here: what counts is what happens to others.
 """
 
@@ -48,6 +53,8 @@ _READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
 _TURNED_AWAY_MS = 2000
+_ELSEWHERE = "127.0.0.2"
+_GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with the bytes that frame them
 SLOW_RECIPE = "paper-flow"
 SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
 
@@ -96,11 +103,34 @@ def idle(address: str, number: int) -> None:
     links = []
     try:
         for count in range(IDLE_EACH):
-            host, _, port = address.removeprefix("tcp://").rpartition(":")
-            links.append(socket.create_connection((host, int(port)), timeout=5.0))
+            links.append(_connected(address))
             if count % 2:
                 links[-1].sendall(_greeting(address))
         time.sleep(2.0)
+    finally:
+        for link in links:
+            link.close()
+
+
+def flood(address: str, number: int) -> None:
+    """See the module."""
+    with _connected(address) as peer:
+        while True:
+            peer.sendall(os.urandom(1 << 16))
+
+
+def trickle(address: str, number: int) -> None:
+    """See the module."""
+    said = _greeting(address)
+    links: list[socket.socket] = []
+    try:
+        for _ in range(IDLE_EACH):
+            links.append(_connected(address))
+        for byte in said[:-1]:
+            for link in links:
+                with suppress(OSError):  # that one was cut off
+                    link.send(bytes([byte]))
+            time.sleep(0.1)
     finally:
         for link in links:
             link.close()
@@ -140,7 +170,7 @@ class Refused:
             try:
                 peer.setsockopt(zmq.LINGER, 0)
                 key.secure(peer)
-                peer.connect(where)
+                peer.connect(_from_elsewhere(where))
                 if monitor.poll(_TURNED_AWAY_MS):
                     with self.tally.open("ab") as file:
                         file.write(b".")
@@ -149,16 +179,53 @@ class Refused:
                 peer.close()
 
 
+@dataclass(frozen=True, slots=True)
+class Handshakes:
+    """See the module.
+
+    Args:
+        said: greeting and first message of somebody with a key of that server's.
+    """
+
+    said: bytes
+
+    @classmethod
+    def recorded(cls) -> Handshakes:
+        """What a peer with the key of ``V2V_KEYS`` says to a server that only listens."""
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
+            try:
+                peer.setsockopt(zmq.LINGER, 0)
+                read_key(Path(os.environ[KEY_VARIABLE])).secure(peer)
+                peer.connect(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+                link, _ = server.accept()
+                with link:
+                    link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
+                    said = b""
+                    while len(said) < _GREETING_BYTES + _HELLO_BYTES:
+                        said += link.recv(4096)
+            finally:
+                peer.close()
+        return cls(said)
+
+    def __call__(self, address: str, number: int) -> None:
+        while True:
+            with _connected(address) as peer:
+                peer.sendall(self.said)
+                answer = b""
+                while len(answer) < _GREETING_BYTES + _WELCOME_BYTES and (piece := peer.recv(4096)):
+                    answer += piece
+
+
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (parts, headers, hello, leave, look, idle, slow)
+    each.__name__: each for each in (parts, headers, hello, leave, look, idle, flood, trickle, slow)
 }
-REFUSED = "refused"
+REFUSED, HANDSHAKES = "refused", "handshakes"
+KEYED_KINDS = (REFUSED, HANDSHAKES)
 
 
-def attack(address: str, kind: str, refused: Refused | None = None) -> NoReturn:
+def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn:
     """Sets :data:`PEERS` peers on a server, again when cut off, as long as this process lives."""
-
-    act = KINDS[kind] if refused is None else refused
 
     def live(number: int) -> NoReturn:
         while True:
@@ -179,10 +246,19 @@ def _greeting(address: str) -> bytes:
 @contextmanager
 def _raw(address: str) -> Iterator[socket.socket]:
     """A peer that speaks ZMTP by hand, past the handshake."""
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=5.0) as peer:
+    with _connected(address) as peer:
         peer.sendall(_greeting("") + _READY)
         yield peer
+
+
+def _connected(address: str) -> socket.socket:
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    return socket.create_connection((host, int(port)), 5.0, (_ELSEWHERE, 0) if host == "127.0.0.1" else None)
+
+
+def _from_elsewhere(address: str) -> str:
+    """The same for ZeroMQ."""
+    return address.replace("tcp://127.0.0.1:", f"tcp://{_ELSEWHERE}:0;127.0.0.1:")
 
 
 @contextmanager
@@ -197,7 +273,7 @@ def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
         peer.setsockopt(zmq.SNDTIMEO, 2000)
         if key := key_for(address, "consumer", None):
             key.secure(peer)
-        peer.connect(address)
+        peer.connect(_from_elsewhere(address))
         yield peer
     finally:
         peer.close()
@@ -207,14 +283,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m v2v_bench.chaos.hostile", description=__doc__)
     parser.add_argument("--address", required=True)
-    parser.add_argument("--kind", required=True, choices=(*KINDS, REFUSED))
+    parser.add_argument("--kind", required=True, choices=(*KINDS, *KEYED_KINDS))
     parser.add_argument("--worker-address", help="for refused: the other port")
     parser.add_argument("--revoked", type=Path, help="for refused: a revoked key")
     parser.add_argument("--tally", type=Path, help="for refused: a file that grows by a byte with every refusal")
     asked = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    refused = Refused(asked.worker_address, asked.revoked, asked.tally) if asked.kind == REFUSED else None
-    attack(asked.address, asked.kind, refused)
+    if asked.kind == REFUSED:
+        act: Callable[[str, int], None] = Refused(asked.worker_address, asked.revoked, asked.tally)
+    else:
+        act = Handshakes.recorded() if asked.kind == HANDSHAKES else KINDS[asked.kind]
+    attack(asked.address, asked.kind, act)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ One server with one worker and one honest consumer of the paper's samples. Each 
 
     kept        batches per second under attack over those of the calm spells before and after, median of the turns
     peak MiB    the most that the server's main process held above its start, while attacked
+    server CPU  its processor time, seconds a second, above that of the calm spell before, median of the turns
     after MiB   what it held above its start at most 30 s after the attack
 
 The attackers run at the lowest priority: on the same cores they would otherwise take from the honest consumer what
@@ -26,11 +27,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 from rich.console import Console
 from rich.table import Table
 
 from v2v_bench.chaos.fleet import Fleet
-from v2v_bench.chaos.hostile import KINDS, PEERS, REFUSED
+from v2v_bench.chaos.hostile import KEYED_KINDS, KINDS, PEERS, REFUSED
 from v2v_bench.corpus import webvid_like
 from v2v_bench.speed.memory import rss_mib
 from v2v_protocol.errors import UsageError, V2VError
@@ -47,10 +49,12 @@ class Spell:
     Attributes:
         rate: batches a second of the honest consumer.
         peak_mib: the most that the server held.
+        cpu: processor time of the server, seconds a second.
     """
 
     rate: float
     peak_mib: float
+    cpu: float
 
 
 def spell(fleet: Fleet, seconds: float) -> Spell:
@@ -59,14 +63,14 @@ def spell(fleet: Fleet, seconds: float) -> Spell:
     Raises:
         UsageError: the server or the consumer ended.
     """
-    began, before, peak = time.monotonic(), fleet.committed()[0], 0.0
+    began, before, peak, worked = time.monotonic(), fleet.committed()[0], 0.0, _worked(fleet)
     while (now := time.monotonic()) < began + seconds:
         fleet.look(now)
         if fleet.failures:
             raise UsageError(f"{fleet.failures[0].name} ended: {fleet.failures[0].text}")
         peak = max(peak, _held(fleet))
         time.sleep(0.05)
-    return Spell((fleet.committed()[0] - before) / (now - began), peak)
+    return Spell((fleet.committed()[0] - before) / (now - began), peak, (_worked(fleet) - worked) / (now - began))
 
 
 def attacked(fleet: Fleet, kind: str, seconds: float) -> Spell:
@@ -78,6 +82,14 @@ def attacked(fleet: Fleet, kind: str, seconds: float) -> Spell:
     finally:
         peers.kill()
         peers.wait()
+
+
+def _worked(fleet: Fleet) -> float:
+    """Seconds of processor time that the server has taken."""
+    if fleet.server.pid is None:
+        return 0.0
+    times = psutil.Process(fleet.server.pid).cpu_times()
+    return float(times.user + times.system)
 
 
 def _held(fleet: Fleet) -> float:
@@ -96,7 +108,7 @@ def settled(fleet: Fleet, start_mib: float) -> float:
 
 def besiege(fleet: Fleet, kinds: Sequence[str], turns: int, seconds: float) -> list[dict[str, Any]]:
     """All kinds in turn, several times over; a record for each kind."""
-    found: dict[str, list[tuple[float, float, float]]] = {kind: [] for kind in kinds}
+    found: dict[str, list[tuple[float, float, float, float]]] = {kind: [] for kind in kinds}
     start = max(spell(fleet, seconds).peak_mib for _ in range(2))
     for turn in range(turns):
         for kind in kinds:
@@ -104,16 +116,20 @@ def besiege(fleet: Fleet, kinds: Sequence[str], turns: int, seconds: float) -> l
             under = attacked(fleet, kind, seconds)
             after = settled(fleet, start)
             calm = (before.rate + spell(fleet, seconds / 2).rate) / 2
-            found[kind].append((under.rate / calm if calm else 0.0, under.peak_mib - start, after))
-            kept, peak, left = found[kind][-1]
-            print(f"turn {turn + 1}/{turns}  {kind:8} kept {kept:.2f}  peak {peak:.0f} MiB  after {left:.0f} MiB")
+            kept, cpu = under.rate / calm if calm else 0.0, under.cpu - before.cpu
+            found[kind].append((kept, under.peak_mib - start, after, cpu))
+            print(
+                f"turn {turn + 1}/{turns}  {kind:10} kept {kept:.2f}  server CPU {cpu:+.3f}  "
+                f"peak {under.peak_mib - start:.0f} MiB  after {after:.0f} MiB"
+            )
     return [
         {
             "kind": kind,
-            "kept": statistics.median(kept for kept, _, _ in rows),
-            "kept_lowest": min(kept for kept, _, _ in rows),
-            "peak_mib": max(peak for _, peak, _ in rows),
-            "after_mib": max(left for _, _, left in rows),
+            "kept": statistics.median(kept for kept, *_ in rows),
+            "kept_lowest": min(kept for kept, *_ in rows),
+            "server_cpu": statistics.median(cpu for *_, cpu in rows),
+            "peak_mib": max(peak for _, peak, *_ in rows),
+            "after_mib": max(left for _, _, left, _ in rows),
         }
         for kind, rows in found.items()
     ]
@@ -139,13 +155,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--footage", type=Path, nargs="+", required=True, metavar="FILE", help="clips are made of these"
     )
-    parser.add_argument("--kinds", metavar="KIND,KIND", help=f"default {','.join(KINDS)}; with --keys {REFUSED} too")
+    parser.add_argument(
+        "--kinds", metavar="KIND,KIND", help=f"default {','.join(KINDS)}; with --keys {' and '.join(KEYED_KINDS)} too"
+    )
     parser.add_argument("--keys", action="store_true", help="the server takes nobody without a key: all is encrypted")
     parser.add_argument("--turns", type=int, default=3, help="default 3")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each spell (default 8)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
     asked = parser.parse_args(arguments)
-    possible = (*KINDS, REFUSED) if asked.keys else tuple(KINDS)
+    possible = (*KINDS, *KEYED_KINDS) if asked.keys else tuple(KINDS)
     kinds = asked.kinds.split(",") if asked.kinds else possible
     unknown = [kind for kind in kinds if kind not in possible]
     if unknown or asked.turns < 1 or asked.seconds <= 0:
@@ -180,10 +198,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _show(records: Sequence[dict[str, Any]]) -> None:
     table = Table(box=None, pad_edge=False)
-    for title in ("kind", "kept", "lowest", "peak MiB", "after MiB"):
+    for title in ("kind", "kept", "lowest", "server CPU", "peak MiB", "after MiB"):
         table.add_column(title, justify="left" if title == "kind" else "right")
     for record in records:
-        figures = (f"{record['kept']:.2f}", f"{record['kept_lowest']:.2f}")
+        figures = (f"{record['kept']:.2f}", f"{record['kept_lowest']:.2f}", f"{record['server_cpu']:+.3f}")
         table.add_row(record["kind"], *figures, f"{record['peak_mib']:.0f}", f"{record['after_mib']:.0f}")
     Console(width=None if sys.stdout.isatty() else 100, highlight=False).print(table)
 

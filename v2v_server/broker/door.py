@@ -9,6 +9,9 @@ thread looks at them many times a second and ends the connection of a peer that
     says nothing that is a message after it has connected    a file of the server
     comes when all connections are taken
 
+An address that opens one connection after the other and says nothing on them costs a handshake each time: the kernel
+turns it away for a while (:mod:`v2v_server.keys.callers`, :mod:`v2v_server.system.turn_away`).
+
 The connection is shut down under ZeroMQ, which then forgets the peer and what it kept for it. An honest consumer that
 is cut off by mistake connects again and goes on. The loop learns whose connections have ended.
 
@@ -28,10 +31,13 @@ import termios
 import threading
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import zmq
 
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES
+from v2v_server.keys.callers import UNKNOWN, Callers
+from v2v_server.system.turn_away import network_of, shown, turn_away
 
 LOOK_SECONDS = 0.05
 SAYS_NOTHING_SECONDS = 30.0
@@ -40,7 +46,7 @@ MOST_CONNECTIONS = 4096 + 256
 _LARGEST_UNREAD_BYTES = 6 * LARGEST_REQUEST_BYTES
 """More than ZeroMQ holds of whole messages (``transport.MOST_UNREAD``) and of one that is on its way."""
 _SLACK_BYTES = 64 << 20
-_EVENTS = int(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_CLOSED)
+_EVENTS = int(zmq.EVENT_LISTENING | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_CLOSED)
 _TCP_INFO_BYTES, _ACKED, _RECEIVED = 136, 120, 128  # of struct tcp_info, Linux
 
 
@@ -58,7 +64,8 @@ def most_connections(files_for_others: int) -> int:
 
 @dataclass(slots=True)
 class _Connection:
-    peer: object  # its address, by which it is known again
+    peer: tuple[Any, ...] | None  # its address, by which it is known again
+    caller: bytes | None  # its host; None: over a socket of this host
     since: float
     identity: bytes | None = None
     consumed: int = 0  # bytes that ZeroMQ had taken at the last look
@@ -91,6 +98,8 @@ class Door:
         self._connections: dict[int, _Connection] = {}
         self._files: dict[bytes, int] = {}
         self._ended: list[bytes] = []
+        self._callers = Callers()
+        self._listening: list[int] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._monitor: zmq.Socket[bytes] | None = None
@@ -114,6 +123,8 @@ class Door:
             if connection.identity != identity:
                 if connection.identity is not None:  # who had the descriptor before, and was heard late
                     self._leave(connection.identity, file)
+                elif connection.caller is not None:
+                    self._callers.spoke(connection.caller, time.monotonic())
                 connection.identity = identity
                 self._files[identity] = file
 
@@ -138,6 +149,11 @@ class Door:
             ended, self._ended = self._ended, []
         return ended
 
+    def take_turned_away(self) -> list[str]:
+        """Addresses that the kernel turns away, and did not before; "" for strangers."""
+        with self._lock:
+            return [shown(caller) if caller else "" for caller in self._callers.take_news()]
+
     def close(self) -> None:
         """Stops watching. To be called before the socket is closed."""
         self._closing.set()
@@ -160,6 +176,8 @@ class Door:
                 self._take_events()
                 if (now := time.monotonic()) >= look_at:
                     look_at = now + LOOK_SECONDS
+                    if self._callers.look(now):
+                        self._turn_away()
                     for file in list(self._connections):
                         self._look(file, now)
 
@@ -176,11 +194,23 @@ class Door:
         while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             event, file = struct.unpack("=hi", self._monitor.recv_multipart()[0])
             self._forget(file)
-            if event == zmq.EVENT_ACCEPTED:
+            if event == zmq.EVENT_LISTENING:
+                self._listening.append(file)
+            elif event == zmq.EVENT_ACCEPTED:
                 self._accept(file)
 
+    def _turn_away(self) -> None:
+        away = [caller for caller in self._callers.away if caller != UNKNOWN]
+        known = self._callers.known if UNKNOWN in self._callers.away else None
+        for file in self._listening:
+            turn_away(file, away, known)
+
     def _accept(self, file: int) -> None:
-        self._connections[file] = _Connection(_peer(file), time.monotonic())
+        peer, now = _peer(file), time.monotonic()
+        caller = None if peer is _LOCAL else UNKNOWN if peer is None else network_of(peer[0])
+        self._connections[file] = _Connection(peer, caller, now)
+        if caller is not None and self._callers.came(caller, now):
+            self._turn_away()
         if len(self._connections) > self._most_connections:
             # Those who have said nothing yet, the oldest first; perhaps the newcomer itself.
             silent = (each for each, known in self._connections.items() if known.identity is None and not known.cut)
@@ -220,7 +250,7 @@ class Door:
     def _cut(self, file: int) -> None:
         connection = self._connections[file]
         connection.cut = True
-        if connection.peer is None or _peer(file) != connection.peer:
+        if not connection.peer or _peer(file) != connection.peer:
             return  # no TCP; or closed already, and the descriptor is another's
         with contextlib.suppress(OSError):  # it has just ended
             link = _link(file)
@@ -235,14 +265,17 @@ def _link(file: int) -> socket.socket:
     return socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=file)
 
 
-def _peer(file: int) -> object:
-    """Address of the other end; None where there is no connection."""
+_LOCAL: tuple[Any, ...] = ()
+
+
+def _peer(file: int) -> tuple[Any, ...] | None:
+    """Address of the other end; :data:`_LOCAL` where that is a process of this host; None where there is none."""
     try:
         link = socket.socket(fileno=file)
     except OSError:
         return None
     try:
-        return link.getpeername() if link.family in (socket.AF_INET, socket.AF_INET6) else None
+        return link.getpeername() if link.family in (socket.AF_INET, socket.AF_INET6) else _LOCAL
     except OSError:
         return None
     finally:

@@ -62,7 +62,21 @@ class ConsumerGone:
     identity: bytes
 
 
-Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone
+@dataclass(frozen=True, slots=True)
+class TurnedAway:
+    """From an address came more connections without a message than any host needs; its next ones are not let in.
+
+    Attributes:
+        address: of a host, or of a network of IPv6; empty where connections were gone before they could be asked, and
+            hosts that have not spoken within the hour are turned away.
+        side: whose port it was.
+    """
+
+    address: str
+    side: str
+
+
+Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone | TurnedAway
 
 
 class ServerTransport(Protocol):
@@ -82,7 +96,7 @@ class ServerTransport(Protocol):
 
     def receive(self, seconds: float) -> list[Arrival]:
         """At most one message of each side, so that neither can shut the other out; the workers' first. Last of all who
-        has gone.
+        has gone, and who is turned away.
 
         Args:
             seconds: longest wait for any of them.
@@ -198,6 +212,9 @@ class Sockets:
         if self._gate is not None:
             self._review(self._gate, gone, workers_gone)
         arrivals += map(ConsumerGone, gone)
+        for door, side in ((self._door, "consumer"), (self._worker_door, "worker")):
+            if door is not None:
+                arrivals += (TurnedAway(address, side) for address in door.take_turned_away())
         return arrivals
 
     def _receive(self, router: zmq.Socket[bytes], side: str) -> tuple[bytes, list[Any]] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -16,13 +17,14 @@ from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker import door
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, Sockets
+from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, Sockets, TurnedAway
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
 
 ROUTER_READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0NULL" + bytes(16 + 1 + 31)
 MIB = 1 << 20
+peer_of = door._peer
 
 
 @pytest.fixture
@@ -181,6 +183,87 @@ def test_connections_are_bounded_and_those_that_say_nothing_make_room(
     assert sockets.send(to(b"honest", encode(Pong())))
     for each in idle:
         each.close()
+
+
+def gets_in(where: tuple[str, int], source: str, held: list[socket.socket] | None = None) -> bool:
+    """Whether a new connection comes about; it ends with a reset unless it is held."""
+    peer = socket.socket()
+    peer.settimeout(0.3)  # the kernel drops what asks for a connection, or answers at once
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    peer.bind((source, 0))
+    try:
+        peer.connect(where)
+    except TimeoutError:
+        peer.close()
+        return False
+    if held is None:
+        peer.close()
+    else:
+        held.append(peer)
+    return True
+
+
+def port_of(sockets: Sockets, kind: type) -> tuple[str, int]:
+    address = sockets.address if kind is FromConsumer else sockets.worker_address
+    return "127.0.0.1", int(address.rpartition(":")[2])
+
+
+def from_elsewhere(where: tuple[str, int]) -> str:
+    return f"tcp://127.0.0.2:0;127.0.0.1:{where[1]}"
+
+
+@pytest.mark.parametrize(("kind", "side"), [(FromConsumer, "consumer"), (FromWorker, "worker")])
+def test_a_host_that_connects_again_and_again_without_a_word_is_turned_away(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], kind: type, side: str
+) -> None:
+    """Each connection may cost a handshake: its arithmetic is done before anyone knows whether the key is good."""
+    sockets = serve()
+    where = port_of(sockets, kind)
+    same_host = consumer(sockets, b"same-host", from_elsewhere(where))
+    same_host.send_multipart(encode(Ping()))
+    next_from(sockets, kind)
+    held: list[socket.socket] = []
+    told: list[Arrival] = []
+
+    def is_told() -> bool:
+        gets_in(where, "127.0.0.2", held)
+        told.extend(one for one in sockets.receive(0) if isinstance(one, TurnedAway))
+        return bool(told)
+
+    until(is_told)
+    assert told == [TurnedAway("127.0.0.2", side)]
+    assert not gets_in(where, "127.0.0.2")
+    honest = consumer(sockets, b"honest", f"tcp://127.0.0.1:{where[1]}")
+    for peer, name in ((honest, b"honest"), (same_host, b"same-host")):  # new from another host; old from the same
+        peer.send_multipart(encode(Ping()))
+        assert next_from(sockets, kind).identity == name  # type: ignore[union-attr]
+    for each in held:
+        each.close()
+
+
+def test_who_is_gone_before_it_is_seen_costs_strangers_their_turn(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection that was reset has no address any more when the door asks for it."""
+    monkeypatch.setattr(
+        door, "_peer", lambda file: seen if (seen := peer_of(file)) and seen[0] == "127.0.0.2" else None
+    )
+    sockets = serve()
+    where = port_of(sockets, FromConsumer)
+    known = consumer(sockets, b"known", from_elsewhere(where))
+    known.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    told: list[Arrival] = []
+
+    def is_told() -> bool:
+        gets_in(where, "127.0.0.3")
+        told.extend(one for one in sockets.receive(0) if isinstance(one, TurnedAway))
+        return bool(told)
+
+    until(is_told)
+    assert told == [TurnedAway("", "consumer")]
+    assert gets_in(where, "127.0.0.2")
+    assert not all(gets_in(where, "127.0.0.4") for _ in range(5))
 
 
 def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]) -> None:
