@@ -39,6 +39,7 @@ class Camera:
         provenance: where the clip came from, and the draw.
         frames_per_bin: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
+        whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
     """
 
     voxels: npt.NDArray[Any]
@@ -48,10 +49,16 @@ class Camera:
     provenance: Provenance
     frames_per_bin: int = 1
     lead_voxels: int = 0
+    whole: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def of(
-        cls, arrays: Mapping[str, npt.NDArray[Any]], provenance: Provenance, title: str, frames_per_bin: int = 1
+        cls,
+        arrays: Mapping[str, npt.NDArray[Any]],
+        provenance: Provenance,
+        title: str,
+        frames_per_bin: int = 1,
+        whole: npt.NDArray[np.uint8] | None = None,
     ) -> Camera:
         """From the arrays of one sample. Lead frames and lead voxels, which stand in front, are left out.
 
@@ -69,7 +76,16 @@ class Camera:
             provenance,
             frames_per_bin,
             len(voxels) - count,
+            whole,
         )
+
+    @property
+    def crop(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom of what the camera sees, px of the whole picture."""
+        params = self.provenance.params
+        height, width = self.frames.shape[1:]
+        left, top, scale = params.crop_left_px, params.crop_top_px, params.scale
+        return left / scale, top / scale, (left + width) / scale, (top + height) / scale
 
     @property
     def rates(self) -> npt.NDArray[np.float64]:
@@ -91,22 +107,24 @@ class Camera:
 
     def moments(self, count: int) -> list[int]:
         """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled. Paused
-        bins, in which only noise fires, count nothing, and the more of them a grid has the less it is worth."""
+        bins, in which only noise fires, count nothing, and the more of them a grid has the less it is worth. Its
+        liveliest bin counts nothing either: a cut of the film is a flash of one bin, and no motion."""
         bins = self.voxels.shape[1]
         moving = ~self.paused.reshape(-1, bins)
-        activity = (self.rates.sum(axis=0).reshape(-1, bins) * moving).sum(axis=1) * moving.mean(axis=1)
+        each = self.rates.sum(axis=0).reshape(-1, bins) * moving
+        activity = (each.sum(axis=1) - (each.max(axis=1) if bins > 1 else 0.0)) * moving.mean(axis=1)
         first = min(round(len(activity) * _SETTLED_SHARE), len(activity) - 1)
         edges = np.linspace(first, len(activity), min(count, len(activity) - first) + 1).round().astype(int)
         return [int(start + np.argmax(activity[start:end])) for start, end in pairwise(edges)]
 
     def describe(self) -> str:
-        """The draw in one line."""
+        """The draw in one line: what is nothing is left out."""
         params = self.provenance.params
-        parts = [
-            f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}",
-            f"noise {params.noise_sigma:.3f}",
-            f"{params.hot_pixel_count} hot pixels",
-        ]
+        parts = [f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}"]
+        if params.noise_sigma:
+            parts.append(f"noise {params.noise_sigma:.3f}")
+        if params.hot_pixel_count:
+            parts.append(f"{params.hot_pixel_count} hot pixels")
         if params.scale != 1.0:
             parts.append(f"resized by {params.scale:.2f}")
         if params.flip:
@@ -114,10 +132,21 @@ class Camera:
         if params.contrast:
             parts.append(f"contrast {params.contrast:.2f}")
         effects = params.to_dict().get("effects", {})
-        parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in effects.items() if value]
+        parts += [_with_unit(name, value) for name, value in effects.items() if value]
         return "   ".join(parts)
 
     @property
     def source(self) -> str:
         """Video and first frame."""
         return f"{self.provenance.video}, from frame {self.provenance.start_frame}"
+
+
+_UNITS = {"_hz": (1.0, " Hz"), "_seconds": (1e3, " ms"), "_share": (100.0, " %"), "_sigma": (1.0, "")}
+
+
+def _with_unit(name: str, value: float) -> str:
+    """``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
+    for ending, (factor, unit) in _UNITS.items():
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} {factor * value:.2g}{unit}"
+    return f"{name.replace('_', ' ')} {value:.3g}"

@@ -13,10 +13,12 @@ import av
 import numpy as np
 from PIL import Image as Pictures
 
-from v2v_pictures.colours import Image
+from v2v_pictures import canvas
+from v2v_pictures.colours import BRIGHTER, DARKER, Image
 from v2v_protocol.errors import UsageError
 
-_GIF_COLOURS = 96
+_GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8
+_GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED, BRIGHTER, DARKER)
 _QUALITY = "20"  # x264's rate factor: no visible loss of thin red and blue lines
 
 
@@ -30,13 +32,27 @@ def png_bytes(image: Image) -> bytes:
 def gif_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
     """A film as GIF, of few colours, so that it fits a page."""
     pages = [Pictures.fromarray(np.ascontiguousarray(image)) for image in film]
-    few_pages = [np.asarray(pages[number]) for number in {0, len(pages) // 2, len(pages) - 1}]
-    palette = Pictures.fromarray(np.concatenate(few_pages)).quantize(_GIF_COLOURS)
+    palette = _palette(np.concatenate([np.asarray(pages[at]) for at in {0, len(pages) // 2, len(pages) - 1}]))
     few = [page.quantize(palette=palette, dither=Pictures.Dither.NONE) for page in pages]
     file = io.BytesIO()
     milliseconds = round(1000 / frames_per_second)
     few[0].save(file, "GIF", save_all=True, append_images=few[1:], duration=milliseconds, loop=0, optimize=True)
     return file.getvalue()
+
+
+def _palette(sampled: Image) -> Pictures.Image:
+    """Colours that mean something as they are, and a selection of all others, which are photographs: a picture that
+    Pillow takes for a palette."""
+    found, counts = np.unique(sampled.reshape(-1, 3), axis=0, return_counts=True)
+    common = found[np.argsort(-counts, kind="stable")][:_GIF_COMMON]
+    others = Pictures.fromarray(sampled).quantize(_GIF_COLOURS).getpalette() or []
+    rest = np.concatenate([common, np.array(others, np.uint8).reshape(-1, 3)])
+    exact = np.array(_GIF_EXACT, np.uint8)
+    # Pillow looks colours up in steps of 4: one beside an exact colour would take its place.
+    near = np.abs(rest[:, None].astype(int) - exact.astype(int)).max(axis=2).min(axis=1) < _GIF_STEP
+    palette = Pictures.new("P", (1, 1))
+    palette.putpalette([*exact.reshape(-1).tolist(), *rest[~near].reshape(-1).tolist()])
+    return palette
 
 
 def mp4_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:

@@ -7,10 +7,13 @@ from collections.abc import Iterator, Sequence
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import Canvas
-from v2v_pictures.colours import Image, draw_events, draw_flow, draw_grey
-from v2v_pictures.sheet import GAP_PX, MARGIN_PX, Scale, draw_strip
+from v2v_pictures.colours import Image, draw_events, draw_grey
+from v2v_pictures.sheet import GAP_PX, MARGIN_PX, Scale, events_heading, flow_panel, label
+from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
-_TITLE_PX, _LABEL_PX, _STRIP_PX = 56, 46, 46
+_TITLE_PX, _STRIP_PX = 58, 50
+_CAMERA_PX, _NAMES_PX, _BETWEEN_PX = 52, 30, 20
+_LEAST_WIDTH_PX = 620
 FRAMES_PER_SECOND = 20.0
 
 
@@ -26,31 +29,35 @@ def draw_film(cameras: Sequence[Camera], title: str, *, tile_px: int = 256) -> I
         [height, width, 3] uint8 RGB, all of one size.
     """
     scale = Scale.of(cameras)
-    with_flow = cameras[0].flow is not None
-    names = ["video frame", "simulated events", *(["optical flow"] if with_flow else [])]
-    width = max(2 * MARGIN_PX + len(names) * (tile_px + GAP_PX), 2 * MARGIN_PX + 620)
-    block = _LABEL_PX + 22 + tile_px + GAP_PX + _STRIP_PX + 24
+    columns = 2 + (cameras[0].flow is not None)
+    width = max(2 * MARGIN_PX + columns * (tile_px + GAP_PX) - GAP_PX, 2 * MARGIN_PX + _LEAST_WIDTH_PX)
+    block = _CAMERA_PX + _NAMES_PX + tile_px + GAP_PX + LABEL_PX + _STRIP_PX + TICKS_PX + _BETWEEN_PX
     grids, bins = cameras[0].voxels.shape[:2]
     for number in range(grids * bins):
         page = Canvas(width, _TITLE_PX + len(cameras) * block)
-        page.text(MARGIN_PX, 18, title, size=canvas.TITLE_PT)
+        page.title(MARGIN_PX, 16, title)
         for place, camera in enumerate(cameras):
-            top = _TITLE_PX + place * block
-            x = page.text(MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)
-            page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
-            line = canvas.shortened(camera.describe(), width - 2 * MARGIN_PX)
-            page.text(MARGIN_PX, top + 22, line, colour=canvas.SOFT)
-            grid, bin_ = divmod(number, bins)
-            tiles = [draw_grey(camera.frames[grid]), draw_events(camera.voxels[grid, bin_], scale.full)]
-            if camera.flow is not None:
-                tiles.append(draw_flow(camera.flow[grid], scale.largest_px))
-            for column, (name, tile) in enumerate(zip(names, tiles, strict=True)):
-                left = MARGIN_PX + column * (tile_px + GAP_PX)
-                page.text(left + tile_px / 2, top + _LABEL_PX, name, colour=canvas.SOFT, anchor="ma")
-                page.panel(left, top + _LABEL_PX + 20, tile, tile_px, tile_px)
-            below = top + _LABEL_PX + 22 + tile_px + GAP_PX
-            draw_strip(page, camera, MARGIN_PX, below, width - 2 * MARGIN_PX, _STRIP_PX, (), cursor=number)
-            if camera.paused[number]:
-                left = MARGIN_PX + tile_px + GAP_PX
-                page.text(left + 8, top + _LABEL_PX + 26, "paused", size=canvas.HEADING_PT, colour=canvas.SOFT)
+            _draw_camera(page, camera, place, _TITLE_PX + place * block, number, scale, tile_px)
         yield page.image()
+
+
+def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int, scale: Scale, tile_px: int) -> None:
+    """One camera at one bin of its clip."""
+    grid, bin_ = divmod(number, camera.voxels.shape[1])
+    width = page.width_px - 2 * MARGIN_PX
+    x = page.text(MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)
+    page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
+    page.text(MARGIN_PX, top + 27, canvas.shortened(camera.describe(), width), colour=canvas.SOFT)
+    left = [MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
+    top += _CAMERA_PX
+    page.text(left[0], top, "video frame", size=canvas.HEADING_PT)
+    events_heading(page, left[1], top, "events:")
+    top += _NAMES_PX
+    page.panel(left[0], top, draw_grey(camera.frames[grid]), tile_px, tile_px)
+    page.panel(left[1], top, draw_events(camera.voxels[grid, bin_], scale.full), tile_px, tile_px)
+    if camera.paused[number]:
+        label(page, left[1] + 5, top + 5, "paused")
+    if camera.flow is not None:
+        page.text(left[2], top - _NAMES_PX, "optical flow", size=canvas.HEADING_PT)
+        flow_panel(page, left[2], top, camera.flow[grid], scale.largest_px, tile_px)
+    draw_strip(page, camera, MARGIN_PX, top + tile_px + GAP_PX + LABEL_PX, width, _STRIP_PX, cursor=number)

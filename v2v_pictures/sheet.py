@@ -8,20 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import Canvas
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
+from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
 MARGIN_PX, GAP_PX = 28, 8
-_TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 62, 46, 36, 46, 96
-_STRIP_LABEL_PX = 116
+_TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 64, 58, 38, 54, 132
+_BETWEEN_PX = 26
 _LEAST_SOURCE_PX = 120
-_HATCH_PX = 7
 _MOST_BINS = 8
+_ARROWS = 4
+"""Arrows along a side of a panel of flow: colours alone are not told apart by everybody."""
+_STILL = 0.15
+"""Flow below this share of the largest gets no arrow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +68,29 @@ def draw_sheet(cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_
     with_flow = cameras[0].flow is not None
     columns = 1 + bins + with_flow
     width = 2 * MARGIN_PX + columns * (tile_px + GAP_PX) + 2 * 2 * GAP_PX
-    block = _CAMERA_PX + _STRIP_PX + 18 + moments * (tile_px + GAP_PX) + 20
+    strip_px = LABEL_PX + _STRIP_PX + TICKS_PX + GAP_PX
+    block = _CAMERA_PX + strip_px + moments * (tile_px + GAP_PX) + _BETWEEN_PX
     page = Canvas(width, _TITLE_PX + _HEADING_PX + len(cameras) * block + _LEGEND_PX)
     left = _columns(bins, with_flow, tile_px)
-    page.text(MARGIN_PX, 20, title, size=canvas.TITLE_PT)
+    page.title(MARGIN_PX, 18, title)
     _headings(page, left, bins, with_flow, tile_px)
     for number, camera in enumerate(cameras):
         top = _TITLE_PX + _HEADING_PX + number * block
         picks = camera.moments(moments)
         _camera_line(page, camera, number, top)
-        draw_strip(page, camera, MARGIN_PX, top + _CAMERA_PX, width - 2 * MARGIN_PX, _STRIP_PX, picks)
+        top += _CAMERA_PX
+        strip_left = MARGIN_PX
+        if camera.whole is not None:
+            whole_panel(page, camera, MARGIN_PX, top, tile_px, strip_px - GAP_PX)
+            strip_left = left[1]
+        strip_width = page.width_px - MARGIN_PX - strip_left
+        draw_strip(page, camera, strip_left, top + LABEL_PX, strip_width, _STRIP_PX, picks)
         for row, pick in enumerate(picks):
-            y = top + _CAMERA_PX + _STRIP_PX + 18 + row * (tile_px + GAP_PX)
+            y = top + strip_px + row * (tile_px + GAP_PX)
             _moment(page, camera, pick, scale, left, y, tile_px)
-    _legend(page, scale, with_flow, page.height_px - _LEGEND_PX)
+            if len(picks) > 1:
+                label(page, left[0] + 5, y + 5, f"voxel grid {pick + 1}", canvas.MARK)
+    _legend(page, cameras, scale, page.height_px - _LEGEND_PX)
     return page.image()
 
 
@@ -87,83 +102,81 @@ def _columns(bins: int, with_flow: bool, tile_px: int) -> list[int]:
 
 
 def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px: int) -> None:
-    y = _TITLE_PX + 4
+    y, below = _TITLE_PX, _TITLE_PX + 27
     page.text(left[0] + tile_px / 2, y, "video frame", size=canvas.HEADING_PT, anchor="ma")
-    page.text(left[0] + tile_px / 2, y + 20, "at the end of the bins", colour=canvas.SOFT, anchor="ma")
+    page.text(left[0] + tile_px / 2, below, "at the end of the bins", colour=canvas.SOFT, anchor="ma")
     end = left[bins] + tile_px
-    events = "simulated events: one voxel grid"
-    page.text((left[1] + end) / 2, y, events, size=canvas.HEADING_PT, anchor="ma")
+    events_heading(page, left[1], y)
     for number in range(bins):
-        page.text(left[1 + number] + tile_px / 2, y + 20, f"bin {number + 1}", colour=canvas.SOFT, anchor="ma")
-    page.text(left[1], y + 2, "time", colour=canvas.SOFT)
-    page.arrow(left[1] + 34, y + 10, (left[1] + end) / 2 - canvas.text_width(events, canvas.HEADING_PT) / 2 - 12)
-    page.arrow((left[1] + end) / 2 + canvas.text_width(events, canvas.HEADING_PT) / 2 + 12, y + 10, end)
+        x = page.text(left[1 + number], below, f"bin {number + 1}", colour=canvas.SOFT)
+        if number + 1 < bins:
+            page.arrow(x + 10, below + 11, left[2 + number] - 6)
+        else:
+            page.arrow(x + 10, below + 11, end - canvas.text_width("time") - 8)
+            page.text(end, below, "time", colour=canvas.SOFT, anchor="ra")
     if with_flow:
         page.text(left[-1] + tile_px / 2, y, "optical flow", size=canvas.HEADING_PT, anchor="ma")
-        page.text(left[-1] + tile_px / 2, y + 20, "over the voxel grid", colour=canvas.SOFT, anchor="ma")
+        page.text(left[-1] + tile_px / 2, below, "over the voxel grid", colour=canvas.SOFT, anchor="ma")
+
+
+def events_heading(page: Canvas, x: float, y: float, what: str = "simulated events:") -> None:
+    """What red and blue are, in red and blue."""
+    x = page.text(x, y, what, size=canvas.HEADING_PT)
+    x = page.text(x + 10, y, "brighter", size=canvas.HEADING_PT, colour=BRIGHTER)
+    page.text(x + 10, y, "darker", size=canvas.HEADING_PT, colour=DARKER)
+
+
+def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], largest_px: float, tile_px: int) -> None:
+    """Flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
+    page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
+    height, width = flow.shape[1:]
+    scale = min(tile_px / width, tile_px / height)
+    x0, y0 = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
+    rows, columns = (np.linspace(0, side, _ARROWS + 1).round().astype(int) for side in (height, width))
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            if bottom <= top or right <= left:
+                continue
+            along = flow[:, top:bottom, left:right].mean(axis=(1, 2), dtype=np.float64) / largest_px
+            length = float(np.hypot(*along))
+            if length < _STILL:
+                continue
+            along *= min(1.0, length) / length * 0.85 * tile_px / _ARROWS
+            centre_x, centre_y = x0 + (left + right) / 2 * scale, y0 + (top + bottom) / 2 * scale
+            page.vector(centre_x - along[0] / 2, centre_y - along[1] / 2, *along)
+
+
+def label(page: Canvas, x: int, y: int, text: str, colour: canvas.Colour = canvas.INK) -> None:
+    """Text on a ground of its own, so that the panel below does not hide it."""
+    page.box(x, y, x + canvas.text_width(text) + 10, y + 24, canvas.PAPER)
+    page.text(x + 5, y + 2, text, colour=colour)
+
+
+def whole_panel(page: Canvas, camera: Camera, x: int, y: int, width_px: int, height_px: int) -> None:
+    """The video's picture, small, and a box around what the camera sees of it."""
+    if camera.whole is None:
+        return
+    height, width = camera.whole.shape
+    scale = min(width_px / width, height_px / height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    page.panel(x, y, draw_grey(camera.whole), *size)
+    left, top, right, bottom = (edge * scale for edge in camera.crop)
+    for colour, wider in ((canvas.PAPER, 1), (canvas.MARK, 0)):
+        page.frame(
+            x + max(0, left) - wider, y + max(0, top) - wider, x + min(size[0], right) - 1 + wider,
+            y + min(size[1], bottom) - 1 + wider, colour, 2 + wider,
+        )  # fmt: skip
 
 
 def _camera_line(page: Canvas, camera: Camera, number: int, top: int) -> None:
-    page.line(MARGIN_PX, top - 6, page.width_px - MARGIN_PX, top - 6, canvas.SHADE, 2)
+    page.line(MARGIN_PX, top - 8, page.width_px - MARGIN_PX, top - 6, canvas.SHADE, 2)
     x = page.text(MARGIN_PX, top, f"Camera {number + 1}", size=canvas.HEADING_PT)
     if camera.title:
         x = page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
-    x = page.text(x + 18, top + 3, camera.describe(), colour=canvas.SOFT)
+    x = page.text(x + 18, top + 4, camera.describe(), colour=canvas.SOFT)
     right = page.width_px - MARGIN_PX
     if right - x > _LEAST_SOURCE_PX:
-        page.text(right, top + 3, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
-
-
-def draw_strip(
-    page: Canvas,
-    camera: Camera,
-    left: int,
-    top: int,
-    width: int,
-    height: int,
-    picks: Sequence[int],
-    cursor: int | None = None,
-) -> None:
-    """Activity over the whole clip: brighter events up, darker down; pauses hatched and named.
-
-    Args:
-        page: to draw on.
-        camera: whose activity. Each strip has a scale of its own, whose top is written beside it.
-        left, top, width, height: where, px.
-        picks: voxel grids to point at.
-        cursor: a bin to draw a line at, for films.
-    """
-    rates, paused, middle = camera.rates, camera.paused, top + height / 2
-    highest = max(float(np.quantile(rates, 0.99)), 1e-9)
-    label = _STRIP_LABEL_PX
-    page.text(left, top + height / 2 - 16, "events a pixel")
-    page.text(left, top + height / 2, f"up to {highest:.1g} a bin", colour=canvas.SOFT)
-    left, width = left + label, width - label
-    count = rates.shape[1]
-    at = [left + width * number / count for number in range(count + 1)]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], paused, [False]])))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        page.hatch(at[start], top, at[end], top + height)
-    for number in range(count):
-        up, down = np.minimum(rates[:, number] / highest, 1.0) * (height / 2)
-        page.box(at[number], middle - up, at[number + 1], middle, BRIGHTER)
-        page.box(at[number], middle, at[number + 1], middle + down, DARKER)
-    for start, end in zip(edges[::2], edges[1::2], strict=True):  # seen behind full bars too
-        page.hatch(at[start], top, at[end], top + _HATCH_PX)
-        page.hatch(at[start], top + height - _HATCH_PX, at[end], top + height)
-    page.line(left, middle, left + width, middle, canvas.LINE)
-    page.frame(left, top, left + width, top + height)
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        if at[end] - at[start] > canvas.text_width("paused") + 8:
-            centre, half = (at[start] + at[end]) / 2, canvas.text_width("paused") / 2 + 4
-            page.box(centre - half, middle - 9, centre + half, middle + 9, canvas.SHADE)
-            page.text(centre, middle, "paused", colour=canvas.SOFT, anchor="mm")
-    bins = camera.voxels.shape[1]
-    for pick in picks:
-        page.frame(at[pick * bins], top, at[(pick + 1) * bins], top + height, canvas.MARK)
-        page.pointer((at[pick * bins] + at[(pick + 1) * bins]) / 2, top - 1)
-    if cursor is not None:
-        page.line(at[cursor], top, at[cursor], top + height, canvas.MARK, 2)
+        page.text(right, top + 4, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
 
 
 def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[int], y: int, tile_px: int) -> None:
@@ -172,31 +185,33 @@ def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[in
     for number in range(min(bins, _MOST_BINS)):
         page.panel(left[1 + number], y, draw_events(camera.voxels[pick, number], scale.full), tile_px, tile_px)
         if camera.paused[pick * bins + number]:
-            page.text(left[1 + number] + 6, y + 5, "paused", colour=canvas.SOFT)
+            label(page, left[1 + number] + 5, y + 5, "paused")
     if camera.flow is not None:
-        page.panel(left[-1], y, draw_flow(camera.flow[pick], scale.largest_px), tile_px, tile_px)
+        flow_panel(page, left[-1], y, camera.flow[pick], scale.largest_px, tile_px)
 
 
-def _legend(page: Canvas, scale: Scale, with_flow: bool, top: int) -> None:
+def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> None:
     page.line(MARGIN_PX, top, page.width_px - MARGIN_PX, top, canvas.LINE)
-    y, x = top + 22, MARGIN_PX
-    ramp = np.linspace(-scale.full, scale.full, 241, dtype=np.float32)[None].repeat(16, axis=0)
-    page.panel(x, y, draw_events(ramp, scale.full), 241, 16)
-    page.text(x, y + 22, f"{scale.full:.0f} or more darker", colour=DARKER)
-    page.text(x + 241, y + 22, f"{scale.full:.0f} or more brighter", colour=BRIGHTER, anchor="ra")
-    page.text(x + 120, y - 16, "events a pixel and bin", colour=canvas.SOFT, anchor="ma")
-    x += 280
-    page.hatch(x, y, x + 46, y + 16)
-    page.frame(x, y, x + 46, y + 16)
-    page.text(x + 56, y, "the camera is paused: the picture stands still, only noise fires")
-    page.frame(x, y + 24, x + 46, y + 40, canvas.MARK)
-    page.text(x + 56, y + 24, "the voxel grid shown below the strip")
-    if with_flow:
-        radius = 34
-        right = page.width_px - MARGIN_PX
-        wheel = draw_wheel(radius)
-        page.panel(right - 2 * radius - 1, top + 12, wheel, 2 * radius + 1, 2 * radius + 1)
-        page.text(right - 2 * radius - 14, y, "colour: where a pixel moves to", anchor="ra")
-        page.text(
-            right - 2 * radius - 14, y + 18, f"rim: {scale.largest_px:.1f} px or more", colour=canvas.SOFT, anchor="ra"
-        )
+    y, x, width = top + 42, MARGIN_PX, 341
+    ramp = np.linspace(-scale.full, scale.full, width, dtype=np.float32)[None].repeat(20, axis=0)
+    page.text(x + width / 2, y - 26, "events a pixel and bin", anchor="ma")
+    page.panel(x, y, draw_events(ramp, scale.full), width, 20)
+    page.text(x, y + 26, f"{scale.full:.0f} or more darker", colour=DARKER)
+    page.text(x + width / 2, y + 26, "none", colour=canvas.SOFT, anchor="ma")
+    page.text(x + width, y + 26, f"{scale.full:.0f} or more brighter", colour=BRIGHTER, anchor="ra")
+    x, y = x + width + 44, top + 16
+    page.hatch(x, y + 1, x + 46, y + 19)
+    page.frame(x, y + 1, x + 46, y + 19)
+    page.text(x + 58, y, "the camera is paused: its picture stands still, only noise fires")
+    page.frame(x, y + 29, x + 46, y + 47, canvas.MARK, 2)
+    whole = any(camera.whole is not None for camera in cameras)
+    crop = "; in the video: what the camera sees" if whole else ""
+    page.text(x + 58, y + 28, f"in the strip: the voxel grid shown below it{crop}")
+    said = "threshold: the change of log brightness that makes an event, brighter / darker"
+    page.text(x, y + 56, said, colour=canvas.SOFT)
+    if cameras[0].flow is not None:
+        radius = 46
+        x = page.width_px - MARGIN_PX - 2 * radius - 1
+        page.panel(x, top + 18, draw_wheel(radius), 2 * radius + 1, 2 * radius + 1)
+        page.text(x - 14, y, "flow: where a pixel moves to", anchor="ra")
+        page.text(x - 14, y + 28, f"rim: {scale.largest_px:.1f} px or more", colour=canvas.SOFT, anchor="ra")

@@ -18,11 +18,11 @@ from PIL import Image as Pictures
 
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import PAUSED, Canvas, shortened, text_width
+from v2v_pictures.canvas import INK, MARK, PAUSED, Canvas, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
-from v2v_pictures.sheet import draw_sheet
+from v2v_pictures.sheet import draw_sheet, flow_panel, whole_panel
 from v2v_protocol.errors import UsageError
 
 WHITE = (255, 255, 255)
@@ -143,6 +143,13 @@ def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise(
     assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
 
 
+def test_a_cut_is_no_moment() -> None:
+    voxels = np.zeros((20, 5, 4, 4), np.int8)
+    voxels[7, 4], voxels[12] = 100, 3
+    assert camera(voxels).moments(1) == [12]
+    assert camera(voxels[:, 4:]).moments(1) == [7]  # of one bin each: nothing else is known
+
+
 @given(st.integers(1, 30), st.integers(1, 8))
 def test_moments_are_in_order_and_different(grids: int, count: int) -> None:
     chosen = camera(np.ones((grids, 2, 2, 2), np.int8)).moments(count)
@@ -187,6 +194,36 @@ def test_pauses_are_hatched_and_named() -> None:
     )
 
 
+def test_the_whole_picture_has_a_box_around_the_crop() -> None:
+    """A crop of 16 x 16 at (left 20, top 10) of a picture twice as large as the video's: a box of 8 x 8 at (10, 5)."""
+    voxels = np.zeros((2, 2, 16, 16), np.int8)
+    params = dataclasses.replace(PARAMS, scale=2.0, crop_left_px=20, crop_top_px=10)
+    shown = dataclasses.replace(camera(voxels), provenance=dataclasses.replace(PROVENANCE, params=params))
+    assert shown.crop == (10, 5, 18, 13)
+    page = Canvas(200, 200)
+    whole_panel(page, dataclasses.replace(shown, whole=np.full((30, 40), 99, np.uint8)), 0, 0, 160, 120)
+    rows, columns = np.nonzero((page.image() == MARK).all(axis=-1))
+    assert (columns.min(), rows.min(), columns.max(), rows.max()) == (40, 20, 71, 51)
+    before = page.image()
+    whole_panel(page, shown, 0, 0, 160, 120)
+    assert np.array_equal(page.image(), before)
+
+
+def test_arrows_of_flow_point_where_pixels_move() -> None:
+    """Flow to the right in the upper half, none below: dark tips lie right of the light rims' beginnings, above."""
+    flow = np.zeros((2, 32, 32), np.float32)
+    flow[0, :16] = 3.0
+    page = Canvas(128, 128)
+    flow_panel(page, 0, 0, flow, 3.0, 128)
+    dark = (page.image() == INK).all(axis=-1)
+    assert dark[:64].any()
+    assert not dark[64:].any()
+    arrow = dark[:32, :32]  # one cell of four by four
+    tall = [int(np.ptp(np.flatnonzero(column))) if column.any() else -1 for column in arrow.T]
+    drawn = np.flatnonzero(np.array(tall) >= 0)
+    assert tall.index(max(tall)) > drawn.mean()  # the head is at its right
+
+
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 300), (300, 1), (128, 128), (300, 200)])
 def test_a_panel_keeps_the_shape_of_its_picture(height: int, width: int) -> None:
     page = Canvas(200, 200)
@@ -227,6 +264,18 @@ def test_files_read_back(tmp_path: Path) -> None:
     assert "data:video/mp4;base64," in page
     with pytest.raises(UsageError, match=r"picture\.png: No such file or directory"):
         write_png(tmp_path / "nowhere" / "picture.png", image)
+
+
+def test_a_gif_keeps_the_colours_that_mean_something() -> None:
+    """Among many greys and hues of a photograph, paper stays white and red stays red."""
+    page = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    page[:8], page[8], page[9] = WHITE, BRIGHTER, DARKER
+    page[10] = (250, 250, 250)
+    with Pictures.open(io.BytesIO(gif_bytes([page, page], 10.0))) as film:
+        read = np.asarray(film.convert("RGB"))
+    assert (read[:8] == WHITE).all()
+    assert (read[8] == BRIGHTER).all()
+    assert (read[9] == DARKER).all()
 
 
 def test_a_long_name_keeps_its_end() -> None:

@@ -12,16 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from v2v_pictures.camera import Camera
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.offline.remake import open_shown, remake
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.decode import decode_luma
 
 KINDS = (".png", ".mp4", ".gif", ".html")
 _TOLD_SECONDS = 2.0
@@ -82,18 +87,22 @@ def preview(
         raise UsageError(f"--out {out}: there is no folder {out.parent}")
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
+    notes: dict[str, list[str]] = {}
     began = told = 0.0
     try:
         for look in looks:
-            cameras.append(_camera(catalogue, look, spec, with_flow, say))
+            cameras.append(_camera(catalogue, look, spec, with_flow, notes))
             now, left = time.monotonic(), len(looks) - len(cameras)
             if len(cameras) == 1:  # it may have waited for kernels to be compiled, and says nothing of the others
                 began = told = now
             elif left and now - told > _TOLD_SECONDS:
                 told, each = now, (now - began) / (len(cameras) - 1)
-                say(f"{len(cameras)} of {len(looks)} cameras, {1 / each:.1f} a second, {left * each:.0f} s left")
+                rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
+                say(f"{len(cameras)} of {len(looks)} cameras, {rate}, {left * each:.0f} s left")
     finally:
         catalogue.close()
+    for note, titles in notes.items():
+        say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
     write(out, _content(out.suffix, cameras, title, moments))
     say(f"{out}: {len(cameras)} cameras")
 
@@ -110,20 +119,36 @@ def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int) -> 
 
 
 def _camera(
-    catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, say: Callable[[str], None]
+    catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> Camera:
+    """One camera's clip; what is to be said of it goes to ``notes``, by the text, because many may share it."""
     stream = StreamSpec.from_dict({**spec, "recipe": look.recipe})
     fitted = _fitted(catalogue, stream)
     if fitted != stream.recipe:
-        say(
-            f"{look.title}: shown with {fitted.voxels_per_clip} voxel grids of {fitted.crop_width_px} x "
+        note = (
+            f"shown with {fitted.voxels_per_clip} voxel grids of {fitted.crop_width_px} x "
             f"{fitted.crop_height_px} instead of {stream.recipe.voxels_per_clip} of {stream.recipe.crop_width_px} x "
             f"{stream.recipe.crop_height_px}: no video here is long and large enough for more"
         )
+        notes.setdefault(note, []).append(look.title)
         stream = StreamSpec.from_dict({**spec, "recipe": fitted})
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
     sample = remake(catalogue, stream, seed=look.seed, epoch=0, index=0, arrays=arrays)
-    return Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin)
+    whole = _whole_picture(catalogue, sample.provenance)
+    return Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin, whole)
+
+
+def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8] | None:
+    """The video's rows at the clip's first frame, or None: a prepared folder has files that are no videos."""
+    if catalogue.prepared is not None:
+        return None
+    index = catalogue.frame_index(provenance.video)
+    top, bottom = catalogue.rows.bounds(index.height_px)
+    rows = (top, 0, bottom - top, index.width_px)
+    picture: npt.NDArray[np.uint8] = decode_luma(
+        catalogue.path(provenance.video), index, provenance.start_frame, 1, rows
+    ).frames[0]
+    return picture
 
 
 def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:

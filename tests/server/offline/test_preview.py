@@ -44,7 +44,7 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
     looks = [Shot("paper", "paper", 0)]
     preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
-    assert "paper: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
+    assert "all cameras: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
     assert said[1] == f"{tmp_path / 'p.png'}: 1 cameras"
 
 
