@@ -4,6 +4,7 @@
 
 A few dozen photographs give a network more scenes than a handful of films do. Motion is smooth and random, as that of a
 camera held by hand; a patch is an ellipse of another photograph with its own motion, so that edges cover each other.
+PNG files that are transparent in part are objects cut out: they are patches of their own shape, and no backgrounds.
 """
 
 import argparse
@@ -41,25 +42,57 @@ def reduced(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """A photograph (H, W, 3) uint8 at a random scale, the smallest of which fills the frame half as large again."""
     fill = 1.5 * max(WIDTH / photograph.shape[1], HEIGHT / photograph.shape[0])
     scale = min(fill * random.uniform(1, 2.5), 1.0)
-    return np.asarray(cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    smaller = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(smaller[:, :: random.choice((-1, 1))])
 
 
-def clip(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
+def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
+    """A patch (HEIGHT, WIDTH, 4) uint8: an ellipse of a photograph somewhere in the frame, transparent around it."""
+    picture = reduced(photographs[random.integers(len(photographs))], random)
+    if picture.shape[0] < HEIGHT or picture.shape[1] < WIDTH:
+        picture = cv2.resize(picture, (WIDTH, HEIGHT))
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    middle = random.integers((0, 0), (WIDTH, HEIGHT)).tolist()
+    cv2.ellipse(mask, middle, random.integers(15, 90, 2).tolist(), random.uniform(0, 180), 0, 360, 255, -1)
+    return np.dstack((picture[:HEIGHT, :WIDTH], mask))
+
+
+def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
+    """A patch (HEIGHT, WIDTH, 4) uint8: an object 60 to 200 pixels high somewhere in the frame."""
+    thing = objects[random.integers(len(objects))]
+    scale = random.uniform(60, 200) / thing.shape[0]
+    thing = cv2.resize(thing, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[:, :: random.choice((-1, 1))]
+    place = np.eye(2, 3)
+    place[:, 2] = random.uniform((0, 0), (WIDTH, HEIGHT)) - np.array(thing.shape[1::-1]) / 2
+    return np.asarray(cv2.warpAffine(thing, place, (WIDTH, HEIGHT)))
+
+
+def clip(photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
     """Frames (FRAMES, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
     frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    for layer in range(1 + random.integers(0, 4)):
-        picture = reduced(photographs[random.integers(len(photographs))], random)
-        room = np.maximum(np.array(picture.shape[1::-1]) - (WIDTH, HEIGHT), 1)
-        start = np.eye(3)
-        start[:2, 2] = -random.integers(0, room)
-        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-        middle = random.integers((0, 0), (WIDTH, HEIGHT)).tolist()
-        cv2.ellipse(mask, middle, random.integers(15, 90, 2).tolist(), random.uniform(0, 180), 0, 360, 255, -1)
-        for t, step in enumerate(motion(random, float(np.exp(random.uniform(np.log(0.2), np.log(3)))))):
-            moved = cv2.warpPerspective(picture, step @ start, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT_101)
-            inside = cv2.warpPerspective(mask, step, (WIDTH, HEIGHT))[..., None] / 255 if layer else 1.0
-            frames[t] = np.rint(inside * moved + (1 - inside) * frames[t])
-    return frames
+    background = reduced(photographs[random.integers(len(photographs))], random)
+    start = np.eye(3)
+    start[:2, 2] = -random.integers(0, np.maximum(np.array(background.shape[1::-1]) - (WIDTH, HEIGHT), 1))
+    for t, step in enumerate(motion(random, pace(random))):
+        frames[t] = cv2.warpPerspective(background, step @ start, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT_101)
+    for _ in range(random.integers(0, 4)):
+        patch = cut_out(objects, random) if objects and random.random() < 0.5 else ellipse(photographs, random)
+        for t, step in enumerate(motion(random, pace(random))):
+            moved = cv2.warpPerspective(patch, step, (WIDTH, HEIGHT))
+            inside = moved[..., 3:] / np.float32(255)
+            frames[t] = np.rint(inside * moved[..., :3] + (1 - inside) * frames[t])
+    return tone(random)[frames]
+
+
+def pace(random: np.random.Generator) -> float:
+    """Pixels a frame, from 0.2 to 3, slow as often as fast."""
+    return float(np.exp(random.uniform(np.log(0.2), np.log(3))))
+
+
+def tone(random: np.random.Generator) -> np.ndarray:
+    """A table (256,) uint8 of exposure: gamma 0.6 to 1.6, some contrast taken away."""
+    low, high = random.uniform(0, 40), random.uniform(180, 255)
+    return np.rint(low + (high - low) * (np.arange(256) / 255) ** random.uniform(0.6, 1.6)).astype(np.uint8)
 
 
 def write(path: Path, frames: np.ndarray) -> None:
@@ -80,13 +113,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    photographs = [picture for p in files if (picture := cv2.imread(str(p))) is not None]
+    pictures = [picture for p in files if (picture := cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) is not None]
+    pictures = [cv2.cvtColor(p, cv2.COLOR_GRAY2BGR) if p.ndim == 2 else p for p in pictures if p.dtype == np.uint8]
+    objects = [p for p in pictures if p.shape[2] == 4 and p[..., 3].min() < 255]
+    photographs = [p[..., :3] for p in pictures if p.shape[2] == 3 or p[..., 3].min() == 255]
     if not photographs:
         raise SystemExit(f"no photograph (JPEG or PNG) in {args.photographs}: {len(files)} files looked at")
     args.out.mkdir(parents=True, exist_ok=True)
     for index in range(args.clips):
         random = np.random.default_rng((args.seed, index))
-        write(args.out / f"pan_{index:04d}.mp4", clip(photographs, random))
+        write(args.out / f"pan_{index:04d}.mp4", clip(photographs, objects, random))
         print(f"\r{index + 1}/{args.clips}", end="", flush=True)
     print()
 

@@ -41,6 +41,25 @@ def test_a_folder_of_photographs_becomes_clips(tmp_path, monkeypatch):
     assert np.abs(frames[0].astype(int) - frames[11]).mean() > 1
 
 
+def test_an_object_cut_out_moves_over_a_photograph(monkeypatch):
+    monkeypatch.setattr(pan_photographs, "FRAMES", 3)
+    black = np.zeros((600, 800, 3), np.uint8)
+    white = np.dstack([np.full((100, 100), 255, np.uint8)] * 4)
+    clips = [pan_photographs.clip([black], [white], np.random.default_rng(seed)) for seed in range(12)]
+    shares = [np.mean(frames > frames.min()) for frames in clips]
+    assert min(shares) == 0  # black alone, or under ellipses of black
+    assert 0.001 < max(shares) < 0.6
+
+
+def test_a_picture_that_is_transparent_in_part_is_no_background(tmp_path, monkeypatch):
+    cut_out = np.zeros((50, 50, 4), np.uint8)
+    cut_out[10:40, 10:40] = 255
+    cv2.imwrite(str(tmp_path / "thing.png"), cut_out)
+    monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="no photograph"):
+        pan_photographs.main()
+
+
 def test_a_folder_without_photographs_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / "out")])
     with pytest.raises(SystemExit, match="no photograph"):

@@ -140,6 +140,7 @@ class RunConfig:
         keep_epochs: also keep checkpoints of the ends of the last so many epochs.
         judge_every: steps between two looks at a held-out batch of the stream; 0: none.
         judge_samples: samples of it, if an epoch has so many.
+        judge_videos: folder of the videos of the held-out batch; empty: those that are trained on.
         preview_every: steps between films of that batch; 0: none.
         preview_samples: how many of its samples they show.
         validate: recordings (as ``v2v-eval --data``) that are scored at the ends of epochs; the best network so far is
@@ -156,6 +157,7 @@ class RunConfig:
     keep_epochs: int = limited(0, 0, 1_000_000)
     judge_every: int = limited(500, 0, 10**9)
     judge_samples: int = limited(4, 1, 64)
+    judge_videos: str = ""
     preview_every: int = limited(500, 0, 10**9)
     preview_samples: int = limited(2, 1, 64)
     validate: str = ""

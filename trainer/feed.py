@@ -6,6 +6,7 @@ training loop only queues work, so it is here, with the next batch in its hands,
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import time
 from collections.abc import Iterable, Iterator
@@ -15,10 +16,12 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader
 
-from trainer.config import TrainConfig
+from trainer.config import StreamConfig, TrainConfig
 from trainer.tasks import Asked
 from v2v_client import Batch, V2VStreamDataset
+from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
 
 HELD_OUT_SEED = 1 << 32
@@ -52,11 +55,38 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
     return V2VStreamDataset(address, **(arguments | changes))
 
 
+def server_flags(settings: StreamConfig, recipe: Recipe) -> list[str]:
+    """What a server on ``settings.videos`` is told at its start.
+
+    It looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what the videos
+    show only if it is told so.
+    """
+    asked = {"--list": settings.list, "--scene": settings.spec.get("scene")}
+    flags = [part for flag, value in asked.items() if value for part in (flag, value)]
+    return ["--rows", settings.rows, *recipe_flags(recipe), *flags]
+
+
 def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:
     """Yields the batch that the run is judged by, on the CPU: the same one whenever the run is started again.
 
-    It has ``run.judge_samples`` samples, or as many as an epoch has.
+    It has ``run.judge_samples`` samples, or as many as an epoch has. They are of ``run.judge_videos``, from a server
+    that runs for as long as this takes, where there are such videos.
     """
+    if not config.run.judge_videos:
+        yield from _held_out(config, asked, address)
+        return
+    settings = dataclasses.replace(config.stream, address="", videos=config.run.judge_videos, list="")
+    config = dataclasses.replace(config, stream=settings)
+    try:
+        flags = server_flags(settings, asked.recipe(settings.resolved_recipe))
+        with LocalServer(settings.videos, workers=1, flags=flags) as server:
+            batches = list(_held_out(config, asked, server.address))
+    except UsageError as error:
+        raise UsageError(f"run.judge_videos = {config.run.judge_videos}: {error}") from error
+    yield from batches
+
+
+def _held_out(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:
 
     def held_out(samples: int) -> V2VStreamDataset:
         seed = (config.stream.seed + HELD_OUT_SEED) % (LARGEST_SEED + 1)

@@ -13,12 +13,13 @@ import torch
 
 from trainer.config import StreamConfig, TrainConfig, keys
 from trainer.config_file import load_config, shipped, show_config
+from trainer.feed import server_flags
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
 from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from v2v_client.local_server import LocalServer, recipe_flags
+from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
@@ -96,25 +97,13 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
     print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
     with ExitStack() as stack:
         try:
-            server = LocalServer(stream.videos, workers=stream.workers, flags=_server_flags(stream, recipe))
+            server = LocalServer(stream.videos, workers=stream.workers, flags=server_flags(stream, recipe))
             stack.enter_context(server)
         except V2VError as error:
             mine.from_first(("", str(error)))
             raise
         mine.from_first((server.address, ""))
         yield server.address
-
-
-def _server_flags(stream: StreamConfig, recipe: Recipe) -> list[str]:
-    # A server looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what
-    # the videos show only if it is told at its start.
-    asked = {"--list": stream.list, "--scene": stream.spec.get("scene")}
-    return [
-        "--rows",
-        stream.rows,
-        *recipe_flags(recipe),
-        *(part for flag, value in asked.items() if value for part in (flag, value)),
-    ]
 
 
 def _lacks_bfloat16() -> bool:

@@ -17,12 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.config import OptimizerConfig, RunConfig, StreamConfig
+from trainer.feed import server_flags
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import METRICS, Meter, Reporter, read_metrics
-from trainer.train import _server_flags, serving
+from trainer.train import serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
 
@@ -31,12 +32,12 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 
 def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
     recipe = Recipe.from_dict({"preset": "clean", "bins": 3})
-    plain = _server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
+    plain = server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
     assert plain[:2] == ["--rows", "top:0.5"]
     assert plain[plain.index("bins=3") - 1] == "--set"
     assert "--list" not in plain
     assert "--scene" not in plain
-    asked = _server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
+    asked = server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
 
 

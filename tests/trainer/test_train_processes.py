@@ -16,14 +16,20 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+import torch
 
 from tests.client.fake_server import FakeServer
 from tests.clips import panned_luma, write_clip
 from tests.trainer.training import arguments, losses, trained
+from trainer.config_file import load_config
+from trainer.feed import held_out_batch
+from trainer.learner import build
 from trainer.run.checkpoint import LAST, load_checkpoint
+from trainer.run.distributed import Ranks
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]
+ALONE = Ranks(0, 1, torch.device("cpu"))
 TRAIN = (sys.executable, "-m", "trainer.train")
 
 
@@ -115,6 +121,26 @@ def test_on_a_server_of_its_own_a_resumed_run_is_the_uninterrupted_one(clips: Pa
     assert losses(half) == losses(whole)
     assert load_checkpoint(half / LAST).stream == load_checkpoint(whole / LAST).stream
     assert set(psutil.Process().children(recursive=True)) <= before
+
+
+@pytest.mark.slow
+def test_a_run_is_judged_on_videos_that_it_does_not_train_on(
+    server: FakeServer, clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The held-out batch comes from a server of its own, which is gone when training begins."""
+    before = set(psutil.Process().children(recursive=True))
+    recipe = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": 16, "crop_width_px": 20}
+    given = arguments(tmp_path, server.address, "run", run__judge_videos=str(clips), stream__recipe=recipe)
+    config = load_config(given[0], given[given.index("--set") + 1 :: 2])
+    asked = build(config, ALONE).task.asked
+    batches = list(held_out_batch(config, asked, server.address))
+    assert len(batches) == 1
+    assert {Path(each.video).name for each in batches[0].provenance} <= {f"{number}.mp4" for number in range(4)}
+    assert len(batches[0].provenance) == config.run.judge_samples
+    assert set(psutil.Process().children(recursive=True)) <= before
+    missing = arguments(tmp_path, server.address, "other", run__judge_every=1, run__judge_videos="nowhere")
+    assert main(missing) == 2
+    assert "run.judge_videos = nowhere: " in capsys.readouterr().err
 
 
 @pytest.mark.slow
