@@ -113,7 +113,9 @@ class ComputeConfig:
             under autocast, while weights, sums of gradients, losses and pictures stay float32.
         pieces: a batch is computed in so many pieces whose gradients are added up: less memory, the same step.
         channels_last: memory format of the network.
-        compile: through ``torch.compile``.
+        compile: through ``torch.compile``: "step" one turn of each loop over time or over updates, which takes seconds;
+            "clip" the network over the whole clip, unrolled, which takes minutes.
+        cuda_graph: forward and backward of a step as one CUDA graph, see :mod:`trainer.captured`.
         threads: of PyTorch on the CPU; 0: its own choice. Leave cores to the server's workers.
         seed: of the first weights.
     """
@@ -122,7 +124,8 @@ class ComputeConfig:
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
     pieces: int = limited(1, 1, 65_536)
     channels_last: bool = False
-    compile: bool = False
+    compile: Literal["none", "step", "clip"] = "none"
+    cuda_graph: bool = False
     threads: int = limited(0, 0, 1024)
     seed: int = limited(0, 0, 2**63 - 1)
 

@@ -8,13 +8,14 @@ import hashlib
 import inspect
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from trainer.captured import CapturedGradients
 from trainer.config import OptimizerConfig, RunConfig, TrainConfig, setting_of
 from trainer.models import NETWORKS, VoxelNetwork
 from trainer.precision import bfloat16_products
@@ -39,6 +40,7 @@ class Learner:
         config: of the run.
         device: where all of this computes.
         rank: of this process; dropout differs between ranks.
+        captured: what computes :meth:`gradients` from a CUDA graph, or None.
     """
 
     network: VoxelNetwork
@@ -49,6 +51,7 @@ class Learner:
     config: TrainConfig
     device: torch.device
     rank: int
+    captured: CapturedGradients | None = None
 
     @property
     def trained(self) -> VoxelNetwork:
@@ -66,26 +69,33 @@ class Learner:
         Returns:
             The losses and the norm of the gradient, on the device.
         """
-        config = self.config.compute
-        pieces = work.pieces(config.pieces)
-        torch.manual_seed(_seed(config.seed, self.rank, step))
-        losses: dict[str, Tensor] = {}
-        self.optimizer.zero_grad()
-        for number, piece in enumerate(pieces, start=1):
-            with self._exchanging(number == len(pieces)):
-                with bfloat16_products(self.device, enabled=config.precision == "bfloat16", share=not config.compile):
-                    prediction, _ = self.model(piece.voxels, None, piece.guide)
-                    found = self.task.losses(prediction, piece)
-                (found["total"] / len(pieces)).backward()  # type: ignore[no-untyped-call]
-            for name, value in found.items():
-                losses[name] = losses.get(name, 0) + value.detach() / len(pieces)
-        norm = gradient_norm(self.network.parameters(), self.config.optimizer.clip_gradient_norm)
+        torch.manual_seed(_seed(self.config.compute.seed, self.rank, step))
+        found = self.gradients(work) if self.captured is None else self.captured(work)
         rate = learning_rate(self.config.optimizer, self.config.run, step, epoch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.step()
         if self.average is not None:
             self.average.update(self.network, step + 1)
+        return found
+
+    def gradients(self, work: Work) -> dict[str, Tensor]:
+        """Forward and backward: the losses and the norm of the gradient; gradients of this batch alone are left."""
+        config = self.config.compute
+        pieces = work.pieces(config.pieces)
+        losses: dict[str, Tensor] = {}
+        self.optimizer.zero_grad()
+        for number, piece in enumerate(pieces, start=1):
+            with self._exchanging(number == len(pieces)):
+                with bfloat16_products(
+                    self.device, enabled=config.precision == "bfloat16", share=config.compile == "none"
+                ):
+                    prediction, _ = self.model(piece.voxels, None, piece.guide)
+                    found = self.task.losses(prediction, piece)
+                (found["total"] / len(pieces)).backward()  # type: ignore[no-untyped-call]
+            for name, value in found.items():
+                losses[name] = losses.get(name, 0) + value.detach() / len(pieces)
+        norm = gradient_norm(self.network.parameters(), self.config.optimizer.clip_gradient_norm)
         return losses | {"gradient_norm": norm}
 
     def _exchanging(self, now: bool) -> contextlib.AbstractContextManager[None]:
@@ -125,6 +135,10 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
         raise UsageError(
             f"compute.pieces = {compute.pieces}: give a divisor of stream.batch_size = {config.stream.batch_size}"
         )
+    if compute.cuda_graph and ranks.device.type != "cuda":
+        raise UsageError("compute.cuda_graph = true: there is no GPU here; leave it out")
+    if compute.cuda_graph and ranks.world_size > 1:
+        raise UsageError("compute.cuda_graph = true: on one rank only, ranks exchange gradients outside of a graph")
     _set_numerics(compute.precision)
     torch.manual_seed(compute.seed)
     network = _network(config)
@@ -139,9 +153,17 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     if ranks.world_size > 1:
         devices = [ranks.device] if ranks.device.type == "cuda" else None
         model = DistributedDataParallel(network, device_ids=devices)
-    if compute.compile:
+    if compute.compile == "clip":
         model = torch.compile(model)  # type: ignore[assignment]
-    return Learner(network, model, task, optimizer, average, config, ranks.device, ranks.rank)
+    elif compute.compile == "step":
+        try:
+            network.compile_turns()
+        except UsageError as error:
+            raise UsageError(f"compute.compile = step: {error}; take clip, or none") from error
+    learner = Learner(network, model, task, optimizer, average, config, ranks.device, ranks.rank)
+    if compute.cuda_graph:
+        learner = replace(learner, captured=CapturedGradients(learner.gradients))
+    return learner
 
 
 def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int) -> float:

@@ -19,13 +19,14 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from trainer.captured import WARM_UP_STEPS
 from trainer.config import TrainConfig
 from trainer.learner import build
 from trainer.models import NETWORKS
@@ -46,12 +47,21 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-def measure(name: str, device: str, side: int, voxels: int, batch_size: int, steps: int) -> dict[str, Any]:
-    """One network, in this process; the first step, which allocates, is left out."""
+def measure(
+    name: str, compute: Mapping[str, Any], side: int, voxels: int, batch_size: int, steps: int
+) -> dict[str, Any]:
+    """One network, in this process; the first steps, which allocate, compile and record, are left out.
+
+    Args:
+        name: of the network.
+        compute: section of that name of its configuration.
+        side, voxels, batch_size: of the batch.
+        steps: timed.
+    """
+    device = compute["device"]
     torch.set_num_threads(1)
     loss = {"flow": "stream"} if NETWORKS[name].task == "flow" else {"lpips_weight": 0.0, "temporal_weight": 0.0}
     recipe = {"preset": "paper", "voxels_per_clip": voxels, "crop_height_px": side, "crop_width_px": side}
-    compute = {"device": device, "threads": 1}
     config = TrainConfig.from_dict(
         {"network": {"name": name}, "stream": {"recipe": recipe}, "loss": loss, "compute": compute}
     )
@@ -69,21 +79,25 @@ def measure(name: str, device: str, side: int, voxels: int, batch_size: int, ste
         cpu_seconds=0.0, decodes=batch_size,
     )  # fmt: skip
     seconds = []
-    for step in range(steps + 1):
+    untimed = WARM_UP_STEPS + 1 if compute["cuda_graph"] else 1
+    for step in range(untimed + steps):
         began = time.perf_counter()
         values = learner.step(learner.task.prepare(batch, 0), step, 0)
         float(values["total"])  # waits for a GPU
         seconds.append(time.perf_counter() - began)
-    median = statistics.median(seconds[1:])
+    del seconds[:untimed]
+    median = statistics.median(seconds)
     return {
         "network": name,
         "device": device,
+        "compile": compute["compile"],
+        "cuda_graph": compute["cuda_graph"],
         "parameters": sum(parameter.numel() for parameter in learner.trained.parameters()),
         "side_px": side,
         "voxels_per_clip": voxels,
         "batch_size": batch_size,
         "seconds": median,
-        "fastest_seconds": min(seconds[1:]),
+        "fastest_seconds": min(seconds),
         "voxel_grids_per_second": batch_size * voxels / median,
         "memory_mib": (_held(device) - before) / _MIB,
     }
@@ -105,6 +119,7 @@ def _apart(name: str, asked: argparse.Namespace) -> dict[str, Any]:
     """
     numbers = {"--side": asked.side, "--voxels": asked.voxels, "--batch-size": asked.batch_size, "--steps": asked.steps}
     command = [sys.executable, "-m", "v2v_bench.step", "--networks", name, "--device", asked.device, "--here"]
+    command += ["--compile", asked.compile, *(["--cuda-graph"] if asked.cuda_graph else [])]
     command += [str(part) for pair in numbers.items() for part in pair]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -119,7 +134,10 @@ def _work(asked: argparse.Namespace) -> int:
     if unknown := set(names) - set(NETWORKS):
         raise UsageError(f"--networks {', '.join(sorted(unknown))}: choose of {', '.join(NETWORKS)}")
     if asked.here:
-        print(json.dumps(measure(names[0], asked.device, asked.side, asked.voxels, asked.batch_size, asked.steps)))
+        compute = {
+            "device": asked.device, "threads": 1, "compile": asked.compile, "cuda_graph": asked.cuda_graph,
+        }  # fmt: skip
+        print(json.dumps(measure(names[0], compute, asked.side, asked.voxels, asked.batch_size, asked.steps)))
         return 0
     records = [_apart(name, asked) for name in names]
     show(records, _COLUMNS)
@@ -132,6 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = plain_parser(__doc__, "step")
     parser.add_argument("--networks", default=",".join(NETWORKS), metavar="A,B", help="default: all")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="default cpu, one thread")
+    parser.add_argument("--compile", default="none", choices=("none", "step", "clip"), help="compute.compile")
+    parser.add_argument("--cuda-graph", action="store_true", help="compute.cuda_graph")
     parser.add_argument("--side", type=int, default=64, help="pixels of a crop's side (default 64)")
     parser.add_argument("--voxels", type=int, default=10, help="voxel grids of a sample (default 10)")
     parser.add_argument("--batch-size", type=int, default=2, help="default 2")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from tests.trainer.training import configured
 from trainer.config_file import load_config
 from trainer.learner import Learner, build, obeying_weights
 from trainer.models import FireNet
+from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import Work
@@ -98,6 +100,22 @@ def test_pieces_of_a_batch_make_the_same_step(tmp_path: Path, longest: float) ->
     norm = torch.nn.utils.clip_grad_norm_(network.parameters(), longest or float("inf"))
     torch.testing.assert_close(whole["gradient_norm"], norm)
     torch.testing.assert_close(gradients, [parameter.grad for parameter in network.parameters()])
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # torch.compile looks at all of it
+def test_one_compiled_time_step_makes_the_same_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    voxels, frames = torch.randint(-3, 4, (4, 3, 2, 16, 20)), torch.rand(4, 3, 1, 16, 20)
+    results = []
+    for compiled in ("none", "step"):
+        built = build(load_config(configured(tmp_path), [f"compute.compile={compiled}"]), ALONE)
+        values = [built.step(Work(voxels=voxels, truth={"frames": frames}), step, 0) for step in range(2)]
+        results.append((values, built.network.state_dict(), built.trained.state_dict()))
+    assert any(isinstance(module, Loop) and module._compiled for module in built.network.modules())
+    torch.testing.assert_close(results[1], results[0])
+    settings = ["compute.compile=step", "network.name=evflownet", "loss.flow=stream"]
+    with pytest.raises(UsageError, match=r"compute\.compile = step: EVFlowNet has no loop .*; take clip, or none"):
+        build(load_config(configured(tmp_path), settings), ALONE)
 
 
 def test_a_batch_is_cut_into_equal_pieces(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ time step are contiguous, in either memory format. Attribute names are those of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -105,7 +106,28 @@ def _by_step(sequence: Tensor, steps: int) -> tuple[Tensor, ...]:
     return torch.unflatten(sequence, 0, (steps, -1)).unbind(0)
 
 
-class ConvLSTM(nn.Module):
+class Loop:
+    """What a module has that does the same again and again: over time, or over improvements of an estimate.
+
+    One turn of the loop can be compiled by itself, which takes seconds where the whole loop, unrolled, takes minutes.
+    A subclass gives ``_turn``.
+    """
+
+    training: bool
+    _turn: Callable[..., Any]
+    _compiled: Callable[..., Any] | None = None
+
+    @property
+    def turn(self) -> Callable[..., Any]:
+        """``_turn``, or in training what :meth:`compile_turn` made of it."""
+        return self._compiled if self._compiled is not None and self.training else self._turn
+
+    def compile_turn(self) -> None:
+        """From now on :attr:`turn` is compiled in training, when it is first called with tensors of new shapes."""
+        self._compiled = torch.compile(self._turn, dynamic=False, fullgraph=True)
+
+
+class ConvLSTM(Loop, nn.Module):
     """Convolutional LSTM, kernel 3, hidden channels = input channels; gate order in, forget, out, candidate.
 
     c_t = sigmoid(f) c_(t-1) + sigmoid(i) tanh(g),    h_t = sigmoid(o) tanh(c_t)     (Shi et al. 2015, no peepholes)
@@ -130,20 +152,26 @@ class ConvLSTM(nn.Module):
         from_input = _by_step(F.conv2d(x, to_input, self.Gates.bias, padding=1), steps)
         hiddens: list[Tensor] = []
         for gates in from_input:
-            if state is not None:
-                gates = gates + F.conv2d(state.hidden, to_hidden, padding=1)
-            switches, candidate = torch.split(gates, [3 * self.channels, self.channels], dim=1)
-            admit, keep, emit = switches.sigmoid().chunk(3, dim=1)
-            # In float32 even under autocast: the cell is a running sum, and a bfloat16 sum forgets small increments.
-            cell = (admit * candidate.tanh()).to(torch.promote_types(gates.dtype, torch.float32))
-            if state is not None:
-                cell = cell + keep * state.cell
-            state = LSTMState((emit * cell.tanh()).to(gates.dtype), cell)
+            state = LSTMState(*self.turn(gates, state, to_hidden))
             hiddens.append(state.hidden)
-        return torch.cat(hiddens), LSTMState(hiddens[-1], cell)
+        assert state is not None
+        return torch.cat(hiddens), state
+
+    @staticmethod
+    def _turn(gates: Tensor, state: LSTMState | None, to_hidden: Tensor) -> tuple[Tensor, Tensor]:
+        if state is not None:
+            gates = gates + F.conv2d(state.hidden, to_hidden, padding=1)
+        channels = gates.shape[1] // 4
+        switches, candidate = torch.split(gates, [3 * channels, channels], dim=1)
+        admit, keep, emit = switches.sigmoid().chunk(3, dim=1)
+        # In float32 even under autocast: the cell is a running sum, and a bfloat16 sum forgets small increments.
+        cell = (admit * candidate.tanh()).to(torch.promote_types(gates.dtype, torch.float32))
+        if state is not None:
+            cell = cell + keep * state.cell
+        return (emit * cell.tanh()).to(gates.dtype), cell
 
 
-class ConvGRU(nn.Module):
+class ConvGRU(Loop, nn.Module):
     """Convolutional GRU, kernel 3, hidden channels = input channels (Ballas et al. 2016).
 
     u, r = sigmoid(conv([x, h])),    n = tanh(conv([x, r h])),    h' = (1 - u) h + u n
@@ -168,17 +196,22 @@ class ConvGRU(nn.Module):
         from_input = _by_step(F.conv2d(x, torch.cat(to_input), bias, padding=1), steps)
         hiddens: list[Tensor] = []
         for now in from_input:
-            switches, candidate = torch.split(now, [2 * self.channels, self.channels], dim=1)
-            if state is not None:
-                switches = switches + F.conv2d(state.to(now.dtype), to_switches, padding=1)
-            update, reset = switches.sigmoid().chunk(2, dim=1)
-            if state is not None:
-                candidate = candidate + F.conv2d((state * reset).to(now.dtype), to_hidden[2], padding=1)
-            target = candidate.tanh().to(torch.promote_types(now.dtype, torch.float32))
-            hidden = update * target if state is None else state + update * (target - state)
-            hiddens.append(hidden.to(now.dtype))
-            state = hidden
-        return torch.cat(hiddens), hidden
+            state = self.turn(now, state, to_switches, to_hidden[2])
+            hiddens.append(state.to(now.dtype))
+        assert state is not None
+        return torch.cat(hiddens), state
+
+    @staticmethod
+    def _turn(now: Tensor, state: Tensor | None, to_switches: Tensor, to_candidate: Tensor) -> Tensor:
+        channels = now.shape[1] // 3
+        switches, candidate = torch.split(now, [2 * channels, channels], dim=1)
+        if state is not None:
+            switches = switches + F.conv2d(state.to(now.dtype), to_switches, padding=1)
+        update, reset = switches.sigmoid().chunk(2, dim=1)
+        if state is not None:
+            candidate = candidate + F.conv2d((state * reset).to(now.dtype), to_candidate, padding=1)
+        target = candidate.tanh().to(torch.promote_types(now.dtype, torch.float32))
+        return update * target if state is None else state + update * (target - state)
 
 
 class RecurrentLayer(nn.Module):

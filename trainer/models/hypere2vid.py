@@ -25,7 +25,7 @@ from scipy.special import jn_zeros, jv  # type: ignore[import-untyped]
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from trainer.models.blocks import LSTMState
+from trainer.models.blocks import Loop, LSTMState
 from trainer.models.e2vid import E2VID
 from trainer.models.sequence import Guide, Padding, Settings, predict
 
@@ -162,7 +162,7 @@ class HyperState(NamedTuple):
     picture: Tensor
 
 
-class HyperE2VID(E2VID):
+class HyperE2VID(Loop, E2VID):
     """HyperE2VID.
 
     Args:
@@ -199,12 +199,17 @@ class HyperE2VID(E2VID):
         for step, (voxel, z, *added) in enumerate(by_step):
             if guide is not None and shown is not None:
                 picture = torch.lerp(picture, shown[step], guide.share)
-            z = net.decoders[0](z + added[0], voxel, picture)
-            for decoder, skip in zip(list(net.decoders)[1:], added[1:-1], strict=True):
-                z = decoder(z + skip)
-            pictures.append(predict(net.pred, z + added[-1]))
+            pictures.append(self.turn(voxel, picture, z, *added))
             picture = pictures[-1].detach()
         return torch.cat(pictures), HyperState(after, picture)
+
+    def _turn(self, voxel: Tensor, picture: Tensor, z: Tensor, *added: Tensor) -> Tensor:
+        """The picture of one time step; ``added`` goes into the decoders and into the last layer."""
+        net = self.unetrecurrent
+        z = net.decoders[0](z + added[0], voxel, picture)
+        for decoder, skip in zip(list(net.decoders)[1:], added[1:-1], strict=True):
+            z = decoder(z + skip)
+        return predict(net.pred, z + added[-1])
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:

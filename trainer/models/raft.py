@@ -20,6 +20,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from trainer.models.blocks import Loop
+
 DOWNSCALE = 8
 LEVELS = 4
 SMALLEST_SIDE_PX = DOWNSCALE * 2**LEVELS
@@ -188,7 +190,7 @@ class _MaskPredictor(nn.Module):
         return weights
 
 
-class RAFT(nn.Module):
+class RAFT(Loop, nn.Module):
     """The network.
 
     Args:
@@ -244,11 +246,16 @@ class RAFT(nn.Module):
         grid = _grid(height, width, pyramid[0]).expand(count, 2, height, width)
         flow = torch.zeros_like(grid) if flow is None else flow
         for _ in range(updates):
-            flow = flow.detach()  # each correction is trained by itself
-            correlation = look_up(pyramid, grid + flow, self.size.radius)
-            hidden, correction = self.update_block(hidden, context, correlation, flow)
-            flow = flow + correction.to(flow.dtype)
+            flow, hidden = self.turn(pyramid, grid, context, hidden, flow.detach())  # each correction by itself
             yield flow, hidden
+
+    def _turn(
+        self, pyramid: list[Tensor], grid: Tensor, context: Tensor, hidden: Tensor, flow: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """One correction of the flow."""
+        correlation = look_up(pyramid, grid + flow, self.size.radius)
+        hidden, correction = self.update_block(hidden, context, correlation, flow)
+        return flow + correction.to(flow.dtype), hidden
 
     def upsampled(self, flow: Tensor, hidden: Tensor) -> Tensor:
         """Flow of :meth:`refine` at full size."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from trainer.models.blocks import Loop
 from v2v_protocol.errors import UsageError
 
 Padding = Literal["bottom-right", "centred", "top-left"]
@@ -162,6 +163,19 @@ class VoxelNetwork(nn.Module):
         outputs, state = self.unroll(x, state, steps, guide)
         outputs = outputs[..., top : top + height, left : left + width]
         return torch.unflatten(outputs, -4, (steps - lead, batch)).transpose(-5, -4), state
+
+    def compile_turns(self) -> None:
+        """Compile one turn of each loop, for training: see :class:`trainer.models.blocks.Loop`.
+
+        Raises:
+            UsageError: there is no loop.
+        """
+        loops = [module for module in self.modules() if isinstance(module, Loop)]
+        if not loops:
+            raise UsageError(f"{type(self).__name__} has no loop over time of which one step could be compiled")
+        torch._dynamo.config.recompile_limit = 64  # layers of a kind share their code, and each is a shape of its own
+        for loop in loops:
+            loop.compile_turn()
 
     def _edges(self, height: int, width: int) -> tuple[int, int, int, int]:
         """Pixels to add: left, right, top, bottom."""

@@ -1,0 +1,76 @@
+"""``compute.compile: step``: a network whose loops are compiled turn by turn is the network."""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from trainer.models import E2VID, ERAFT, ETNet, EVFlowNet, FireNet, HyperE2VID, VoxelNetwork
+from trainer.models.blocks import Loop
+from trainer.models.sequence import Guide
+from v2v_protocol.errors import UsageError
+
+pytestmark = [  # of what torch.compile itself does
+    pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor"),
+    pytest.mark.filterwarnings("ignore:`torch.jit.*:DeprecationWarning"),
+]
+SIDE_PX = 33
+NETWORKS = {
+    "firenet": partial(FireNet, base_channels=2),
+    "e2vid": partial(E2VID, base_channels=2),
+    "hypere2vid": partial(HyperE2VID, base_channels=2),
+    "etnet": partial(ETNet, base_channels=2),
+    "eraft": ERAFT,
+}
+
+
+def compared(network: VoxelNetwork) -> None:
+    """Outputs, gradients and statistics of two training steps; and what it says when it is not in training."""
+    eager = copy.deepcopy(network)
+    network.compile_turns()
+    torch.manual_seed(0)
+    for _ in range(2):
+        voxels = torch.randint(-3, 4, (2, 3, network.bins, SIDE_PX, SIDE_PX)).float()
+        guide = Guide(torch.rand(2, 3, 1, SIDE_PX, SIDE_PX), 0.3) if isinstance(network, HyperE2VID) else None
+        for each in (eager, network):
+            torch.manual_seed(1)  # dropout
+            each.zero_grad()
+            each(voxels, None, guide)[0].square().mean().backward()
+        close(network, eager)
+    found: list[Tensor] = []
+    for each in (eager, network):
+        each.eval()
+        with torch.no_grad():
+            found.append(each(voxels)[0])
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-5)
+    assert all(loop.turn == loop._turn for loop in network.modules() if isinstance(loop, Loop))
+
+
+def close(network: VoxelNetwork, eager: VoxelNetwork) -> None:
+    for (name, mine), theirs in zip(network.named_parameters(), eager.parameters(), strict=True):
+        torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-3, atol=1e-5, msg=name)
+    for (name, mine), theirs in zip(network.named_buffers(), eager.buffers(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6, msg=name)
+
+
+@pytest.mark.parametrize("name", [*list(NETWORKS)[:-1], pytest.param("eraft", marks=pytest.mark.slow)])
+def test_a_turn_is_traced_as_it_is(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that ``torch.compile`` does but the making of machine code."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    torch.manual_seed(3)
+    compared(NETWORKS[name](bins=2))
+
+
+@pytest.mark.slow
+def test_compiled_code_computes_the_same() -> None:
+    torch.manual_seed(3)
+    compared(FireNet(bins=2, base_channels=2))
+
+
+def test_a_network_without_loops_is_refused() -> None:
+    with pytest.raises(UsageError, match="EVFlowNet has no loop"):
+        EVFlowNet(base_channels=2).compile_turns()
