@@ -65,7 +65,7 @@ def train(
 
     def look() -> None:
         """Read the meter: from time to time, and always before anything is saved."""
-        values = meter.read(feed.wait_seconds)
+        values = meter.read(feed.wait_seconds, feed.transfer_seconds)
         if not values:
             return
         if not math.isfinite(values["total"] + values["gradient_norm"]):

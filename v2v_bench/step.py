@@ -5,7 +5,7 @@
 Each network in a process of its own: forward through all voxel grids, L1 loss, backward, Adam. Batches are random and
 made before, so that nothing of the stream is timed.
 
-    s a step       median of the steps, and the fastest
+    s a step       median of the steps, and the fastest; processor: of the processor, which other work disturbs less
     voxel grids/s  of all samples together
     MiB            the most that the process held beyond what it held before the network was built; of a GPU, the most
                    that PyTorch had given out
@@ -42,6 +42,7 @@ _COLUMNS: tuple[Column, ...] = (
     ("parameters", "parameters", "{:,}", 1),
     ("seconds", "s a step", "{:.3f}", 1.0),
     ("fastest_seconds", "fastest", "{:.3f}", 1.0),
+    ("processor_seconds", "processor", "{:.3f}", 1.0),
     ("voxel_grids_per_second", "voxel grids/s", "{:.1f}", 1.0),
     ("memory_mib", "MiB", "{:.0f}", 1.0),
 )
@@ -78,14 +79,15 @@ def measure(
         arrays=arrays, indices=tuple(range(batch_size)), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
         cpu_seconds=0.0, decodes=batch_size,
     )  # fmt: skip
-    seconds = []
+    seconds, processor = [], []
     untimed = WARM_UP_STEPS + 1 if compute["cuda_graph"] else 1
     for step in range(untimed + steps):
-        began = time.perf_counter()
+        began, spent = time.perf_counter(), time.process_time()
         values = learner.step(learner.task.prepare(batch, 0), step, 0)
         float(values["total"])  # waits for a GPU
         seconds.append(time.perf_counter() - began)
-    del seconds[:untimed]
+        processor.append(time.process_time() - spent)
+    del seconds[:untimed], processor[:untimed]
     median = statistics.median(seconds)
     return {
         "network": name,
@@ -98,6 +100,7 @@ def measure(
         "batch_size": batch_size,
         "seconds": median,
         "fastest_seconds": min(seconds),
+        "processor_seconds": statistics.median(processor),
         "voxel_grids_per_second": batch_size * voxels / median,
         "memory_mib": (_held(device) - before) / _MIB,
     }

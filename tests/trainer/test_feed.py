@@ -85,6 +85,22 @@ def until_ended(child: psutil.Process) -> None:
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 
+def test_bringing_a_batch_to_a_gpu_is_counted_as_transfer_and_not_as_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in takes a quarter of a second for it, by a clock that nothing else moves."""
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+
+    def moved(batch: object, _copies: object) -> object:
+        now[0] += 0.25
+        return batch
+
+    monkeypatch.setattr("trainer.feed._moved", moved)
+    feed = Feed(Installing("tcp://127.0.0.1:1"), CPU)
+    feed._copies = object()  # type: ignore[assignment]
+    assert len(list(feed.epochs(0, 2))) == 6
+    assert (feed.wait_seconds, feed.transfer_seconds) == (0.0, 1.5)
+
+
 @pytest.mark.slow
 def test_a_signal_to_the_whole_group_lets_the_step_finish() -> None:
     """The loader worker dies of it in the middle of the step; the run ends after the step."""

@@ -231,14 +231,16 @@ def test_the_meter_gives_means_and_starts_anew(monkeypatch: pytest.MonkeyPatch) 
     for value in (1.0, 2.0, 6.0):
         meter.add({"total": torch.tensor(value), "l1": torch.tensor(-value)})
     now[0] = 16.0
-    reading = meter.read(1.5)
+    reading = meter.read(1.5, 0.75)
     assert reading == {
-        "total": 3.0, "l1": -3.0, "steps_per_second": 0.5, "data_wait_seconds": 0.5, "compute_seconds": 1.5,
+        "total": 3.0, "l1": -3.0, "steps_per_second": 0.5, "data_wait_seconds": 0.5, "transfer_seconds": 0.25,
+        "compute_seconds": 1.25,
     }  # fmt: skip
     meter.add({"total": torch.tensor(4.0)})
     now[0] = 17.0
-    assert meter.read(2.5) == {
-        "total": 4.0, "steps_per_second": 1.0, "data_wait_seconds": 1.0, "compute_seconds": 0.0,
+    assert meter.read(2.0, 1.0) == {
+        "total": 4.0, "steps_per_second": 1.0, "data_wait_seconds": 0.5, "transfer_seconds": 0.25,
+        "compute_seconds": 0.25,
     }  # fmt: skip
 
 

@@ -29,7 +29,7 @@ SMALL: dict[str, Any] = {
 }
 """With 23 sequences: 5 batches an epoch, 3 samples dropped."""
 
-OF_THE_CLOCK = ("steps_per_second", "data_wait_seconds", "compute_seconds")
+OF_THE_CLOCK = ("steps_per_second", "data_wait_seconds", "transfer_seconds", "compute_seconds")
 
 
 def configured(folder: Path) -> str:

@@ -38,7 +38,7 @@ class Meter:
         self._sum: Tensor | None = None
         self._steps = 0
         self._began = time.perf_counter()
-        self._waited = 0.0
+        self._waited = self._transferred = 0.0
 
     def add(self, values: Mapping[str, Tensor]) -> None:
         """The scalars of one step; the same names each time."""
@@ -47,26 +47,31 @@ class Meter:
         self._sum = stacked if self._sum is None else self._sum + stacked
         self._steps += 1
 
-    def read(self, wait_seconds: float) -> dict[str, float]:
+    def read(self, wait_seconds: float, transfer_seconds: float = 0.0) -> dict[str, float]:
         """Means over steps and ranks, and the speed; then starts anew.
 
         Args:
-            wait_seconds: time spent waiting for data since the run began.
+            wait_seconds, transfer_seconds: time spent waiting for data, and bringing it to the device, since the run
+                began.
 
         Returns:
-            the scalars by name; ``steps_per_second``; ``data_wait_seconds`` and ``compute_seconds`` per step.
+            the scalars by name; ``steps_per_second``; ``data_wait_seconds``, ``transfer_seconds`` and the rest,
+            ``compute_seconds``, per step.
         """
         if self._sum is None:
             return {}
         means = self._ranks.mean(self._sum / self._steps).tolist()
         now = time.perf_counter()
         seconds, waited = now - self._began, wait_seconds - self._waited
+        transferred = transfer_seconds - self._transferred
         record = dict(zip(self._names, means, strict=True)) | {
             "steps_per_second": self._steps / seconds,
             "data_wait_seconds": waited / self._steps,
-            "compute_seconds": (seconds - waited) / self._steps,
+            "transfer_seconds": transferred / self._steps,
+            "compute_seconds": (seconds - waited - transferred) / self._steps,
         }
-        self._sum, self._steps, self._began, self._waited = None, 0, now, wait_seconds
+        self._sum, self._steps, self._began = None, 0, now
+        self._waited, self._transferred = wait_seconds, transfer_seconds
         return record
 
 
@@ -200,7 +205,7 @@ class Reporter:
         self._board.flush()
 
     def _note(self, values: Mapping[str, float]) -> str:
-        wait, compute = values["data_wait_seconds"], values["compute_seconds"]
+        wait = values["data_wait_seconds"]
         spent = time.perf_counter() - self._began
         left = self._seconds - spent if self._seconds else math.inf
         if self._total:
@@ -209,12 +214,12 @@ class Reporter:
         held_out = "" if self._held_out is None else f"held out {self._held_out:.4f}  "
         return (
             f"{held_out}loss {values['total']:.4f}  {values['steps_per_second']:.2f} it/s  "
-            f"data wait {wait / (wait + compute):.0%}  ETA {_clock(max(0.0, left))}"
+            f"data wait {wait * values['steps_per_second']:.0%}  ETA {_clock(max(0.0, left))}"
         )
 
 
 _GROUPS = {
-    **dict.fromkeys(("steps_per_second", "data_wait_seconds", "compute_seconds"), "speed"),
+    **dict.fromkeys(("steps_per_second", "data_wait_seconds", "transfer_seconds", "compute_seconds"), "speed"),
     **dict.fromkeys(("epoch", "learning_rate", "gradient_norm"), "optimizer"),
 }
 
