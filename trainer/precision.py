@@ -1,4 +1,6 @@
-"""Products in bfloat16 whose weights are cast once, and whose gradients are not added up in bfloat16.
+"""How exactly products are computed: IEEE's float32 for all that is scored, and bfloat16 that adds up in float32.
+
+bfloat16: weights are cast once, and their gradients are not added up in bfloat16.
 
 Autocast by itself has the choice of two evils for a weight that one forward pass uses many times, as a loop over time
 or over E-RAFT's updates does. It keeps the cast copy, and then the gradients of all uses are added up in the eight bits
@@ -34,6 +36,17 @@ def bfloat16_products(device: torch.device, *, enabled: bool, share: bool = True
         if enabled and share:
             stack.enter_context(_SharedWeights(device.type))
         yield
+
+
+@contextlib.contextmanager
+def ieee_products() -> Iterator[None]:
+    """Products of float32 are IEEE's on a GPU, whatever a training outside allows itself ("tf32"): for scores."""
+    before = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = before
 
 
 class _SharedWeights(TorchFunctionMode):

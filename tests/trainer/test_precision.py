@@ -1,8 +1,10 @@
-"""bfloat16: weights are cast once, gradients of many uses are added up in float32."""
+"""bfloat16: weights are cast once, gradients of many uses are added up in float32. Scores are of IEEE's float32."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +13,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.trainer.evaluation.h5_file import random_recording
+from tests.trainer.evaluation.test_flow import constant
+from tests.trainer.evaluation.test_flow import recording as flow_recording
+from tests.trainer.training import configured
+from trainer.config_file import load_config
+from trainer.learner import build
 from trainer.models import NETWORKS
+from trainer.models.firenet import FireNet
 from trainer.precision import bfloat16_products
+from trainer.run.distributed import Ranks
 
+ALONE = Ranks(0, 1, torch.device("cpu"))
 CPU = torch.device("cpu")
 USES = 600  # adding 1 to 256 gives 256 in bfloat16
 
@@ -86,3 +97,32 @@ def test_a_longer_pass_of_a_network_casts_no_weight_more_often(name: str, option
 
     assert casts_of_weights(5) == casts_of_weights(3) > 4
     assert all(weight.grad.dtype == torch.float32 for weight in network.parameters() if weight.grad is not None)
+
+
+def allowed() -> tuple[bool, bool]:
+    return torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+
+
+@pytest.fixture
+def _as_before() -> Iterator[None]:
+    before = allowed()
+    yield
+    torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = before
+
+
+@pytest.mark.usefixtures("_as_before")
+@pytest.mark.parametrize("task", ["reconstruction", "flow"])
+def test_scores_within_a_training_of_shorter_products_are_of_full_ones(tmp_path: Path, task: str) -> None:
+    """``compute.precision: tf32`` is for the training alone."""
+    flow = task == "flow"
+    settings = ["compute.precision=tf32", *(["network.name=evflownet", "loss.flow=stream"] if flow else [])]
+    learner = build(load_config(configured(tmp_path), settings), ALONE)
+    assert allowed() == (True, True)
+    network = constant(0, 0) if flow else FireNet(base_channels=2)
+    path = tmp_path / "recordings" / "a.h5"
+    _ = flow_recording(path) if flow else random_recording(path)
+    seen = set()
+    network.register_forward_hook(lambda *_: seen.add(allowed()))
+    learner.task.validator(network, path.parent)()
+    assert seen == {(False, False)}
+    assert allowed() == (True, True)

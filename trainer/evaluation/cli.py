@@ -228,8 +228,6 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _device(wanted: str | None) -> str:
-    # Figures are compared to the last digit: no shorter products on a GPU.
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     device = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         torch.zeros(1, device=device).cpu()

@@ -19,6 +19,7 @@ from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models import VoxelNetwork
+from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
 
 Advance = Callable[[str, int, int], None]
@@ -132,7 +133,7 @@ def evaluate_sequence(
     run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> SequenceScore:
     """Score, and draw, one recording."""
-    with Recording(path, as_published=run.as_published, size=run.size) as recording:
+    with Recording(path, as_published=run.as_published, size=run.size) as recording, ieee_products():
         windows = _windows(run, recording, data_set)
         scorer = SequenceScorer(run.metrics)
         rows = []

@@ -32,6 +32,7 @@ from trainer.evaluation import paper
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
+from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
 
 FlowImage = npt.NDArray[np.float32]
@@ -108,7 +109,7 @@ def evaluate_flow(
         UsageError: see :class:`Recording`; no flow in it; or the output is not finite.
     """
     scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
-    with Recording(path, as_published=run.as_published) as recording:
+    with Recording(path, as_published=run.as_published) as recording, ieee_products():
         windows = recording.flow_windows(cut, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from trainer.models.sequence import Guide, VoxelNetwork
 from trainer.pictures import Image
+from trainer.precision import ieee_products
 from v2v_client import Batch
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
@@ -146,6 +147,7 @@ class Task(abc.ABC):
         raise UsageError(f"run.validate = {recordings}: {type(self).__name__} has no such scores")
 
     @torch.no_grad()
+    @ieee_products()
     def judge(self, network: VoxelNetwork, batch: Batch, films: int) -> tuple[dict[str, float], list[Image]]:
         """Losses of a network on a batch that it is not trained on, and films of the first samples."""
         training = network.training
