@@ -2,12 +2,12 @@
 
 catalogue        the snapshot that everything else works from
 videos           its videos, in columns
-columns          very many records side by side
 files            which files a corpus has
 listfile         list files like the paper's
 survey           probing many files in processes of their own
-index_file       what probing found, on disk
+index            what probing found, on disk and in memory
 refresh          bringing that up to date
+changed          which files are new or changed since
 scene            what a video shows, in a few numbers
 look             the look that finds these numbers
 scenes           the numbers of a whole corpus

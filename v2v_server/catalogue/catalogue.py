@@ -13,7 +13,6 @@ import numpy as np
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_server.catalogue.columns import Records
 from v2v_server.catalogue.files import (
     UNPRINTABLE,
     VIDEO_SUFFIXES,
@@ -25,7 +24,8 @@ from v2v_server.catalogue.files import (
     regular_files,
     video_files,
 )
-from v2v_server.catalogue.index_file import IndexRow, Store
+from v2v_server.catalogue.index.columns import Records
+from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.catalogue.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date

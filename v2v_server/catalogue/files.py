@@ -8,8 +8,12 @@ from __future__ import annotations
 import os
 import re
 import stat
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,8 +27,11 @@ Notice = Callable[[str], None]
 """Told again and again what is being looked at, and how far that is."""
 
 _AT_ONCE = 16
-_TOGETHER = 64
+_TOGETHER, _MOST_TOGETHER = 64, 1024
 """Files that a thread asks about in one go: to hand them over one by one takes longer than a local disk's answer."""
+_SOON_SECONDS = 0.05
+_IN_TURN = 256
+"""Parts that are asked many at a time before one alone is tried again."""
 
 VIDEO_SUFFIXES = frozenset({
     ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
@@ -45,7 +52,7 @@ def video_files(root: Path, refused: dict[str, str]) -> Iterator[str]:
         root: the folder.
         refused: receives, by relative path, why a folder or file cannot be taken in.
     """
-    yield from _below(root, "", frozenset(), refused)
+    return chain.from_iterable(_below(root, "", frozenset(), refused))
 
 
 def bucket_files(names: Iterable[str], refused: dict[str, str]) -> Iterator[str]:
@@ -62,35 +69,43 @@ def bucket_files(names: Iterable[str], refused: dict[str, str]) -> Iterator[str]
             yield name
 
 
-def _below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused: dict[str, str]) -> Iterator[str]:
+def _below(
+    folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused: dict[str, str]
+) -> Iterator[list[str]]:
     try:
         here = folder.stat()
         with os.scandir(folder) as listing:
-            entries = sorted(listing, key=lambda entry: entry.name)
+            entries = sorted(listing, key=attrgetter("name"))
     except OSError as error:
         refused[printable(prefix.rstrip("/") or ".")] = f"the folder cannot be read: {error.strerror or error}"
         return
     identity = (here.st_dev, here.st_ino)
     if identity in above:
         return
+    found: list[str] = []
     for entry in entries:
-        if entry.name.startswith("."):
+        name = entry.name
+        if name[0] == ".":
             continue
-        relative = prefix + entry.name
+        relative = prefix + name
         try:
-            is_folder, is_file = entry.is_dir(), entry.is_file()
+            is_file = entry.is_file()
+            is_folder = not is_file and entry.is_dir()
         except OSError as error:  # a link that leads in a circle, or where this user may not look
             refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
             continue
         if is_folder:
-            yield from _below(folder / entry.name, f"{relative}/", above | {identity}, refused)
-        elif f".{entry.name.rpartition('.')[2].lower()}" in VIDEO_SUFFIXES and "." in entry.name:
+            yield found
+            found = []
+            yield from _below(folder / name, f"{relative}/", above | {identity}, refused)
+        elif f".{name.rpartition('.')[2].lower()}" in VIDEO_SUFFIXES and "." in name:
             if printable(relative) != relative:
                 refused[printable(relative)] = UNPRINTABLE
             elif not is_file:
                 refused[relative] = "is no regular file, or a link that leads nowhere"
             else:
-                yield relative
+                found.append(relative)
+    yield found
 
 
 def printable(name: str) -> str:
@@ -166,19 +181,48 @@ def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q
         question: asked in threads; must not raise.
         files: what to ask it of.
     """
-    parts = [files[start : start + _TOGETHER] for start in range(0, len(files), _TOGETHER)]
+    with closing(by_parts(lambda part: [question(file) for file in part], files)) as answered:
+        for part, found in answered:
+            yield from zip(part, found, strict=True)
 
-    def ask(part: Sequence[Q]) -> list[A]:
-        return [question(file) for file in part]
 
-    with ThreadPoolExecutor(min(_AT_ONCE, len(parts) or 1)) as threads:
+def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Generator[tuple[Sequence[Q], A], None, None]:
+    """(some of the files, answer) until all were asked about, in their order.
+
+    One part after the other while they are answered at once, for threads that take turns cost more than a local disk's
+    answer. When one is waited for, many are asked at a time; whether that is still needed is tried again and again.
+
+    Args:
+        question: asked of a part of the files in threads; must not raise.
+        files: what to ask it of.
+    """
+    asked: deque[tuple[Sequence[Q], Future[A] | None]] = deque()
+    at, together, at_once, in_turn = 0, _TOGETHER, 1, 0
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
         try:
-            try:
-                answered = threads.map(ask, parts)
-            except RuntimeError:  # the system has no room for another thread: then one after the other
-                threads.shutdown(cancel_futures=True)
-                answered = map(ask, parts)
-            for part, found in zip(parts, answered, strict=True):
-                yield from zip(part, found, strict=True)
+            while asked or at < len(files):
+                while at < len(files) and len(asked) < at_once:
+                    part = files[at : at + together]
+                    at += len(part)
+                    try:
+                        asked.append((part, threads.submit(question, part)))
+                    except RuntimeError:  # the system has no room for another thread: then one after the other
+                        threads.shutdown(cancel_futures=True)
+                        asked.append((part, None))
+                part, answer = asked[0]
+                if answer is None or answer.cancelled():
+                    found = question(part)
+                else:
+                    try:
+                        found = answer.result(_SOON_SECONDS if at_once == 1 else None)
+                    except TimeoutError:
+                        together, at_once, in_turn = _TOGETHER, 2 * _AT_ONCE, _IN_TURN
+                        continue
+                asked.popleft()
+                yield part, found
+                if at_once == 1:
+                    together = min(2 * together, _MOST_TOGETHER)
+                elif (in_turn := in_turn - 1) <= 0:
+                    at_once = 1
         finally:
             threads.shutdown(cancel_futures=True)

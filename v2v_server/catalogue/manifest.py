@@ -21,7 +21,7 @@ from typing import Any
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.catalogue.files import answers
-from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.catalogue.scene import Scene
 from v2v_server.cloud.copies import Copies
 from v2v_server.store.clips import STORE_FORMAT

@@ -7,20 +7,21 @@ import hashlib
 import os
 import sqlite3
 import stat
-from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
-from itertools import chain, islice, pairwise
-from operator import itemgetter
+from contextlib import closing, suppress
+from itertools import islice, pairwise
 from pathlib import Path
 
-from v2v_server.catalogue.columns import CHUNK, Records, joined
-from v2v_server.catalogue.files import Notice, answers, is_said
-from v2v_server.catalogue.index_file import IndexRow, Store
+from v2v_server.catalogue.changed import changed
+from v2v_server.catalogue.files import Notice, by_parts
+from v2v_server.catalogue.index.columns import CHUNK, Records, merged
+from v2v_server.catalogue.index.copy import NoCopy, Part, copied, read_copy
+from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
 from v2v_server.cloud.copies import Copies
-from v2v_server.system.process import cache_folder
+from v2v_server.system.process import cache_folder, without_collections
 
 _WRITE_EVERY = 256
 
@@ -80,8 +81,10 @@ def _refreshed(
 ) -> tuple[Store, Records]:
     store = Store(path)
     try:
-        records, states, unasked = _known(store, ids)
-        stale = _stale(root, records.ids, states, notice)
+        with without_collections():
+            records, unasked, mark = _known(store, ids)
+        stale = [records.ids[at] for at in changed(root, records.ids, records.states, processes, notice)]
+        del records.states[:]
         store.forget(_gone(root, unasked, notice))
         with closing(survey(root, stale, processes)) as found:
             for batch in _batches(found, len(stale), progress):
@@ -93,50 +96,44 @@ def _refreshed(
         records.fingerprints.settle()
         if looking is not None:
             looking.take_in(store, root, {record.id: record for record in records}, processes, progress)
+        _copy(store, mark)
         return store, records
     except BaseException:
         store.close()
         raise
 
 
-def _known(store: Store, ids: Sequence[str]) -> tuple[Records, array[int], list[str]]:
-    """What the index has of these ids; (size, mtime, ctime) of each, one after the other; other ids that it has."""
+def _known(store: Store, ids: Sequence[str]) -> tuple[Records, list[str], str]:
+    """What the index has of these ids; other ids that it has; the mark of its state."""
     ids = sorted(ids)
     if any(one == next for one, next in pairwise(ids)):  # a list may name a video twice
         ids = sorted(set(ids))
-    records, states, unasked = Records(), array("q"), list[str]()
-    with closing(store.rows()) as rows:
-        found = joined(ids, rows, unasked)
-        while chunk := list(islice(found, CHUNK)):
-            records.extend(chunk)
-            states.extend(chain.from_iterable(map(itemgetter(1, 2, 3), chunk)))
-    return records, states, unasked
+    with store.reading() as mark:
+        unasked = list[str]()
+        with suppress(NoCopy), closing(read_copy(store.path, mark)) as parts:
+            return merged(ids, parts, unasked), unasked, mark
+        unasked = []
+        return merged(ids, _parts(store, mark), unasked), unasked, mark
 
 
-def _stale(root: Path | Copies, ids: Sequence[str], states: array[int], notice: Notice | None) -> list[str]:
-    """Those of the ids whose files are new or changed."""
-    folder, listed = os.path.join(root, ""), root.listed if isinstance(root, Copies) else None
+def _parts(store: Store, mark: str) -> Iterator[Part]:
+    """All that the index has, of which a copy is left behind."""
 
-    def is_unchanged(place: int) -> bool:
-        size, mtime, ctime = states[3 * place : 3 * place + 3]
-        if size < 0:
-            return False
-        if listed is not None:
-            state = listed.get(ids[place])
-            return state is not None and (state.size_bytes, state.mark, 0) == (size, mtime, ctime)
-        try:
-            status = os.stat(folder + ids[place])
-        except OSError:
-            return False
-        return (status.st_size, status.st_mtime_ns, status.st_ctime_ns) == (size, mtime, ctime)
+    def parts() -> Iterator[Part]:
+        with closing(store.rows()) as rows:
+            while chunk := list(islice(rows, CHUNK)):
+                part = Records()
+                part.extend(chunk)
+                yield part.packed()
 
-    stale = []
-    for place, unchanged in answers(is_unchanged, range(len(ids))):
-        if not unchanged:
-            stale.append(ids[place])
-        if notice is not None and is_said(place + 1):
-            notice(f"looking at files: {place + 1} of {len(ids)}, {len(stale)} of them new or changed")
-    return stale
+    return copied(store.path, mark, parts())
+
+
+def _copy(store: Store, mark: str) -> None:
+    """Leaves a copy behind of what the index has now, if that is not what it had."""
+    with suppress(sqlite3.Error, OSError), store.reading() as now:
+        if now != mark:
+            deque(_parts(store, now), maxlen=0)
 
 
 def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> list[str]:
@@ -150,10 +147,10 @@ def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> lis
         except OSError as error:
             return error.errno in (errno.ENOENT, errno.ENOTDIR)
 
-    unlisted, gone = sorted(ids), []
-    for done, (id, is_none) in enumerate(answers(is_gone, unlisted), 1):
-        if is_none:
-            gone.append(id)
+    unlisted, gone, done = sorted(ids), list[str](), 0
+    for part, those in by_parts(lambda part: list(filter(is_gone, part)), unlisted):
+        done += len(part)
+        gone += those
         if notice is not None:
             notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
     return gone

@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
-from v2v_server.catalogue.index_file import IndexRow, Store
+from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.catalogue.columns import CHUNK, Records
+from v2v_server.catalogue.index.columns import CHUNK, Records
 from v2v_server.video.rows import Rows
 
 Runs = tuple[tuple[int, int], ...]

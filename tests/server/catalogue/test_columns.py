@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from v2v_server.catalogue import columns
-from v2v_server.catalogue.columns import Records, Texts, joined
-from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.catalogue.index import columns
+from v2v_server.catalogue.index.columns import Records, Texts, joined, merged
+from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 
@@ -60,6 +62,31 @@ def test_a_changed_record_is_the_new_one_before_and_after_it_is_packed(records: 
     assert list(records) == expected
     records.fingerprints.settle()
     assert list(records) == expected
+
+
+def test_packed_records_are_taken_in_whole_whatever_numbers_their_formats_had(records: Records) -> None:
+    other = Records()
+    other.append(replace(ROWS[0], codec="av1"))
+    other.take_in(records.packed())
+    assert list(other) == [replace(ROWS[0], codec="av1"), *ROWS]
+    assert list(records.rows()) == [plain(record) for record in ROWS]
+
+
+@given(asked=st.sets(st.sampled_from(NAMES)), known=st.sets(st.sampled_from(NAMES)), size=st.integers(1, 70))
+def test_records_of_parts_are_those_of_one_row_after_the_other(asked: set[str], known: set[str], size: int) -> None:
+    """Whole parts are taken over where all of them is asked for: that may not show."""
+    ids, index = sorted(asked), [plain(replace(record, size_bytes=7)) for record in ROWS if record.id in known]
+    parts = []
+    for start in range(0, len(index), size):
+        part = Records()
+        part.extend(index[start : start + size])
+        parts.append(part.packed())
+    unasked: list[str] = []
+    found = merged(ids, parts, unasked)
+    assert unasked == sorted(known - asked)
+    rows = {row[0]: row for row in index}
+    missing = (-1, 0, 0, "", 0, 0, 0, None, "", 0, None)
+    assert list(found.rows()) == [rows.get(id, (id, *missing)) for id in ids]
 
 
 def test_texts_of_nothing() -> None:

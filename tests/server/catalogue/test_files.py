@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.files import answers, corpus_root, printable, video_files
+from v2v_server.catalogue.files import answers, by_parts, corpus_root, printable, video_files
 from v2v_server.catalogue.listfile import read_list
 
 STEERING = {
@@ -77,6 +78,40 @@ def test_what_comes_late_holds_up_no_other_question_and_keeps_its_place() -> Non
         return others.wait(10) if file == 0 else True
 
     assert [file for file, in_time in answers(question, range(1000)) if in_time] == list(range(1000))
+
+
+def test_storage_that_answers_at_once_is_asked_by_one_thread_and_another_by_many() -> None:
+    now, most, seconds = [0], [0], [0.0]
+
+    def question(part: Sequence[int]) -> int:
+        now[0] += 1
+        most[0] = max(most[0], now[0])
+        time.sleep(seconds[0])
+        now[0] -= 1
+        return sum(part)
+
+    for seconds[0], expected in (0.0, 1), (0.06, 16):
+        most[0] = 0
+        found = list(by_parts(question, range(64 * 40)))
+        assert [each for part, _ in found for each in part] == list(range(64 * 40))
+        assert all(answer == sum(part) for part, answer in found)
+        assert most[0] == expected
+
+
+def test_storage_that_was_slow_for_a_while_is_asked_by_one_thread_again() -> None:
+    at_once: dict[int, int] = {}
+    now: set[int] = set()
+
+    def question(part: Sequence[int]) -> None:
+        now.add(part[0])
+        at_once[part[0]] = len(now)
+        if part[0] < 640:
+            time.sleep(0.06)
+        now.discard(part[0])
+
+    list(by_parts(question, range(64 * 1000)))
+    assert max(at_once.values()) > 8
+    assert all(count == 1 for first, count in at_once.items() if first > 64 * 400)
 
 
 @pytest.mark.parametrize("room", [0, 3])

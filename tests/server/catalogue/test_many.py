@@ -10,7 +10,7 @@ import pytest
 
 from v2v_server.catalogue import refresh
 from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index_file import IndexRow, Store
+from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.refresh import index_path
 
 VIDEOS = 2000

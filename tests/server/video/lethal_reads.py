@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.catalogue.survey import examine
 
 

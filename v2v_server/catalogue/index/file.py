@@ -8,9 +8,10 @@ alone, it does not matter which of them wrote it.
 
 from __future__ import annotations
 
+import os
 import sqlite3
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import closing
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,11 @@ from typing import Any
 SCHEMA_VERSION = 3
 """Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
 
+MARKED_FROM = 10_000
+"""Records from which on it is worth knowing that nothing has changed."""
 _BUSY_SECONDS = 30.0
+_HEADER_BYTES = 100  # of a SQLite file, see its format
+_WAL = 2
 _TABLE = """
 CREATE TABLE video (
     id TEXT PRIMARY KEY,
@@ -86,6 +91,9 @@ class Store:
     Args:
         path: the SQLite file, made if missing; None keeps the index in memory.
 
+    Attributes:
+        path: that.
+
     Raises:
         sqlite3.Error, OSError: the file cannot be made, opened or read.
     """
@@ -93,6 +101,7 @@ class Store:
     def __init__(self, path: Path | None) -> None:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
@@ -123,6 +132,32 @@ class Store:
         """
         with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video ORDER BY id")) as rows:
             yield from rows
+
+    @contextmanager
+    def reading(self) -> Iterator[str]:
+        """Nobody writes meanwhile. Gives the mark of the state that the index is in: two that are equal are of equal
+        contents. Empty where it has none: in memory, with a write-ahead log, and where it is small.
+
+        Raises:
+            sqlite3.Error, OSError: the file is damaged or cannot be read, or is held by another process for too long.
+        """
+        self._database.execute("BEGIN")
+        try:
+            query = f"SELECT 1 FROM video LIMIT 1 OFFSET {MARKED_FROM - 1}"
+            is_large = self._database.execute(query).fetchone() is not None  # only this takes the lock
+            yield self._mark() if is_large else ""
+        finally:
+            self._database.rollback()
+
+    def _mark(self) -> str:
+        if self.path is None:
+            return ""
+        with self.path.open("rb") as file:
+            head, status = file.read(_HEADER_BYTES), os.fstat(file.fileno())
+        if len(head) < _HEADER_BYTES or _WAL in head[18:20]:
+            return ""
+        changes = int.from_bytes(head[24:28], "big")  # counts transactions that wrote
+        return f"{SCHEMA_VERSION} {status.st_ino} {status.st_size} {status.st_mtime_ns} {changes}"
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
         """The encoded frame index of a file; None if the index does not know that state of it.

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import math
 from array import array
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
-from itertools import accumulate, islice, pairwise
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate, chain, islice, pairwise
+from operator import itemgetter
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.catalogue.index_file import IndexRow
+from v2v_server.catalogue.index.file import IndexRow
 
 CHUNK = 4096
 """Records that are worked on at a time."""
+_NUMBERS = ("states", "_frames", "_width", "_height", "_rate", "_codec", "_interlaced")
+"""Columns that are arrays."""
 
 
 class Texts(Sequence[str]):
@@ -36,6 +39,16 @@ class Texts(Sequence[str]):
         utf8 = joined.encode()
         lengths = map(len, texts) if len(utf8) == len(joined) else (len(text.encode()) for text in texts)
         self._ends.extend(islice(accumulate(lengths, initial=self._ends[-1]), 1, None))
+        self._utf8 += utf8
+
+    def packed(self) -> list[bytes]:
+        """All of them as plain bytes, for :meth:`take_in`; equal for equal texts."""
+        self.settle()
+        return [bytes(self._utf8), self._ends.tobytes()]
+
+    def take_in(self, utf8: bytes, ends: bytes) -> None:
+        """Adds those of another's :meth:`packed` at the end."""
+        self._ends.frombytes((np.frombuffer(ends, np.int64)[1:] + self._ends[-1]).tobytes())
         self._utf8 += utf8
 
     def change(self, place: int, text: str) -> None:
@@ -80,7 +93,8 @@ class Texts(Sequence[str]):
 
     def __getitem__(self, at: int | slice) -> str | list[str]:
         if isinstance(at, slice):
-            return [self[place] for place in range(*at.indices(len(self)))]
+            start, end, step = at.indices(len(self))
+            return self.part(start, max(start, end)) if step == 1 else [self[each] for each in range(start, end, step)]
         if not 0 <= at < len(self):
             raise IndexError(f"text {at} of {len(self)}")
         if at in self._changed:
@@ -89,10 +103,11 @@ class Texts(Sequence[str]):
 
 
 class Records(Sequence[IndexRow]):
-    """Records of an index without sizes, times and frame indices, sorted by id.
+    """Records of an index without frame indices, sorted by id.
 
     Attributes:
         ids, fingerprints: of each.
+        states: size, mtime and ctime of each, one after the other; empty once nobody needs them any more.
         codecs: the names that occur; ``codec`` has the number of each record's.
         problems: why a record cannot be used, by place.
     """
@@ -101,6 +116,7 @@ class Records(Sequence[IndexRow]):
         self.ids, self.fingerprints = Texts(), Texts()
         self.codecs: dict[str, int] = {}
         self.problems: dict[int, str] = {}
+        self.states = array("q")
         self._frames, self._width, self._height = array("q"), array("i"), array("i")
         self._rate, self._codec, self._interlaced = array("d"), array("i"), array("b")
 
@@ -110,6 +126,7 @@ class Records(Sequence[IndexRow]):
         ids, _, _, _, fingerprints, frames, widths, heights, rates, codecs, interlaced, problems = zip(
             *rows, strict=True
         )
+        self.states.extend(chain.from_iterable(map(itemgetter(1, 2, 3), rows)))
         self.ids.extend(ids)
         self.fingerprints.extend(fingerprints)
         self._frames.extend(frames)
@@ -121,6 +138,48 @@ class Records(Sequence[IndexRow]):
         self._interlaced.extend(interlaced)
         if any(problems):
             self.problems.update((at, problem) for at, problem in enumerate(problems, place) if problem is not None)
+
+    def packed(self) -> dict[str, Any]:
+        """All of them as plain bytes, texts and numbers, for :meth:`take_in`."""
+        return {
+            "ids": self.ids.packed(),
+            "fingerprints": self.fingerprints.packed(),
+            "codecs": list(self.codecs),
+            "problems": list(self.problems.items()),
+            **{name: getattr(self, name).tobytes() for name in _NUMBERS},
+        }
+
+    def take_in(self, packed: Mapping[str, Any]) -> None:
+        """Adds those of another's :meth:`packed` at the end."""
+        place = len(self)
+        self.ids.take_in(*packed["ids"])
+        self.fingerprints.take_in(*packed["fingerprints"])
+        for name in _NUMBERS:
+            getattr(self, name).frombytes(packed[name])
+        self.problems.update((place + at, problem) for at, problem in packed["problems"])
+        numbers = [self._number(codec) for codec in packed["codecs"]]
+        if numbers != list(range(len(numbers))):
+            codec = np.frombuffer(self._codec, np.int32)[place:]
+            codec[:] = np.array(numbers, np.int32)[codec]
+
+    def rows(self) -> Iterator[tuple[Any, ...]]:
+        """What :meth:`extend` was given."""
+        names, count = list(self.codecs), len(self)
+        return zip(
+            self.ids.part(0, count),
+            self.states[::3],
+            self.states[1::3],
+            self.states[2::3],
+            self.fingerprints.part(0, count),
+            self._frames,
+            self._width,
+            self._height,
+            (None if math.isnan(rate) else rate for rate in self._rate),
+            map(names.__getitem__, self._codec),
+            self._interlaced,
+            map(self.problems.get, range(count)),
+            strict=True,
+        )
 
     def append(self, row: IndexRow) -> None:
         """Adds one."""
@@ -193,6 +252,31 @@ class Records(Sequence[IndexRow]):
     def codec_name(self, at: int) -> str:
         """FFmpeg's name of its format."""
         return next(islice(self.codecs, self._codec[at], None))
+
+
+def merged(ids: Sequence[str], parts: Iterable[Mapping[str, Any]], unasked: list[str]) -> Records:
+    """The record of each id; with a size of -1, which no file has, where there is none.
+
+    Args:
+        ids: sorted, each once.
+        parts: of the index, :meth:`Records.packed`, sorted.
+        unasked: receives the ids of all other records.
+    """
+    records, at = Records(), 0
+    for packed in parts:
+        part = Records()
+        part.take_in(packed)
+        asked = ids[at : (end := bisect_right(ids, part.ids[len(part) - 1], at))]
+        at = end
+        names = Texts()
+        names.extend(asked)
+        if names.packed() == packed["ids"]:
+            records.take_in(packed)
+        elif rows := list(joined(asked, part.rows(), unasked)):
+            records.extend(rows)
+    for start in range(at, len(ids), CHUNK):
+        records.extend(list(joined(ids[start : start + CHUNK], iter(()), unasked)))
+    return records
 
 
 def joined(ids: Sequence[str], rows: Iterator[tuple[Any, ...]], unasked: list[str]) -> Iterator[tuple[Any, ...]]:
