@@ -17,6 +17,7 @@ MODULES = {
     "v2v-simulate": "v2v_server.commands.simulate",
     "v2v-preview": "v2v_server.commands.preview",
     "v2v-prepare": "v2v_server.commands.prepare",
+    "v2v-catalogue": "v2v_server.commands.catalogue",
     "v2v-quarantine": "v2v_server.commands.quarantine",
     "v2v-top": "v2v_server.commands.top",
     "v2v-doctor": "v2v_server.commands.doctor",

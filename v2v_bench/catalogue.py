@@ -4,7 +4,7 @@
 
 The corpus is made up: one clip under very many names (links to a few copies of it), a thousand to a folder, and an
 index that knows them all, as a second start finds it. Files and index lie below --folder, and are removed at the end.
-Opened in a process of its own, twice: the first has no copy of the index's columns yet, and leaves one. Then a server is
+Opened in a process of its own, twice: the first finds no copy of the index's columns, and leaves one. Then a server is
 started on it, with two workers.
 
     open           seconds until the catalogue is there, and processor time of all its processes

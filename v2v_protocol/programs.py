@@ -61,6 +61,7 @@ simulate = _program("v2v-simulate", "v2v_server.commands.simulate", "main", "ser
 preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server")
 prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
 top = _program("v2v-top", "v2v_server.commands.top", "main", "server")
+catalogue = _program("v2v-catalogue", "v2v_server.commands.catalogue", "main", "server")
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
 doctor = _program("v2v-doctor", "v2v_server.commands.doctor", "main", "server")
 keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")

@@ -2,7 +2,8 @@
 
 catalogue        the snapshot that everything else works from
 videos           its videos, in columns
-files            which files a corpus has
+corpus           where a corpus lies, and which files it has
+files            looking for them, and asking about many at a time
 listfile         list files like the paper's
 survey           probing many files in processes of their own
 index            what probing found, on disk and in memory

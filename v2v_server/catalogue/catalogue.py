@@ -13,21 +13,12 @@ import numpy as np
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_server.catalogue.files import (
-    UNPRINTABLE,
-    VIDEO_SUFFIXES,
-    Notice,
-    bucket_files,
-    corpus_root,
-    is_said,
-    printable,
-    regular_files,
-    video_files,
-)
+from v2v_server.catalogue.corpus import Corpus, find_corpus, told
+from v2v_server.catalogue.files import Notice
 from v2v_server.catalogue.index.columns import Records
 from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
-from v2v_server.catalogue.manifest import Header, Manifest, PreparedVideo, find_manifest, refuse_prepared_below
+from v2v_server.catalogue.listfile import ListEntry
+from v2v_server.catalogue.manifest import Header, PreparedVideo
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scene import Scene
 from v2v_server.catalogue.scenes import Looking
@@ -272,72 +263,21 @@ def open_catalogue(
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
             be used.
     """
-    root: Path | Copies
-    bucket, manifest = copies_of(os.fspath(source), copies, copies_gib, cache_dir), None
-    try:
-        if bucket is not None:
-            root, listed = bucket, None if list_file is None else read_list(list_file)
-        else:
-            root, listed = _wanted(Path(source), list_file)
-            manifest = find_manifest(root)
-    except OSError as error:  # a folder that this user may not enter, a share that has gone
-        raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
-    refused: dict[str, str] = {}
-    if manifest is not None:
-        rows = manifest.served_rows(rows)
-        ids = manifest.wanted(None if listed is None else [entry.id for entry in listed], refused)
-    else:
-        named = None if listed is None else [entry.id for entry in listed]
-        ids = _found(root, refused, notice) if named is None else regular_files(root, named, refused, notice)
-        refuse_prepared_below(root, ids)
-    if not ids:
-        raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{_told(refused)}")
-    looking = Looking(rows or Rows(), manifest) if scene else None
-    store, records, notes = up_to_date(root, ids, index_path(root, cache_dir), looking, processes, progress, notice)
+    corpus = find_corpus(source, list_file, rows, copies_of(os.fspath(source), copies, copies_gib, cache_dir), notice)
+    looking = Looking(corpus.rows, corpus.manifest) if scene else None
+    path = index_path(corpus.root, cache_dir)
+    store, records, notes = up_to_date(corpus.root, corpus.ids, path, looking, processes, progress, notice)
     try:
         with without_collections():
-            return _snapshot(root, rows or Rows(), records, listed or (), refused, notes, store, manifest, looking)
+            return _snapshot(corpus, records, notes, store, looking)
     except BaseException:
         store.close()
         raise
 
 
-def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Path, tuple[ListEntry, ...] | None]:
-    """The root folder, and the entries to take from it; None takes every video below it."""
-    folder = corpus_root(source)
-    if source.is_dir():
-        return folder, None if list_file is None else read_list(list_file)
-    if list_file is not None:
-        raise CorpusError(f"{source}: not a folder; a list file names videos of a folder")
-    if source.suffix.lower() in LIST_SUFFIXES:
-        return folder, read_list(source)
-    if printable(source.name) != source.name:
-        raise CorpusError(f"{printable(source.name)}: {UNPRINTABLE}")
-    return folder, (ListEntry(source.name),)
-
-
-def _found(root: Path | Copies, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
-    """The videos below a folder, or an address."""
-    ids = []
-    for id in bucket_files(root.listed, refused) if isinstance(root, Copies) else video_files(root, refused):
-        ids.append(id)
-        if notice is not None and is_said(len(ids)):
-            notice(f"looking for videos: {len(ids)} so far")
-    return tuple(ids)
-
-
-def _snapshot(
-    root: Path | Copies,
-    rows: Rows,
-    records: Records,
-    listed: Sequence[ListEntry],
-    refused: dict[str, str],
-    notes: list[str],
-    store: Store,
-    manifest: Manifest | None,
-    looking: Looking | None,
-) -> Catalogue:
-    problems, files = dict(refused), dict[str, str]()
+def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, looking: Looking | None) -> Catalogue:
+    root, manifest = corpus.root, corpus.manifest
+    problems, files = dict(corpus.refused), dict[str, str]()
     absent: dict[str, PreparedVideo] = {}
     on_disk = records
     if manifest is not None:
@@ -356,15 +296,15 @@ def _snapshot(
     usable[list(records.problems)] = False
     places = np.flatnonzero(usable)
     videos = Videos(records, places, {})
-    thresholds, shorter = _listed(listed, videos)
+    thresholds, shorter = _listed(corpus.listed, videos)
     videos = Videos(records, places, thresholds)
     if not videos:
-        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{_told(problems)}")
+        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{told(problems)}")
     if absent:
         if len(absent) == len(videos):
             raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
         reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
-        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{_told(reasons)}"]
+        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{told(reasons)}"]
     if manifest is not None and manifest.aside:
         notes = [
             *notes,
@@ -381,7 +321,7 @@ def _snapshot(
         ]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
-    digest = videos.digest(rows)
+    digest = videos.digest(corpus.rows)
     scene_digest, unseen = None, set(absent)
     if looking is not None:
         used = (_of_file(records[place], files) for place in places.tolist())
@@ -393,7 +333,7 @@ def _snapshot(
             notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
     return Catalogue(
         root=root,
-        rows=rows,
+        rows=corpus.rows,
         videos=videos,
         refusals=tuple(Refusal(id, None, problems[id], RefusalKind.UNUSABLE) for id in sorted(problems)),
         notes=tuple(notes),
@@ -427,12 +367,3 @@ def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thre
         if entry.frames is not None and entry.frames > frames:
             shorter.append(f"{entry.id} has {frames} frames, not {entry.frames}")
     return thresholds, shorter
-
-
-def _told(problems: dict[str, str]) -> str:
-    """The first few reasons, for an error message."""
-    if not problems:
-        return ""
-    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
-    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
-    return f" ({shown}{more})"

@@ -7,6 +7,7 @@ import hashlib
 import os
 import sqlite3
 import stat
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
@@ -18,25 +19,31 @@ from v2v_server.catalogue.files import Notice, by_parts
 from v2v_server.catalogue.index.columns import CHUNK, Records, merged
 from v2v_server.catalogue.index.copy import NoCopy, Part, copied, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
+from v2v_server.catalogue.index.parts import Shard
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
 from v2v_server.cloud.copies import Copies
 from v2v_server.system.process import cache_folder, without_collections
 
 _WRITE_EVERY = 256
+_WRITE_SECONDS = 10.0
 
 Progress = Callable[[int, int], None]
 """(files probed so far, files to probe)."""
 
 
-def index_path(root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None) -> Path:
-    """The index file of a corpus; ``cache_dir`` as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+def index_path(
+    root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None, shard: Shard | None = None
+) -> Path:
+    """The index file of a corpus, or of a shard of it; ``cache_dir`` as in
+    :func:`v2v_server.catalogue.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: none was chosen, and this user has no home folder.
     """
     name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
-    return cache_folder(cache_dir) / f"catalogue-{name}.sqlite3"
+    of = "" if shard is None else f"-{shard.number}-of-{shard.count}"
+    return cache_folder(cache_dir) / f"catalogue-{name}{of}.sqlite3"
 
 
 def up_to_date(
@@ -156,13 +163,17 @@ def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> lis
     return gone
 
 
-def _batches(records: Iterator[IndexRow], total: int, progress: Progress | None) -> Iterator[list[IndexRow]]:
+def _batches(
+    records: Iterator[IndexRow], total: int, progress: Progress | None, clock: Callable[[], float] = time.monotonic
+) -> Iterator[list[IndexRow]]:
+    """What a kill may cost is one of them."""
     batch: list[IndexRow] = []
+    begun = clock()
     for done, record in enumerate(records, 1):
         batch.append(record)
         if progress is not None:
             progress(done, total)
-        if len(batch) == _WRITE_EVERY:
+        if len(batch) == _WRITE_EVERY or clock() - begun > _WRITE_SECONDS:
             yield batch
-            batch = []
+            batch, begun = [], clock()
     yield batch

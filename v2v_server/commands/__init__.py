@@ -4,6 +4,7 @@ serve       v2v-serve
 worker      v2v-worker
 simulate    v2v-simulate
 preview     v2v-preview
+catalogue   a corpus looked at ahead (v2v-catalogue)
 prepare     v2v-prepare
 top         what a server is at, on a terminal (v2v-top)
 doctor      what is in the way on this machine (v2v-doctor)

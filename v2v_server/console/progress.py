@@ -9,9 +9,19 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.status import Status
+from rich.text import Text
 
+from v2v_server.console.farewell import span
 from v2v_server.system.log import Log
 
 _LOG_SECONDS = 10.0
@@ -54,9 +64,16 @@ class _Lines:
     def __init__(self, clock: Callable[[], float], log: Log) -> None:
         self._clock, self._log = clock, log
         self._due = clock() + _LOG_SECONDS
+        self._begun: tuple[int, float] | None = None  # files that were done when, to take the rate from
 
     def __call__(self, done: int, total: int) -> None:
-        self.notice(f"probing videos: {done} of {total}")
+        now = self._clock()
+        if self._begun is None or done < self._begun[0]:
+            self._begun = done, now
+        first, begun = self._begun
+        rate = (done - first) / (now - begun) if now > begun else 0.0
+        left = f", {rate:.3g} a second, {span((total - done) / rate)} left" if rate and done < total else ""
+        self.notice(f"probing videos: {done} of {total}{left}")
 
     def notice(self, text: str) -> None:
         now = self._clock()
@@ -65,13 +82,22 @@ class _Lines:
             self._log.say(text)
 
 
+class _Rate(ProgressColumn):
+    """Files a second."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.speed is None else f"{task.speed:.3g}/s")
+
+
 class _Bar:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._due = clock() + _SHOWN_AFTER_SECONDS
         console = Console(file=sys.stderr)
-        columns = (TextColumn("probing videos"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=console, transient=True)
+        self._bar = Progress(
+            TextColumn("probing videos"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
+            console=console, transient=True,
+        )  # fmt: skip
         self._task = self._bar.add_task("probe", total=None)
         self._status = Status("", console=console)
 

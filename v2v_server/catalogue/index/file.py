@@ -218,6 +218,32 @@ class Store:
         places = ", ".join("?" * len(IndexRow.__slots__))
         self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({places})", rows)
 
+    def take_in(self, path: Path) -> int:
+        """Adds or replaces all that another index knows, in one transaction.
+
+        Returns:
+            how many records it has.
+
+        Raises:
+            ValueError: it is an index of another version, or none.
+            sqlite3.Error: it is damaged; or as for :meth:`put`.
+        """
+        # Immutable: it may lie where SQLite's locks do not work.
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as other:
+            (version,) = other.execute("PRAGMA user_version").fetchone()
+            if version != SCHEMA_VERSION:
+                raise ValueError(f"is an index of version {version}, this program reads {SCHEMA_VERSION}")
+            self._database.execute(_SCENES)
+            self._database.execute("BEGIN IMMEDIATE")
+            with self._database:
+                for table, columns in ("video", f"{_COLUMNS}, frame_index"), ("scene", "id, fingerprint, look, data"):
+                    if other.execute("SELECT 1 FROM sqlite_master WHERE name = ?", (table,)).fetchone() is None:
+                        continue
+                    places = ", ".join("?" * (columns.count(",") + 1))
+                    rows = other.execute(f"SELECT {columns} FROM {table}")
+                    self._database.executemany(f"INSERT OR REPLACE INTO {table} ({columns}) VALUES ({places})", rows)
+            return int(other.execute("SELECT COUNT(*) FROM video").fetchone()[0])
+
     def forget(self, ids: Iterable[str]) -> None:
         """Drop records, in one transaction.
 

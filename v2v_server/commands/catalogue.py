@@ -1,0 +1,126 @@
+"""The command line of `v2v-catalogue`: a corpus catalogued ahead, on one host or in shards on many."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.spec import SCENES
+from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.catalogue.index.parts import Shard
+from v2v_server.cloud.copies import COPIES_GIB
+from v2v_server.console.farewell import span
+from v2v_server.console.progress import CatalogueProgress, catalogue_progress
+from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
+from v2v_server.system.process import usable_cores
+from v2v_server.video.rows import Rows
+
+_SHOWN = 5
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = Parser(
+        "v2v-catalogue", "--videos DIR [flags]",
+        "Look at every video ahead, so that v2v-serve starts at once. Goes on where it was interrupted. On many hosts "
+        "each does a shard, and one puts the parts together.",
+        [
+            "v2v-catalogue --videos webvid10k/ --rows top:0.54 --scene auto",
+            "v2v-catalogue --videos /data/webvid --shard 3/16 --out /data/parts",
+            "v2v-catalogue --videos /data/webvid --merge /data/parts",
+        ],
+    )  # fmt: skip
+    videos = parser.group("Videos, as for v2v-serve")
+    videos.add_argument(
+        "--videos", required=True, metavar="DIR", help="folder, video, list file, or s3://bucket/prefix"
+    )
+    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts --videos")
+    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to look at with --scene (default full)")
+    videos.add_argument("--scene", choices=SCENES, default="off", help="auto: also take what --scene auto needs")
+    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    videos.add_argument("--copies", metavar="DIR", help="folder that videos are fetched to from object storage")
+    videos.add_argument(
+        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help=f"at most so much there ({COPIES_GIB:g})"
+    )
+    run = parser.group("Run")
+    run.add_argument(
+        "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core it may use)"
+    )
+    run.add_argument("--shard", metavar="K/N", help="only part K of N; needs --out")
+    run.add_argument("--out", metavar="DIR", help="folder for the part, which the host that merges sees")
+    run.add_argument("--merge", metavar="DIR", help="take up the parts in that folder first")
+    interrupted = "interrupted; the same command goes on from here"
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.workers < 1:
+        raise UsageError(f"--workers {arguments.workers}: give at least 1")
+    if (arguments.shard is None) != (arguments.out is None):
+        raise UsageError("--shard K/N and --out DIR go together: a part that nobody finds is of no use")
+    if arguments.shard is not None and arguments.merge is not None:
+        raise UsageError("--shard makes a part, --merge takes up all of them: one at a time")
+    asked = Ahead(
+        videos=arguments.videos,
+        list_file=arguments.list,
+        rows=Rows.parse(arguments.rows),
+        cache_dir=arguments.cache_dir,
+        copies=arguments.copies,
+        copies_gib=arguments.copies_gib,
+        scene=arguments.scene != "off",
+        processes=arguments.workers,
+    )
+    begun = time.monotonic()
+    shard = None if arguments.shard is None else Shard.parse(arguments.shard)
+    with catalogue_progress() as shown:
+        probed = _Probed(shown)
+        if shard is not None:
+            part = catalogue_shard(asked, shard, Path(arguments.out), probed, shown.notice)
+        else:
+            parts = None if arguments.merge is None else Path(arguments.merge)
+            catalogue = catalogue_ahead(asked, parts, probed, shown.notice)
+    lines = _of_part(part, shard) if shard is not None else _of_all(catalogue)
+    for line in [*lines, f"looked into {probed.files} files in {span(time.monotonic() - begun)}"]:
+        print(line)
+
+
+class _Probed:
+    """Counts what is shown."""
+
+    def __init__(self, shown: CatalogueProgress) -> None:
+        self._shown, self.files = shown, 0
+
+    def __call__(self, done: int, total: int) -> None:
+        self.files += 1
+        self._shown(done, total)
+
+
+def _of_part(part: Part, shard: Shard) -> list[str]:
+    unusable = part.problems.total()
+    lines = [f"shard {shard}: {part.taken_in} of {part.videos} videos, {part.taken_in - unusable} can be used"]
+    lines += [f"  {count}: {reason}" for reason, count in part.problems.most_common(_SHOWN)]
+    return [*lines, f"part: {part.path}"]
+
+
+def _of_all(catalogue: Catalogue) -> list[str]:
+    with closing(catalogue):
+        lines = [*catalogue.notes, f"{catalogue.root}: {len(catalogue.videos)} videos can be used"]
+        if catalogue.refusals:
+            lines.append(f"{len(catalogue.refusals)} files cannot be used:")
+            lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]
+            if len(catalogue.refusals) > _SHOWN:
+                lines.append(f"  ... and {len(catalogue.refusals) - _SHOWN} more: v2v-serve --list-refused names all")
+        lines.append(f"digest: {catalogue.digest}")
+        if catalogue.scene_digest is not None:
+            lines.append(f"with scenes: {catalogue.scene_digest}")
+        return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())

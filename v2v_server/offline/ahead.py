@@ -1,0 +1,105 @@
+"""A corpus catalogued ahead, on one host or on many, so that a server starts at once."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.corpus import find_corpus
+from v2v_server.catalogue.files import Notice
+from v2v_server.catalogue.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
+from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
+from v2v_server.catalogue.scenes import Looking
+from v2v_server.cloud.copies import COPIES_GIB, copies_of
+from v2v_server.video.rows import Rows
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """What is catalogued, and how; see :func:`v2v_server.catalogue.catalogue.open_catalogue`."""
+
+    videos: str
+    list_file: str | None = None
+    rows: Rows | None = None
+    cache_dir: str | None = None
+    copies: str | None = None
+    copies_gib: float = COPIES_GIB
+    scene: bool = False
+    processes: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A shard that is done.
+
+    Attributes:
+        path: of its index.
+        videos: of the corpus.
+        taken_in: of them in this shard.
+        problems: of those the ones that cannot be used, by reason.
+    """
+
+    path: Path
+    videos: int
+    taken_in: int
+    problems: Counter[str]
+
+
+def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None, notice: Notice | None) -> Catalogue:
+    """The catalogue of a corpus, all of whose files are in the index afterwards. The caller closes it.
+
+    Args:
+        asked: the corpus.
+        parts: folder of the parts that other hosts made; what fits the files here need not be probed again.
+        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+
+    Raises:
+        CorpusError: as there; or the parts are not complete, or cannot be read.
+    """
+    if parts is not None:
+        complete = parts_in(parts)
+        bucket = copies_of(asked.videos, asked.copies, asked.copies_gib, asked.cache_dir)
+        corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, None)
+        take_in_parts(index_path(corpus.root, asked.cache_dir), complete)
+    return open_catalogue(
+        asked.videos,
+        list_file=asked.list_file,
+        rows=asked.rows,
+        cache_dir=asked.cache_dir,
+        copies=asked.copies,
+        copies_gib=asked.copies_gib,
+        scene=asked.scene,
+        processes=asked.processes,
+        progress=progress,
+        notice=notice,
+    )
+
+
+def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | None, notice: Notice | None) -> Part:
+    """Catalogues a shard of a corpus, and leaves its index among the parts. What was done before a kill stays done: it
+    lies in the cache folder of this host.
+
+    Args:
+        asked: the corpus.
+        shard: of it.
+        out: folder of the parts, which all hosts see.
+        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+
+    Raises:
+        CorpusError: there is no such corpus, or a folder that cannot be written to.
+    """
+    make_folder(out)
+    bucket = copies_of(os.fspath(asked.videos), asked.copies, asked.copies_gib, asked.cache_dir)
+    corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, notice)
+    ids = [id for id in corpus.ids if shard.holds(id)]
+    looking = Looking(corpus.rows, corpus.manifest) if asked.scene else None
+    index = index_path(corpus.root, asked.cache_dir, shard)
+    store, records, notes = up_to_date(corpus.root, ids, index, looking, asked.processes, progress, notice)
+    store.close()
+    if notes:
+        raise CorpusError(notes[0])
+    return Part(write_part(index, out, shard), len(corpus.ids), len(ids), Counter(records.problems.values()))
