@@ -19,6 +19,7 @@ from tests.server.video.test_hostile import PLAYLISTS
 from tests.waiting import until
 from v2v_bench.usage import peak_rss_bytes
 from v2v_client import V2VStreamDataset
+from v2v_server.system.sandbox import can_confine
 
 pytestmark = [
     pytest.mark.slow,
@@ -61,6 +62,10 @@ def corpus(tmp_path: Path) -> Path:
     return folder
 
 
+def status(process: psutil.Process) -> str:
+    return Path(f"/proc/{process.pid}/status").read_text()
+
+
 def test_a_hostile_folder_is_served_within_bounds(corpus: Path, tmp_path: Path) -> None:
     log, port_file = tmp_path / "opened.txt", tmp_path / "port"
     flags = [f"{key}={value}" for key, value in SMALL.items()]
@@ -84,11 +89,13 @@ def test_a_hostile_folder_is_served_within_bounds(corpus: Path, tmp_path: Path) 
             if "v2v_server.commands.worker" in process.cmdline()
         ]
         peaks = [peak_rss_bytes(worker.pid) / (1 << 20) for worker in workers]
+        confined = [re.search(r"^Seccomp:\t2$", status(worker), re.MULTILINE) is not None for worker in workers]
     finally:
         for process in psutil.Process(server.pid).children(recursive=True):
             if "v2v_server" in process.cmdline() and "strace" not in process.cmdline()[0]:
                 process.terminate()
         _, said = server.communicate(timeout=60)
+    assert not can_confine().calls or all(confined)
     assert len(samples) >= 2 * 9 * 10  # of the good clips at least
     for batch in samples:
         assert batch.voxels.shape[1] == SMALL["voxels_per_clip"]

@@ -148,7 +148,7 @@ class Fleet:
 
     @property
     def tally(self) -> Path:
-        """As many bytes as handshakes were refused to hostile peers."""
+        """As many bytes as hostile peers made connections by hand, or were refused a handshake."""
         return self.folder / "tally"
 
     @property
@@ -237,12 +237,16 @@ class Fleet:
         self._spawn(place)
         self.further_workers.append(place)
 
-    def peers(self, kind: str) -> subprocess.Popen[bytes]:
-        """Hostile peers of that kind (:mod:`v2v_bench.chaos.hostile`); whoever asks ends them."""
+    def peers(self, kind: str, *, last: bool = True) -> subprocess.Popen[bytes]:
+        """Hostile peers of that kind (:mod:`v2v_bench.chaos.hostile`); whoever asks ends them.
+
+        Args:
+            last: they get what others leave of the processor.
+        """
         command = [sys.executable, "-m", "v2v_bench.chaos.hostile", "--address", self._address, "--kind", kind]
+        command += ["--tally", str(self.tally)]
         if self.keys is not None:
             command += ["--worker-address", self._worker_address, "--revoked", str(self.keys.revoked)]
-            command += ["--tally", str(self.tally)]
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -250,7 +254,7 @@ class Fleet:
             stderr=subprocess.DEVNULL,
             env=self._environment("consumer"),
             start_new_session=True,
-            preexec_fn=last_in_line,
+            preexec_fn=last_in_line if last else None,
         )
 
     def cached_pieces(self) -> list[Path]:

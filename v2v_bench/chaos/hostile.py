@@ -54,6 +54,7 @@ _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
 _TURNED_AWAY_MS = 2000
 _ELSEWHERE = "127.0.0.2"
+_tally: Path | None = None
 _GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with the bytes that frame them
 SLOW_RECIPE = "paper-flow"
 SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
@@ -153,12 +154,10 @@ class Refused:
     Args:
         worker_address: the other port.
         revoked: file of a revoked consumer's key.
-        tally: grows by a byte for every handshake that the server refused.
     """
 
     worker_address: str
     revoked: Path
-    tally: Path
 
     def __call__(self, address: str, number: int) -> None:
         known, revoked = read_key(Path(os.environ[KEY_VARIABLE])), read_key(self.revoked)
@@ -172,8 +171,7 @@ class Refused:
                 key.secure(peer)
                 peer.connect(_from_elsewhere(where))
                 if monitor.poll(_TURNED_AWAY_MS):
-                    with self.tally.open("ab") as file:
-                        file.write(b".")
+                    _count()
             finally:
                 peer.disable_monitor()
                 peer.close()
@@ -253,7 +251,16 @@ def _raw(address: str) -> Iterator[socket.socket]:
 
 def _connected(address: str) -> socket.socket:
     host, _, port = address.removeprefix("tcp://").rpartition(":")
-    return socket.create_connection((host, int(port)), 5.0, (_ELSEWHERE, 0) if host == "127.0.0.1" else None)
+    link = socket.create_connection((host, int(port)), 5.0, (_ELSEWHERE, 0) if host == "127.0.0.1" else None)
+    _count()
+    return link
+
+
+def _count() -> None:
+    """One more connection, or one more handshake that was refused."""
+    if _tally is not None:
+        with _tally.open("ab") as file:
+            file.write(b".")
 
 
 def _from_elsewhere(address: str) -> str:
@@ -286,11 +293,15 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     parser.add_argument("--kind", required=True, choices=(*KINDS, *KEYED_KINDS))
     parser.add_argument("--worker-address", help="for refused: the other port")
     parser.add_argument("--revoked", type=Path, help="for refused: a revoked key")
-    parser.add_argument("--tally", type=Path, help="for refused: a file that grows by a byte with every refusal")
+    parser.add_argument(
+        "--tally", type=Path, help="a file that grows by a byte with every raw connection and every refused handshake"
+    )
     asked = parser.parse_args(arguments)
+    global _tally
+    _tally = asked.tally
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
     if asked.kind == REFUSED:
-        act: Callable[[str, int], None] = Refused(asked.worker_address, asked.revoked, asked.tally)
+        act: Callable[[str, int], None] = Refused(asked.worker_address, asked.revoked)
     else:
         act = Handshakes.recorded() if asked.kind == HANDSHAKES else KINDS[asked.kind]
     attack(asked.address, asked.kind, act)

@@ -1,10 +1,11 @@
 """The chaos test between two hosts: the server on one, consumers and workers on another, and the cable between them
 loses packets and is pulled out again and again.
 
-    v2v-bench chaos_across --footage VIDEO VIDEO --minutes 2 --loss 0.01 --delay-ms 5
+    v2v-bench chaos_across --footage VIDEO VIDEO --minutes 2 --loss 0.01 --delay-ms 5 --keys
 
 Two network namespaces (`v2v_bench/link/cable.py`). What is counted, and what must be 0, is what `v2v-bench chaos` says;
-consumers and further workers reach the server by the cable only, and samples travel compressed. A cut lasts up to 4 s.
+consumers and further workers reach the server by the cable only, and samples travel compressed; with ``--keys``
+encrypted, too. A cut lasts up to 4 s.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def _work(asked: argparse.Namespace) -> int:
         with Cable(asked.mbit, asked.delay_ms, asked.loss) as cable:
             fleet = Fleet(
                 folder, videos, asked.workers, asked.consumers, asked.lease_deadline_seconds,
-                server_flags=("--insecure",), host=NEAR, elsewhere=cable.far,
+                server_flags=() if asked.keys else ("--insecure",), host=NEAR, elsewhere=cable.far, keyed=asked.keys,
             )  # fmt: skip
             kinds = tuple(asked.faults.split(",")) if asked.faults else _KINDS
             if unknown := set(kinds) - set(_KINDS):

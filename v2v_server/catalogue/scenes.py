@@ -115,9 +115,15 @@ class Looking:
                 index = store.frame_index(record.id, record.fingerprint) or b""
                 yield _ToLookAt(record.id, record.fingerprint, index, self._window(record))
 
-        look = partial(_look_at, root)
+        isolated = partial(
+            run_isolated,
+            partial(_look_at, root),
+            deadline_seconds=lambda job: LONGEST_SECONDS,
+            memory_bytes=2 * LARGEST_MEMORY_BYTES,
+            confined=not isinstance(root, Copies),
+        )
         suspects = []
-        for job, scene in run_isolated(look, jobs(), processes, lambda job: LONGEST_SECONDS, 2 * LARGEST_MEMORY_BYTES):
+        for job, scene in isolated(jobs(), processes):
             if isinstance(scene, Died) and scene.overdue_seconds:
                 continue  # the next start tries again
             if isinstance(scene, Died) or not scene:
@@ -126,7 +132,7 @@ class Looking:
                 yield by_id[job.id], Scene.from_bytes(scene)
         # Once more, alone: it may have been killed from outside, or for want of memory, or its storage failed for a
         # moment. A second failure is not kept: of such a video nothing is known, and the next start tries again.
-        for job, scene in run_isolated(look, suspects, 1, lambda job: LONGEST_SECONDS, 2 * LARGEST_MEMORY_BYTES):
+        for job, scene in isolated(suspects, 1):
             if not isinstance(scene, Died) and scene:
                 yield by_id[job.id], Scene.from_bytes(scene)
 

@@ -109,16 +109,23 @@ def survey(
         examine: what is done with each file; must be picklable.
         longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
     """
-    look = partial(examine, root)
+    confined = not isinstance(root, Copies)  # which fetches: from a network, into a folder
+    isolated = partial(
+        run_isolated,
+        partial(examine, root),
+        deadline_seconds=lambda id: longest_seconds,
+        memory_bytes=LARGEST_MEMORY_BYTES,
+        confined=confined,
+    )
     suspects: list[str] = []
-    for id, found in run_isolated(look, ids, processes, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
+    for id, found in isolated(ids, processes):
         if isinstance(found, Died) and found.overdue_seconds:
             yield IndexRow(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
         elif isinstance(found, Died):
             suspects.append(id)
         else:
             yield found
-    for id, found in run_isolated(look, suspects, 1, lambda id: longest_seconds, LARGEST_MEMORY_BYTES):
+    for id, found in isolated(suspects, 1):
         yield _culprit(root, id, found) if isinstance(found, Died) else found
 
 

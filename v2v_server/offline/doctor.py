@@ -21,6 +21,7 @@ from typing import Any
 
 from v2v_protocol.command import version_of
 from v2v_server.system.process import usable_cores
+from v2v_server.system.sandbox import can_confine
 
 OK, NOTE, BAD = "ok", "note", "bad"
 PARTS = ("server", "client", "trainer")
@@ -195,6 +196,7 @@ def _machine() -> Iterator[Finding]:
     why = "" if cores == all_cores else f" of {all_cores}: affinity or a control group holds the rest back"
     yield Finding(OK, "cores", f"{cores}{why}; v2v-serve --workers {cores} keeps them busy")
     yield _memory()
+    yield _sandbox()
     yield from _shared_memory()
     kernels = os.environ.get("NUMBA_CACHE_DIR", "")  # chosen when v2v_server was imported
     if kernels:
@@ -222,6 +224,15 @@ def _memory() -> Finding:
     if free < _LITTLE_MEMORY_BYTES:
         return Finding(BAD, "memory", text, "free some, or raise the limit: a server and one worker need about 1 GiB")
     return Finding(OK, "memory", text)
+
+
+def _sandbox() -> Finding:
+    can = can_confine()
+    lacking = [name for name, has in (("seccomp", can.calls), ("Landlock", can.files)) if not has]
+    if not lacking:
+        return Finding(OK, "sandbox", "what decodes videos starts no program, and opens and writes nothing it need not")
+    text = f"no {' and no '.join(lacking)} here: a video that finds a flaw in a decoder has more of its user's rights"
+    return Finding(NOTE, "sandbox", text, "run servers of strangers' videos in a container, or under deploy/systemd")
 
 
 def _kilobytes(name: str, table: Path = Path("/proc/meminfo")) -> int:

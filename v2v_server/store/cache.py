@@ -72,7 +72,7 @@ class Cache:
     """
 
     def __init__(self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
-        self._folder = folder
+        self.folder = folder
         self._most_bytes = most_bytes
         self._least_free_bytes = least_free_bytes
         self._rest_until, self._rest_reason = 0.0, ""
@@ -113,7 +113,7 @@ class Cache:
         size = piece_frames(rows[1] - rows[0], index.width_px)
         key = hashlib.sha256(repr((video, fingerprint, rows, size)).encode()).hexdigest()[:32]
         pieces = [
-            _Piece(self._folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
+            _Piece(self.folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
             for number in range(start // size, last // size + 1)
         ]
         made = self._read(pieces, fingerprint, index, start, cuts, stride)
@@ -136,7 +136,7 @@ class Cache:
     @property
     def used_bytes(self) -> int:
         """How much lies there, of all that share the folder; 0 where that cannot be told."""
-        return used_bytes(self._folder)
+        return used_bytes(self.folder)
 
     def _read(
         self,
@@ -181,7 +181,7 @@ class Cache:
             return False
         pixels = (rows[1] - rows[0]) * index.width_px * sum(piece.end - piece.first for piece in missing)
         try:
-            free = shutil.disk_usage(self._folder).free
+            free = shutil.disk_usage(self.folder).free
         except OSError as error:
             self._rest(f"is gone: {error.strerror or error}")
             return False
@@ -228,7 +228,7 @@ class Cache:
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
         """Writes a piece, and gives it its name if there is room."""
-        partial = self._folder / PARTIAL / secrets.token_hex(8)
+        partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             with StoreWriter(partial, head, QUICK) as writer:
@@ -236,7 +236,7 @@ class Cache:
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
-            with locked_use(self._folder) as used:
+            with locked_use(self.folder) as used:
                 if path.exists() or used.bytes + writer.bytes > self._most_bytes:
                     return
                 path.parent.mkdir(exist_ok=True)
@@ -249,7 +249,7 @@ class Cache:
     def _remove(self, path: Path, why: str) -> None:
         """Removes a piece that cannot be read, so that it is made anew."""
         self.trouble = f"a damaged piece was removed: {why}"
-        with contextlib.suppress(OSError), locked_use(self._folder) as used:
+        with contextlib.suppress(OSError), locked_use(self.folder) as used:
             size = path.stat().st_size
             path.unlink()
             used.add(-size)

@@ -2,6 +2,7 @@
 
 process         memory that stays, cores, long turns, children that die with their parent
 isolate         a function applied to many items in processes of their own, where a crash costs one item
+sandbox         what a process that decodes gives up: programs, networks, writing
 compile_cache   where numba keeps compiled kernels
 turn_away       has the kernel drop newcomers from some addresses
 log             lines for whoever runs a service, as text or JSON

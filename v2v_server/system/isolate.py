@@ -20,6 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from v2v_protocol.errors import UsageError
 from v2v_server.system.process import die_with_parent, limit_memory
+from v2v_server.system.sandbox import confine
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -73,6 +74,7 @@ def run_isolated(
     processes: int,
     deadline_seconds: Callable[[J], float] | None = None,
     memory_bytes: int = 0,
+    confined: bool = False,
 ) -> Iterator[tuple[J, R | Died]]:
     """(job, result) for every job, in order of completion.
 
@@ -86,6 +88,7 @@ def run_isolated(
         deadline_seconds: how long a job may take, its process's start included, before that is killed; None: any time.
             Only time that is spent waiting here counts, so that nothing is overdue after the whole program was stopped.
         memory_bytes: how much a process may allocate: more is refused to whatever asks for it; 0 sets no limit.
+        confined: it only reads and answers, see :mod:`v2v_server.system.sandbox`.
 
     Raises:
         OSError: no process can be started.
@@ -98,7 +101,7 @@ def run_isolated(
     lanes: dict[Connection, _Lane[J, R]] = {}
     try:
         for job in left:
-            lane = _Lane(function, deadline_seconds, memory_bytes)
+            lane = _Lane(function, deadline_seconds, memory_bytes, confined)
             lanes[lane.connection] = lane
             lane.begin(job)
             if len(lanes) == processes:
@@ -112,7 +115,7 @@ def run_isolated(
                     continue
                 for following in left:
                     if isinstance(finished[1], Died):
-                        lane = _Lane(function, deadline_seconds, memory_bytes)
+                        lane = _Lane(function, deadline_seconds, memory_bytes, confined)
                         lanes.pop(ready).end()
                         lanes[lane.connection] = lane
                     lane.begin(following)
@@ -143,14 +146,19 @@ class _Lane(Generic[J, R]):
     """
 
     def __init__(
-        self, function: Callable[[J], R], deadline_seconds: Callable[[J], float] | None, memory_bytes: int
+        self,
+        function: Callable[[J], R],
+        deadline_seconds: Callable[[J], float] | None,
+        memory_bytes: int,
+        confined: bool,
     ) -> None:
         self._deadline_seconds = deadline_seconds
         self.patience = math.inf
         self._begun = False
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, function, os.getpid(), memory_bytes), daemon=True)
+        given = other, function, os.getpid(), memory_bytes, confined
+        self._process = context.Process(target=_serve, args=given, daemon=True)
         # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
         resource_tracker.ensure_running()
         try:
@@ -211,10 +219,14 @@ def _interrupt_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(connection: Connection, function: Callable[[Any], Any], parent_pid: int, memory_bytes: int) -> None:
+def _serve(
+    connection: Connection, function: Callable[[Any], Any], parent_pid: int, memory_bytes: int, confined: bool
+) -> None:
     die_with_parent(parent_pid)
     if memory_bytes:
         limit_memory(memory_bytes)
+    if confined:
+        confine((), network=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
     connection.send(None)  # begun: what ends this process from here on is no fault of its start
     while True:

@@ -35,6 +35,7 @@ from v2v_server.system.process import (
     resident_bytes,
     take_long_turns,
 )
+from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
@@ -303,6 +304,15 @@ def _size_bytes(lease: Lease) -> int:
     return int(size) if size.isdecimal() else 0
 
 
+def _written(root: Path | Copies, address: str, cache: Cache | None) -> list[Path] | None:
+    """Folders that a worker writes to, where those are all; None where its samples may go to a consumer's memory, or
+    tools of object storage write where they like."""
+    if isinstance(root, Copies) or not leaves_host(address):
+        return None
+    kernels = os.environ.get("NUMBA_CACHE_DIR")
+    return [*([Path(kernels)] if kernels else []), *([] if cache is None else [cache.folder])]
+
+
 def run_worker(
     address: str,
     root: Path | Copies,
@@ -341,6 +351,7 @@ def run_worker(
     # What is there by now stays: without it a collection takes a fraction of a millisecond.
     gc.collect()
     gc.freeze()
+    confine(_written(root, address, cache), network=not address.startswith("ipc:") or isinstance(root, Copies))
     worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys, log)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # Now that ZeroMQ's threads are there, which had better come at once.

@@ -272,7 +272,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     """Once at once, and else at the next start: otherwise a video would never have had a cut."""
     with opened(folder, scene=False), opened(folder, cache_dir=tmp_path / "other") as undisturbed:
         digest = undisturbed.scene_digest
-    monkeypatch.setattr(looking, "run_isolated", lambda look, jobs, *_: run_isolated(look, jobs, 0))
+    monkeypatch.setattr(looking, "run_isolated", lambda look, jobs, *_, **__: run_isolated(look, jobs, 0))
     left = failing_opens(monkeypatch, cut=2, whole=1)
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 from pathlib import Path
 
 from v2v_server.catalogue.index.file import IndexRow
@@ -19,9 +20,9 @@ def lethal(root: str, id: str) -> IndexRow:
 
 def killed_once(root: str, id: str) -> IndexRow:
     """Is killed from outside over each file, the first time."""
-    mark = Path(root, f"{id}.killed")
-    if not mark.exists():
-        mark.touch()
+    file = Path(root, id)
+    if not file.stat().st_mode & stat.S_ISVTX:  # such a process may write no file, but change a mode
+        file.chmod(file.stat().st_mode | stat.S_ISVTX)
         os.kill(os.getpid(), signal.SIGKILL)
     return examine(root, id)
 
