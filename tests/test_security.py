@@ -38,6 +38,28 @@ def test_yaml_is_the_safe_kind() -> None:
     assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_server/config.py").read_text(encoding="utf-8")
 
 
+def test_weights_and_arrays_are_loaded_as_such() -> None:
+    """``weights_only=False`` is there once, with an unpickler of a closed list instead of pickle."""
+    unsafe = [
+        (path, word.arg)
+        for path, call in calls()
+        for word in call.keywords
+        if (word.arg == "allow_pickle" and ast.unparse(word.value) != "False")
+        or (word.arg == "weights_only" and ast.unparse(word.value) != "True")
+    ]
+    assert unsafe == [("trainer/unpickle.py", "weights_only")]
+    loads = [call for _, call in calls() if ast.unparse(call.func) == "torch.load"]
+    assert loads
+    for call in loads:
+        assert {"weights_only"} <= {word.arg for word in call.keywords}
+        assert "False" not in ast.unparse(call) or "pickle_module=_TENSORS_ONLY" in ast.unparse(call)
+
+
+def test_opencv_opens_no_file() -> None:
+    readers = ("VideoCapture", "imread", "imreadmulti", "FileStorage", "readNet")
+    assert [path for path, call in calls() if ast.unparse(call.func).endswith(readers)] == []
+
+
 def test_pickle_is_known_in_two_places() -> None:
     found = set()
     for package in PACKAGES:

@@ -23,6 +23,7 @@ SIDES = ("consumer", "worker")
 VARIABLE = "V2V_KEYS"
 KEY_LETTERS = 40
 """Of a CURVE key, in Z85."""
+_Z85 = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
 HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
 """What a socket's monitor says of handshakes: ended without a word, succeeded, other mechanism, not authenticated."""
 _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
@@ -84,11 +85,17 @@ def read_key(file: Path) -> PeerKey:
         key = PeerKey(**json.loads(read_private(file)))
     except (ValueError, TypeError):
         raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made") from None
-    if key.side not in SIDES or any(
-        not isinstance(each, str) or len(each) != KEY_LETTERS for each in (key.server, key.public, key.secret)
-    ):
+    if key.side not in SIDES or not all(map(is_key, (key.server, key.public, key.secret))):
         raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made")
     return key
+
+
+def is_key(text: object) -> bool:
+    """Whether it is written as half of a CURVE pair is (Z85, ZeroMQ RFC 32): 5 letters stand for 4 bytes."""
+    if not isinstance(text, str) or len(text) != KEY_LETTERS or set(text) - set(_Z85):
+        return False
+    groups = (text[at : at + 5] for at in range(0, KEY_LETTERS, 5))
+    return all(sum(_Z85.index(each) * 85**place for place, each in enumerate(reversed(g))) < 2**32 for g in groups)
 
 
 def read_private(file: Path) -> str:

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import json
 import re
+import stat
 from pathlib import Path
 
 import zmq
 
 from v2v_protocol.errors import KeyRefused, UsageError
-from v2v_protocol.keys import KEY_LETTERS, SIDES, PeerKey, read_private, write_key, write_private
+from v2v_protocol.keys import SIDES, PeerKey, is_key, read_private, write_key, write_private
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -56,15 +57,24 @@ class KeyFolder:
         """The server's public and secret key.
 
         Raises:
-            KeyRefused: there is none, or others can read it.
+            KeyRefused: there is none, others can read it, or others can write to the folder, and so let themselves in.
         """
         text = read_private(self._server)
+        for folder in (self.path, *(self.path / side for side in SIDES)):
+            mode = stat.S_IMODE(folder.stat().st_mode) if folder.is_dir() else 0
+            if mode & 0o022:
+                raise KeyRefused(
+                    f"others can write to {folder} (mode {mode:04o}), and so give keys to whom they like: "
+                    f"chmod 700 {folder}, and look at what `v2v-keys list` shows"
+                )
         try:
             keys = json.loads(text)
-            public, secret = keys["public"].encode(), keys["secret"].encode()
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise KeyRefused(f"{self._server} is no key file: v2v-keys init makes one") from None
-        return public, secret
+            public, secret = keys["public"], keys["secret"]
+        except (ValueError, KeyError, TypeError):
+            public = secret = None
+        if not is_key(public) or not is_key(secret):
+            raise KeyRefused(f"{self._server} is no key file: v2v-keys init makes one")
+        return public.encode(), secret.encode()
 
     def new(self, name: str, side: str, out: Path) -> None:
         """Makes a key for a peer, and lets it in.
@@ -140,6 +150,6 @@ class KeyFolder:
                 public = entry.read_text(encoding="ascii").strip()
             except (OSError, ValueError):
                 continue  # revoked at this moment, or none of ours
-            if _NAME.fullmatch(entry.name) and len(public) == KEY_LETTERS:
+            if _NAME.fullmatch(entry.name) and is_key(public):
                 found[public] = entry.name
         return found

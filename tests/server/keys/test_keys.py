@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import stat
@@ -18,7 +19,7 @@ from tests.server.broker.test_door import next_from
 from tests.waiting import until
 from v2v_client.session.link import Link
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
-from v2v_protocol.keys import Handshakes, key_for, mechanism_of, read_key
+from v2v_protocol.keys import Handshakes, is_key, key_for, mechanism_of, read_key
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode, largest_frame_bytes
 from v2v_server.broker.actions import ToConsumer
@@ -200,6 +201,75 @@ def test_a_file_that_others_may_read_is_refused(folder: KeyFolder, tmp_path: Pat
         key_for("tcp://x:1", "consumer", tmp_path / "gpu1.key")
     with pytest.raises(KeyRefused, match=r"server.key has mode 0640"):
         Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=folder)
+
+
+@pytest.mark.parametrize("which", ["", "consumer", "worker"])
+def test_a_folder_that_others_may_write_to_is_refused(folder: KeyFolder, which: str) -> None:
+    """They would put a key of theirs there."""
+    (folder.path / which).chmod(0o770)
+    with pytest.raises(KeyRefused, match=r"others can write to .* \(mode 0770\).* chmod 700"):
+        Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=folder)
+
+
+@pytest.mark.parametrize("half", [" " * 40, "#" * 40, "a" * 39, None])
+def test_what_is_written_as_no_key_is_none(folder: KeyFolder, tmp_path: Path, half: str | None) -> None:
+    for file, name in ((tmp_path / "gpu1.key", "secret"), (folder.path / "server.key", "secret")):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {name: half}))
+    with pytest.raises(KeyRefused, match=r"gpu1.key is no key file"):
+        read_key(tmp_path / "gpu1.key")
+    with pytest.raises(KeyRefused, match=r"server.key is no key file"):
+        folder.server_keys()
+
+
+def test_every_key_of_zeromq_is_one() -> None:
+    for _ in range(100):
+        assert all(is_key(half.decode()) for half in zmq.curve_keypair())
+
+
+def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
+    folder: KeyFolder, sockets: Sockets, tmp_path: Path
+) -> None:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+        peer.setsockopt(zmq.RECONNECT_IVL, -1)
+        peer.setsockopt(zmq.LINGER, 0)
+        read_key(tmp_path / "gpu1.key").secure(peer)
+        monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
+        peer.connect(sockets.address)
+        assert monitor.poll(5000)
+        monitor.recv_multipart()
+        folder.revoke("gpu1")
+        gate = sockets._gate
+        assert gate is not None
+        public = read_key(tmp_path / "gpu1.key").public
+        until(lambda: not gate.admits("consumer", public))
+        peer.send_multipart(encode(Ping()))
+        heard: list[Arrival] = []
+
+        def is_cut_off() -> bool:
+            heard.extend(one for one in sockets.receive(0.05) if isinstance(one, FromConsumer))
+            return bool(monitor.poll(0))
+
+        until(is_cut_off)
+        assert heard == []
+        peer.disable_monitor()
+        monitor.close()
+
+
+def test_where_nobody_answers_for_keys_nobody_comes_in(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
+    """Without ZAP_ENFORCE_DOMAIN everybody would."""
+    gate = sockets._gate
+    assert gate is not None
+    gate.close()
+    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        read_key(tmp_path / "gpu1.key").secure(peer)
+        monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+        peer.connect(sockets.address)
+        peer.send_multipart(encode(Ping()))
+        assert monitor.poll(10_000)
+        assert [one for one in arrivals(sockets, 0.3) if isinstance(one, FromConsumer)] == []
+        peer.disable_monitor()
+        monitor.close()
 
 
 def test_the_environment_names_a_key(folder: KeyFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
