@@ -10,6 +10,7 @@ import platform
 import resource
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -91,6 +92,18 @@ def limit_memory(most_bytes: int) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     at_most = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (at_most, hard))
+
+
+def limit_processor_time(seconds: float) -> None:
+    """From now on this process may take so much processor time, and is ended by the kernel (SIGXCPU) if it takes more:
+    a decoder that goes round in circles does so at the machine's expense. To be called again before each piece of work.
+
+    Args:
+        seconds: at most; a lower limit that the process has already stays.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    at_most = math.ceil(time.process_time() + seconds)
+    resource.setrlimit(resource.RLIMIT_CPU, (at_most if hard == resource.RLIM_INFINITY else min(at_most, hard), hard))
 
 
 def usable_cores() -> int:

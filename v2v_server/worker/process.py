@@ -32,6 +32,7 @@ from v2v_server.system.process import (
     give_way,
     keep_freed_memory,
     limit_memory,
+    limit_processor_time,
     resident_bytes,
     take_long_turns,
 )
@@ -58,6 +59,9 @@ _SOON_FETCHED_BYTES = 32 << 20
 """A video up to this size is waited for with its leases in hand; they are for others while a larger one comes."""
 LARGEST_MEMORY_BYTES = 8 << 30
 """Four times the frames of the largest clip that a lease may have; who needs more ends, and its sample is refused."""
+LONGEST_LEASE_SECONDS = 3600.0
+"""Of processor time, for one lease. The server gives up its own workers sooner, by the clock; one elsewhere would go on
+for ever."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; a routing identity has 255 at most."""
 _MORE = int(zmq.SNDMORE)
@@ -190,6 +194,7 @@ class Worker:
             case Make(lease):
                 if not self._clips.has(lease):
                     give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
+                limit_processor_time(LONGEST_LEASE_SECONDS)
                 note(self._logbook, lease.lease, decodes=True)
                 try:
                     made: tuple[Frames, Spent] | VideoError = self._made(lease)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -99,6 +100,21 @@ def test_a_limit_of_memory_only_ever_becomes_lower() -> None:
         "except MemoryError: print('refused')\n"
     )
     assert said == [str(1 << 30), str(1 << 29), "refused"]
+
+
+def test_a_piece_of_work_that_takes_too_much_processor_time_ends_its_process() -> None:
+    program = (
+        "from v2v_server.system.process import limit_processor_time\n"
+        "import time\n"
+        "for _ in range(3):\n"
+        "    limit_processor_time(1.0)\n"
+        "    until = time.process_time() + 0.5\n"
+        "    while time.process_time() < until: pass\n"
+        "print('three pieces', flush=True)\n"
+        "while True: pass\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.stdout, done.returncode) == ("three pieces\n", -signal.SIGXCPU)
 
 
 def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,8 +130,8 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
             pass
 
     monkeypatch.setattr(worker_module, "Worker", Named)
-    for asks_the_system in ("keep_freed_memory", "limit_memory", "warm_up_in_turn", "take_long_turns"):
-        monkeypatch.setattr(worker_module, asks_the_system, lambda *_: None)
+    for asks_the_system in ("keep_freed_memory", "limit_memory", "confine", "warm_up_in_turn", "take_long_turns"):
+        monkeypatch.setattr(worker_module, asks_the_system, lambda *_, **__: None)
     monkeypatch.setattr(worker_module, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
     monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
