@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 from torch.utils.data import DataLoader
 
@@ -33,6 +35,13 @@ def flags(keys: Path) -> list[str]:
     return ["--keys", str(keys / "keys"), "--worker-bind", "tcp://127.0.0.1:*", *SMALL_FLAGS]
 
 
+def told_by_the_system(pids: list[int]) -> str:
+    """Command lines and environments, as ``ps`` shows them, of these processes and their children."""
+    processes = [psutil.Process(pid) for pid in pids]
+    processes += [child for each in processes for child in each.children(recursive=True)]
+    return "\n".join(f"{each.cmdline()} {each.environ()}" for each in processes)
+
+
 def test_loader_workers_inherit_a_key(clips: Path, keys: Path) -> None:
     with LocalServer(clips, workers=1, flags=flags(keys)) as server:
         dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL)
@@ -57,6 +66,11 @@ def test_workers_elsewhere_need_a_key_of_theirs(clips: Path, keys: Path) -> None
         try:
             batch = next(iter(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL)))
             assert batch.voxels.shape[0] == 3
+            secrets = [read_key(keys / f"{name}.key").secret for name in ("gpu", "cpu")]
+            secrets.append(json.loads((keys / "keys" / "server.key").read_text())["secret"])
+            shown = told_by_the_system([worker.pid, server.pid])
+            assert str(keys / "cpu.key") in shown  # names of files are what is shown
+            assert not [secret for secret in secrets if secret in shown + server.last_lines()]
         finally:
             worker.terminate()
             assert worker.wait(60) == 0
