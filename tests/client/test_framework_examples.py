@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +18,13 @@ from torchdata.stateful_dataloader import StatefulDataLoader
 from tests.client.fake_server import FakeServer
 from v2v_client import Batch, UsageError, V2VStreamDataset
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "frameworks.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "guides" / "frameworks.md"
 EXAMPLES = re.findall(r"^## (.+?)\n\n```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
 
 
-OTHERS = {"Lightning": "lightning", "accelerate": "accelerate"}
-"""Examples that need a package which only the extra ``frameworks`` brings."""
+OTHERS = ("torchrun", "Lightning", "accelerate")
+"""Examples that a framework runs, and not a plain loop."""
 OURS = {name: text for name, text in EXAMPLES if name not in OTHERS}
 
 
@@ -53,10 +57,61 @@ def test_an_example_resumes_where_it_was(text: str) -> None:
     assert taken == list(range(20))
 
 
+RANK = """
+import os
+import torch
+from pathlib import Path
+from v2v_client import V2VStreamDataset
+
+ADDRESS = {address!r}
+trained = 0
+
+
+def train(batch):
+    global trained
+    torch.distributed.barrier()  # as backward() of a network that all ranks train: none is ahead by more than a batch
+    if trained == 1 and Path("first").exists():
+        raise SystemExit("a crash")
+    trained += 1
+    with Path("taken").open("a") as file:
+        print(*batch.indices, file=file)
+
+
+"""
+
+
+@pytest.mark.slow
+def test_the_example_of_torchrun_resumes_where_it_was(tmp_path: Path) -> None:
+    """All ranks crash in their second batch; the same command goes on. 23 sequences, 2 ranks, batches of 4: two batches
+    for each rank."""
+    text = dict(EXAMPLES)["torchrun"]
+    (command,) = re.findall(r"^ {4}torchrun (.*)$", PAGE.read_text(encoding="utf-8"), re.M)
+    with FakeServer(sequences=23, credit=8) as server:
+        (tmp_path / "train.py").write_text(RANK.format(address=server.address) + text, encoding="utf-8")
+        (tmp_path / "first").touch()
+        first = torchrun(command, tmp_path)
+        (tmp_path / "first").unlink()
+        second = torchrun(command, tmp_path)
+    assert first.returncode == 1, first.stderr
+    assert "a crash" in first.stderr
+    assert second.returncode == 0, second.stderr
+    taken = [int(index) for index in (tmp_path / "taken").read_text().split()]
+    assert sorted(taken) == list(range(16))
+
+
+def torchrun(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The command as a shell would run it, but of this environment; SIGTERM of `timeout` ends its ranks, too."""
+    return subprocess.run(
+        ["timeout", "120", sys.executable, "-m", "torch.distributed.run", *command.split()],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
 def test_the_example_of_accelerate_resumes_where_it_was() -> None:
-    accelerate = pytest.importorskip("accelerate", reason="accelerate is not installed; the extra frameworks has it")
+    accelerate = importlib.import_module("accelerate")  # slow to import, and without types
     taken: list[int] = []
     with FakeServer(sequences=23, credit=8) as server:
         names = {"ADDRESS": server.address, "train": lambda batch: taken.extend(batch.indices), "torch": torch}
@@ -75,7 +130,7 @@ def test_the_example_of_accelerate_resumes_where_it_was() -> None:
 @pytest.mark.parametrize("workers", [None, 0, 2])
 def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, workers: int | None) -> None:
     """The checkpoint is written after two batches; the crash comes in the fourth. Workers: of a StatefulDataLoader."""
-    lightning = pytest.importorskip("lightning", reason="lightning is not installed; the extra frameworks has it")
+    lightning = importlib.import_module("lightning")
     callbacks = importlib.import_module("lightning.pytorch.callbacks")
     taken: list[int] = []
 
