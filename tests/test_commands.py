@@ -1,14 +1,20 @@
-"""Every command line that the documentation, `deploy/` and the examples show: its flags are those of the program."""
+"""Every command line that the documentation, `deploy/` and the examples show: its flags are those of the program, and a
+line of a code block is read by the program's own parser, on whatever machine it is meant to run."""
 
 from __future__ import annotations
 
 import argparse
 import re
+import shlex
+import sys
+import tomllib
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from v2v_bench.cli import BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -27,7 +33,13 @@ MODULES = {
     "v2v-eval": "trainer.evaluation.cli",
     "v2v-convert": "trainer.convert.cli",
 }
-"""`v2v-bench` and `make` have commands of their own."""
+_LAUNCHED = {
+    "trainer.train": "trainer.train",
+    "examples/overfit.py": "examples.overfit",
+    "examples.ray_train": "examples.ray_train",
+}
+"""What `python` and `torchrun` start beside benchmarks."""
+_STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
     for pattern in ("README.md", "docs/*.md", "docs/guides/*.md", "docs/reference/*.md", "deploy/**/*", "examples/*.py")
@@ -44,20 +56,27 @@ class _Caught(Exception):
 
 
 @cache
-def flags_of(program: str) -> frozenset[str]:
-    """All flags that the program's own parser knows."""
-    module = import_module(MODULES[program])
+def parser_of(module: str) -> argparse.ArgumentParser:
+    """The parser with which the ``main`` of a module reads its command line."""
     found: list[argparse.ArgumentParser] = []
 
     def parse(self: argparse.ArgumentParser, *_: object) -> None:
         found.append(self)
         raise _Caught
 
+    main = import_module(module).main
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(argparse.ArgumentParser, "parse_args", parse)
+        patch.setattr(argparse.ArgumentParser, "parse_known_args", parse)
+        patch.setattr(sys, "argv", ["program"])
         with pytest.raises(_Caught):
-            module.main([])
-    return frozenset(found[0]._option_string_actions)
+            main()
+    return found[0]
+
+
+def flags_of(program: str) -> frozenset[str]:
+    """All flags that the program's own parser knows."""
+    return frozenset(parser_of(MODULES[program])._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
@@ -99,6 +118,100 @@ def test_images_start_programs_with_flags_of_theirs() -> None:
     assert set(_FLAG.findall(" ".join(lists).replace('"', " "))) <= flags_of("v2v-serve")
     (train,) = re.findall(r"command: (\[\"\$.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M)
     assert set(_FLAG.findall(train.replace('"', " "))) <= flags_of("v2v-train")
+
+
+def block_lines(text: str) -> list[list[str]]:
+    """The words of each line of the code blocks of a page: without the prompt that says on which host, and without
+    variables of the environment."""
+    text = re.sub(r" *\\\n\s*", " ", re.sub(r"^```python.*?^```", "", text, flags=re.M | re.S))
+    lines = re.findall(
+        r"^ {4}(?:\w+\$ +)?((?:[A-Z_]+=\S+ )*(?:v2v-|uvx |torchrun |python |pip |make |pytest ).*)$", text, re.M
+    )
+    lines += re.findall(r"`((?:uvx|torchrun|python -m|pip|make|pytest) [^`]+)`", text)
+    return [shlex.split(re.sub(r"^(?:[A-Z_]+=\S+ )+", "", line), comments=True) for line in lines]
+
+
+def wrong_with(words: list[str]) -> str:
+    """What is wrong with a command line, or nothing."""
+    program, *rest = words
+    if program == "uvx":
+        return wrong_with(rest[rest.index("--from") + 2 :])
+    if program == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M)
+        return "" if set(rest) <= set(targets) else f"make knows {targets}"
+    if program == "pip":
+        extras = re.findall(r"\[([a-z,]+)\]", " ".join(rest))
+        known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        return "" if set(",".join(extras).split(",")) <= {*known, ""} else f"extras are {sorted(known)}"
+    if program == "pytest":
+        missing = [word for word in rest if word.startswith("tests/") and not (ROOT / word).exists()]
+        return f"there is no {missing}" if missing else ""
+    if program in ("python", "torchrun"):
+        return _wrong_with_launched(rest)
+    if program == "v2v-bench":
+        return _refused(f"v2v_bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
+    return _refused(MODULES[program], rest) if program in MODULES else "no program"
+
+
+def _wrong_with_launched(words: list[str]) -> str:
+    """Of what comes after `python` or `torchrun`: flags of theirs, then -m MODULE or a script, then its own."""
+    if words[:1] == ["-c"]:
+        return ""
+    at = words.index("-m") + 1 if "-m" in words else next(n for n, word in enumerate(words) if word.endswith(".py"))
+    started, rest = words[at], words[at + 1 :]
+    if started in _STANDS_FOR_ANY:
+        return ""
+    if started == "pytest":
+        return wrong_with(["pytest", *rest])
+    module = started if started.removeprefix("v2v_bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
+    return "nothing that can be started" if module is None else _refused(module, rest)
+
+
+def _refused(module: str, given: list[str]) -> str:
+    try:
+        parser_of(module).parse_args(given)
+    except SystemExit as ended:
+        return "" if not ended.code else f"its own parser refuses {given}"
+    return ""
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
+def test_lines_of_code_blocks_are_read_by_their_programs(page: Path) -> None:
+    lines = block_lines(page.read_text(encoding="utf-8"))
+    assert [f"{shlex.join(words)}: {wrong}" for words in lines if (wrong := wrong_with(words))] == []
+
+
+def test_what_is_wrong_with_a_line_is_seen() -> None:
+    text = """
+    head$  KEY=a v2v-serve --videos DIR \\
+        --workers 8   # and so on
+    torchrun --nproc-per-node 2 -m trainer.train e2vid --connect A
+"""
+    serve, train = block_lines(text)
+    assert serve == ["v2v-serve", "--videos", "DIR", "--workers", "8"]
+    assert wrong_with(serve) == wrong_with(train) == ""
+    for line in (
+        "v2v-serve --videos DIR --workers many", "v2v-serve --video DIR", "v2v-service", "make tests",
+        "v2v-bench nothing", "v2v-bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
+        "python -m v2v_bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
+        "pytest tests/none.py",
+    ):  # fmt: skip
+        assert wrong_with(shlex.split(line)), line
+
+
+BARE = re.compile(r"`(--[a-z][a-z-]*)[^`]*`")
+PROGRAM = re.compile(r"`(v2v-[a-z]+)[ `]")
+
+OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone": "torchrun", "--shm-size": "docker"}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
+def test_programs_and_flags_that_are_named_alone_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-bench", "v2v-stream", "v2v-workers"}
+    named = set(BARE.findall(text)) - set(OF_OTHERS)
+    modules = [*MODULES.values(), *(f"v2v_bench.{module}" for module in BENCHMARKS.values())]
+    assert named <= {flag for module in modules for flag in parser_of(module)._option_string_actions}
 
 
 def test_pages_with_command_lines_are_many() -> None:
