@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import os
 from collections.abc import KeysView, Mapping
@@ -98,17 +97,11 @@ class Batch:
         return look.picture(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
     def _repr_png_(self) -> bytes | None:
-        try:
-            return look.png(self._picture())
-        except UsageError:  # no picture can be made of it: a notebook goes on with the text
-            return None
+        return look.png_or_none(self._picture)
 
     def _repr_html_(self) -> str:
         rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
-        table, image = html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows), self._repr_png_()
-        return (
-            table if image is None else f'{table}<img src="data:image/png;base64,{base64.b64encode(image).decode()}">'
-        )
+        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + look.img(self._repr_png_())
 
     @property
     def voxels(self) -> torch.Tensor | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Unpack
 
 import torch
@@ -23,6 +24,43 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sam
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 from v2v_protocol.tables import html_table
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ShownSample(Sample):
+    """A sample that shows itself in a notebook.
+
+    Attributes:
+        frames_per_bin: of the recipe; a pause is a run of repeated frames.
+        title: of its picture.
+    """
+
+    frames_per_bin: int
+    title: str
+
+    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """The sample as a picture, which a notebook displays.
+
+        Args:
+            path: a PNG to write too.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: voxels or frames were not asked for, the file cannot be written, or pillow or av is not
+                installed.
+        """
+        return look.shown(self._picture(), path)
+
+    def _picture(self) -> Any:
+        return look.picture([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
+
+    def _repr_png_(self) -> bytes | None:
+        return look.png_or_none(self._picture)
+
+    def _repr_html_(self) -> str:
+        return Sample._repr_html_(self) + look.img(self._repr_png_())
 
 
 class V2VDataset(Dataset[Sample]):
@@ -75,7 +113,7 @@ class V2VDataset(Dataset[Sample]):
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> ShownSample:
         """The sample of this index.
 
         Raises:
@@ -86,7 +124,8 @@ class V2VDataset(Dataset[Sample]):
         if not 0 <= place < self._length:
             raise IndexError(f"index {index}: the epoch has {self._length} samples")
         sample: Sample = self._opened().sample(self.seed, self.epoch, place)
-        return sample
+        title = f"Sample {place} of {self._length}"
+        return ShownSample(sample.arrays, sample.provenance, self.spec.recipe.frames_per_bin, title)
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch: other cameras and another order. Before a DataLoader starts its workers."""
@@ -102,22 +141,8 @@ class V2VDataset(Dataset[Sample]):
         return html_table(f"V2VDataset of {self._source[0]}", rows | {"seed": self.seed, "epoch": self.epoch})
 
     def show(self, index: int = 0, path: str | os.PathLike[str] | None = None) -> Any:
-        """One sample as a picture, which a notebook displays.
-
-        Args:
-            index: of the sample.
-            path: a PNG to write too.
-
-        Returns:
-            A PIL image.
-
-        Raises:
-            UsageError: voxels or frames were not asked for, or pillow or av is not installed.
-        """
-        sample = self[index]
-        title = f"Sample {sample.provenance.id.index} of {len(self)}"
-        image = look.picture([(sample.arrays, sample.provenance)], self.spec.recipe.frames_per_bin, title)
-        return look.shown(image, path)
+        """One sample as a picture, which a notebook displays: ``dataset[index].show(path)``."""
+        return self[index].show(path)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}

@@ -3,10 +3,11 @@ than a consumer does."""
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import importlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,19 @@ def png(image: npt.NDArray[np.uint8]) -> bytes:
     """The picture as PNG."""
     encoded: bytes = _drawing("files").png_bytes(image)
     return encoded
+
+
+def png_or_none(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
+    """The picture as PNG, or None where none can be made: a notebook goes on with the text."""
+    try:
+        return png(draw())
+    except UsageError:
+        return None
+
+
+def img(encoded: bytes | None) -> str:
+    """A PNG as HTML; nothing for None."""
+    return "" if encoded is None else f'<img src="data:image/png;base64,{base64.b64encode(encoded).decode()}">'
 
 
 def shown(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:

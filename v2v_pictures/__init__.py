@@ -5,6 +5,7 @@
     camera.py    one simulated clip as its virtual camera saw it: activity over time, pauses, moments worth showing
     strip.py     a camera's activity over its clip
     sheet.py     a page of cameras: frame, bins, flow, with headings and legend
+    grids.py     voxel grids of which nothing else is known
     film.py      the same clips as a film
     files.py     PNG, GIF, MP4, and one HTML file that holds both
 

@@ -21,9 +21,10 @@ from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
 MARGIN_PX, GAP_PX = 28, 8
 _TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 64, 58, 38, 54, 132
+SCALE_PX = 341
 _BETWEEN_PX = 26
 _LEAST_SOURCE_PX = 120
-_MOST_BINS = 8
+MOST_BINS = 8
 _ARROWS = 4
 """Arrows along a side of a panel of flow: colours alone are not told apart by everybody."""
 _STILL = 0.15
@@ -64,7 +65,7 @@ def draw_sheet(cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_
         [height, width, 3] uint8 RGB.
     """
     scale = Scale.of(cameras)
-    bins = min(cameras[0].voxels.shape[1], _MOST_BINS)
+    bins = min(cameras[0].voxels.shape[1], MOST_BINS)
     with_flow = cameras[0].flow is not None
     columns = 1 + bins + with_flow
     width = 2 * MARGIN_PX + columns * (tile_px + GAP_PX) + 2 * 2 * GAP_PX
@@ -105,18 +106,23 @@ def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px
     y, below = _TITLE_PX, _TITLE_PX + 27
     page.text(left[0] + tile_px / 2, y, "video frame", size=canvas.HEADING_PT, anchor="ma")
     page.text(left[0] + tile_px / 2, below, "at the end of the bins", colour=canvas.SOFT, anchor="ma")
-    end = left[bins] + tile_px
     events_heading(page, left[1], y)
-    for number in range(bins):
-        x = page.text(left[1 + number], below, f"bin {number + 1}", colour=canvas.SOFT)
-        if number + 1 < bins:
-            page.arrow(x + 10, below + 11, left[2 + number] - 6)
-        else:
-            page.arrow(x + 10, below + 11, end - canvas.text_width("time") - 8)
-            page.text(end, below, "time", colour=canvas.SOFT, anchor="ra")
+    bin_headings(page, left[1 : 1 + bins], below, tile_px)
     if with_flow:
         page.text(left[-1] + tile_px / 2, y, "optical flow", size=canvas.HEADING_PT, anchor="ma")
         page.text(left[-1] + tile_px / 2, below, "over the voxel grid", colour=canvas.SOFT, anchor="ma")
+
+
+def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> None:
+    """The bins' numbers over their panels, and arrows of time between them."""
+    for number, x in enumerate(left):
+        x_end = page.text(x, y, f"bin {number + 1}", colour=canvas.SOFT)
+        if number + 1 < len(left):
+            page.arrow(x_end + 10, y + 11, left[number + 1] - 6)
+        else:
+            end = x + tile_px
+            page.arrow(x_end + 10, y + 11, end - canvas.text_width("time") - 8)
+            page.text(end, y, "time", colour=canvas.SOFT, anchor="ra")
 
 
 def events_heading(page: Canvas, x: float, y: float, what: str = "simulated events:") -> None:
@@ -182,7 +188,7 @@ def _camera_line(page: Canvas, camera: Camera, number: int, top: int) -> None:
 def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[int], y: int, tile_px: int) -> None:
     page.panel(left[0], y, draw_grey(camera.frames[pick]), tile_px, tile_px)
     bins = camera.voxels.shape[1]
-    for number in range(min(bins, _MOST_BINS)):
+    for number in range(min(bins, MOST_BINS)):
         page.panel(left[1 + number], y, draw_events(camera.voxels[pick, number], scale.full), tile_px, tile_px)
         if camera.paused[pick * bins + number]:
             label(page, left[1 + number] + 5, y + 5, "paused")
@@ -192,14 +198,8 @@ def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[in
 
 def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> None:
     page.line(MARGIN_PX, top, page.width_px - MARGIN_PX, top, canvas.LINE)
-    y, x, width = top + 42, MARGIN_PX, 341
-    ramp = np.linspace(-scale.full, scale.full, width, dtype=np.float32)[None].repeat(20, axis=0)
-    page.text(x + width / 2, y - 26, "events a pixel and bin", anchor="ma")
-    page.panel(x, y, draw_events(ramp, scale.full), width, 20)
-    page.text(x, y + 26, f"{scale.full:.0f} or more darker", colour=DARKER)
-    page.text(x + width / 2, y + 26, "none", colour=canvas.SOFT, anchor="ma")
-    page.text(x + width, y + 26, f"{scale.full:.0f} or more brighter", colour=BRIGHTER, anchor="ra")
-    x, y = x + width + 44, top + 16
+    draw_scale(page, scale.full, MARGIN_PX, top + 16)
+    x, y = MARGIN_PX + SCALE_PX + 44, top + 16
     page.hatch(x, y + 1, x + 46, y + 19)
     page.frame(x, y + 1, x + 46, y + 19)
     page.text(x + 58, y, "the camera is paused: its picture stands still, only noise fires")
@@ -215,3 +215,13 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
         page.panel(x, top + 18, draw_wheel(radius), 2 * radius + 1, 2 * radius + 1)
         page.text(x - 14, y, "flow: where a pixel moves to", anchor="ra")
         page.text(x - 14, y + 28, f"rim: {scale.largest_px:.1f} px or more", colour=canvas.SOFT, anchor="ra")
+
+
+def draw_scale(page: Canvas, full: float, x: int, y: int) -> None:
+    """The scale of events, SCALE_PX wide: which colour is how many of which sign."""
+    ramp = np.linspace(-full, full, SCALE_PX, dtype=np.float32)[None].repeat(20, axis=0)
+    page.text(x + SCALE_PX / 2, y, "events a pixel and bin", anchor="ma")
+    page.panel(x, y + 26, draw_events(ramp, full), SCALE_PX, 20)
+    page.text(x, y + 52, f"{full:.0f} or more darker", colour=DARKER)
+    page.text(x + SCALE_PX / 2, y + 52, "none", colour=canvas.SOFT, anchor="ma")
+    page.text(x + SCALE_PX, y + 52, f"{full:.0f} or more brighter", colour=BRIGHTER, anchor="ra")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from torch.utils.data import DataLoader
 from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset, look
 from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_pictures.colours import BRIGHTER
+from v2v_server.simulation import simulate
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 4, "crop_height_px": 48, "crop_width_px": 48}
 NAME = "<img src=x>&.mp4"
@@ -45,10 +48,35 @@ def test_a_batch_shows_itself_as_text_table_and_picture(dataset: V2VDataset) -> 
         alone.show()
 
 
+def test_a_sample_shows_itself_as_text_table_and_picture(dataset: V2VDataset, tmp_path: Path) -> None:
+    sample = dataset[0]
+    assert repr(sample).startswith("Sample(voxels: int8[4, 5, 48, 48], ")
+    assert sample._repr_png_().startswith(b"\x89PNG")
+    assert "data:image/png;base64," in sample._repr_html_()
+    assert np.array_equal(np.asarray(sample.show(tmp_path / "a.png")), np.asarray(dataset.show(0)))
+    assert (tmp_path / "a.png").exists()
+    alone = dataclasses.replace(sample, arrays={"voxels": sample.arrays["voxels"]})
+    assert alone._repr_png_() is None
+    assert "drawn: threshold_pos" in alone._repr_html_()
+    assert pickle.loads(pickle.dumps(sample)).title == sample.title
+
+
+def test_a_simulated_result_shows_itself(tmp_path: Path) -> None:
+    result = simulate(panned_luma(31, 40, 50), threshold_pos=0.2)
+    assert repr(result) == "Voxels(int8[6, 5, 40, 50], 0 bins saturated)"
+    image = result.show(tmp_path / "b.png")
+    assert (np.asarray(image) == BRIGHTER).all(axis=-1).any()
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "b.png")), np.asarray(image))
+    assert result._repr_png_() == (tmp_path / "b.png").read_bytes()
+    assert "data:image/png;base64," in result._repr_html_()
+    few = simulate(panned_luma(2, 8, 8), threshold_pos=0.2, bins=1)
+    assert few.show().height < image.height
+
+
 def test_a_file_name_is_no_markup(dataset: V2VDataset) -> None:
     sample = dataset[0]
     for shown in (sample._repr_html_(), sample.provenance._repr_html_()):
-        assert "<img" not in shown
+        assert "<img src=x" not in shown
         assert "&lt;img src=x&gt;&amp;.mp4" in shown
         assert "drawn: threshold_pos" in shown
 

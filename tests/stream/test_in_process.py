@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,14 +14,19 @@ from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
 from tests.stream.conftest import SMALL, digest, epoch_of
-from v2v_client import Batch, UsageError, V2VDataset
+from v2v_client import Batch, UsageError, V2VDataset, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import CorpusError
 
 
 @pytest.fixture(scope="module")
-def dataset(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> V2VDataset:
-    return V2VDataset(clips, recipe=SMALL, seed=3, cache_dir=str(tmp_path_factory.mktemp("index")))
+def index_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("index")
+
+
+@pytest.fixture(scope="module")
+def dataset(clips: Path, index_folder: Path) -> V2VDataset:
+    return V2VDataset(clips, recipe=SMALL, seed=3, cache_dir=str(index_folder))
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +46,51 @@ def test_a_sample_is_that_of_the_stream(
     np.testing.assert_array_equal(sample.arrays["voxels"], batch.voxels[0].numpy())
     np.testing.assert_array_equal(sample.arrays["frames"], batch.frames[0].numpy())
     assert sample.provenance == batch.provenance[0]
+
+
+_RANGES = {
+    "threshold": st.sampled_from(([0.1, 0.1], [0.2, 1.0])),
+    "noise_sigma": st.sampled_from(([0, 0], [0.01, 0.05])),
+    "pause_probability": st.sampled_from((0.0, 0.2)),
+    "resize_scale": st.sampled_from(([1, 1], [0.8, 1.3])),
+    "contrast_probability": st.sampled_from((0.0, 1.0)),
+    "noise_unit": st.sampled_from(("frame", "second")),
+    "leak_hz": st.sampled_from((0.0, [0.1, 1.0])),
+    "threshold_mismatch_sigma": st.sampled_from((0.0, [0.0, 0.2])),
+    "lead_frames": st.integers(0, 1),
+    "frame_stride": st.integers(1, 2),
+}
+
+
+@pytest.mark.slow
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    shape=st.fixed_dictionaries(
+        {"voxels_per_clip": st.integers(1, 4), "bins": st.integers(1, 5), "frames_per_bin": st.integers(1, 2)}
+    ),
+    fields=st.fixed_dictionaries({}, optional=_RANGES),
+    side=st.integers(8, 36),
+    flow=st.booleans(),
+    dtype=st.sampled_from(("int8", "int16", "float32")),
+    seed=st.integers(0, 2**64 - 1),
+    epoch=st.integers(0, 1000),
+)
+def test_a_sample_of_any_recipe_is_that_of_the_stream(
+    clips: Path, index_folder: Path, server: LocalServer, shape: dict[str, int], fields: dict[str, Any], side: int, flow: bool,
+    dtype: str, seed: int, epoch: int,
+) -> None:  # fmt: skip
+    recipe = {"preset": "paper", **shape, **fields, "crop_height_px": side, "crop_width_px": side + 1}
+    arrays = ("voxels", "frames", *(("flow", "flow_valid") if flow else ()))
+    given_ = {"recipe": recipe, "arrays": arrays, "seed": seed, "epoch": epoch, "voxel_dtype": dtype}
+    stream = iter(V2VStreamDataset(server.address, batch_size=2, **given_))
+    batch = next(stream)
+    del stream
+    alone = V2VDataset(clips, cache_dir=str(index_folder), **given_)
+    for place, index in enumerate(batch.indices):
+        sample = alone[index]
+        assert sample.provenance == batch.provenance[place]
+        for name in arrays:
+            np.testing.assert_array_equal(sample.arrays[name], batch[name][place].numpy())
 
 
 def test_it_is_a_sequence(dataset: V2VDataset) -> None:

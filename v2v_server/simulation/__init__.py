@@ -8,6 +8,7 @@ analytic scenes); :func:`simulate_clip` is what the server worker calls. The pix
     grey.py       frames of any usual kind to grey levels
     intensity.py  from grey level to log intensity and to light
     clip.py       simulating a clip: arguments checked, noise prepared, kernel called
+    result.py     what it returns
     pixel.py      the kernel: all pixels, all steps, one pass
     noise.py      its random numbers: the definition
     voxel.py      steps, bins and dtypes: the definition
@@ -22,7 +23,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from v2v_server.simulation.clip import Voxels, simulate, simulate_clip, simulate_log
+    from v2v_server.simulation.clip import simulate, simulate_clip, simulate_log
+    from v2v_server.simulation.result import Voxels
 
 __all__ = ["Voxels", "simulate", "simulate_clip", "simulate_log"]
 
@@ -30,7 +32,7 @@ __all__ = ["Voxels", "simulate", "simulate_clip", "simulate_log"]
 def __getattr__(name: str) -> Any:
     # The schedule imports draw.py in a process that never simulates; the compiler is loaded on first use only.
     if name in __all__:
-        from v2v_server.simulation import clip
+        from v2v_server.simulation import clip, result
 
-        return getattr(clip, name)
+        return getattr(result if name == "Voxels" else clip, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.events import EventList, to_events
 from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import require_known
@@ -23,24 +22,8 @@ from v2v_server.simulation.grey import grey_levels
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
+from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
-
-
-class Voxels(NamedTuple):
-    """What a simulation returns.
-
-    Attributes:
-        voxels: [T, bins, H, W] signed event counts.
-        saturated_bins: how many bins were clipped to what the dtype holds.
-    """
-
-    voxels: npt.NDArray[Any]
-    saturated_bins: int
-
-    def to_events(self, bin_us: float) -> EventList:
-        """Events (x, y, t, p) with these counts, for bins of ``bin_us`` microseconds. Their times within a bin are
-        invented, by the rule of ``v2v_protocol.events``."""
-        return to_events(self.voxels, bin_us)
 
 
 def simulate(

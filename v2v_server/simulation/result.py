@@ -1,0 +1,73 @@
+"""What a simulation returns, and how it shows itself in a notebook."""
+
+from __future__ import annotations
+
+import base64
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy.typing as npt
+
+from v2v_protocol.events import EventList, to_events
+from v2v_protocol.tables import html_table
+
+
+class Voxels(NamedTuple):
+    """What a simulation returns.
+
+    Attributes:
+        voxels: [T, bins, H, W] signed event counts.
+        saturated_bins: how many bins were clipped to what the dtype holds.
+    """
+
+    voxels: npt.NDArray[Any]
+    saturated_bins: int
+
+    def to_events(self, bin_us: float) -> EventList:
+        """Events (x, y, t, p) with these counts, for bins of ``bin_us`` microseconds. Their times within a bin are
+        invented, by the rule of ``v2v_protocol.events``.
+
+        Raises:
+            UsageError: a duration out of range.
+        """
+        return to_events(self.voxels, bin_us)
+
+    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Up to four voxel grids as a picture, bin by bin, which a notebook displays.
+
+        Args:
+            path: a PNG to write too.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: the file cannot be written.
+        """
+        from PIL import Image
+
+        from v2v_pictures.files import write_png
+
+        image = self._picture()
+        if path is not None:
+            write_png(Path(path), image)
+        return Image.fromarray(image)
+
+    def __repr__(self) -> str:
+        return f"Voxels({self.voxels.dtype}{list(self.voxels.shape)}, {self.saturated_bins} bins saturated)"
+
+    def _picture(self) -> Any:
+        from v2v_pictures.grids import draw_grids  # drawing is for people: a worker never loads it
+
+        return draw_grids(self.voxels)
+
+    def _repr_png_(self) -> bytes:
+        from v2v_pictures.files import png_bytes
+
+        return png_bytes(self._picture())
+
+    def _repr_html_(self) -> str:
+        shape = f"{self.voxels.dtype} {list(self.voxels.shape)}"
+        table = html_table("Voxels", {"voxels": shape, "saturated_bins": self.saturated_bins})
+        return f'{table}<img src="data:image/png;base64,{base64.b64encode(self._repr_png_()).decode()}">'
