@@ -76,8 +76,8 @@ _RANGES = {
     epoch=st.integers(0, 1000),
 )
 def test_a_sample_of_any_recipe_is_that_of_the_stream(
-    clips: Path, index_folder: Path, server: LocalServer, shape: dict[str, int], fields: dict[str, Any], side: int, flow: bool,
-    dtype: str, seed: int, epoch: int,
+    clips: Path, index_folder: Path, server: LocalServer, shape: dict[str, int], fields: dict[str, Any], side: int,
+    flow: bool, dtype: str, seed: int, epoch: int,
 ) -> None:  # fmt: skip
     recipe = {"preset": "paper", **shape, **fields, "crop_height_px": side, "crop_width_px": side + 1}
     arrays = ("voxels", "frames", *(("flow", "flow_valid") if flow else ()))
