@@ -74,7 +74,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
         seed: of all random draws and of the order.
         epoch: the first one.
-        rank, world_size: those of torch.distributed when it is initialised, else 0 and 1.
+        rank: of this process; None: that of torch.distributed when it is initialised, else 0.
+        world_size: how many ranks share an epoch; None: that of torch.distributed, else 1.
         shared_memory: whether server workers on this host may put samples into memory of this process, which saves
             most of what moving them costs; where they cannot, samples come in messages by themselves.
         compress: whether samples shall be compressed on their way here, which takes a server worker some 5 % of their

@@ -78,7 +78,8 @@ class V2VDataset(Dataset[Sample]):
         videos: folder tree of videos, a single video, or a list file.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe.
         arrays: which of "voxels", "frames", "flow" and "flow_valid" to make.
-        seed, epoch: of the stream.
+        seed: of the stream.
+        epoch: of the stream.
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None: the user's cache.

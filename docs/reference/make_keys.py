@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.presets import PRESET_FIELDS
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import EFFECTS, Recipe
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
 from v2v_server.config import ServeConfig
@@ -28,6 +28,28 @@ Where a key can be written:
 
 What a consumer asks for wins over what the server has as its default. A range is drawn from uniformly, afresh for each sample; one number fixes the value.
 """
+
+_SHIPPED, _FLOW, _OURS = "V2V's released training configurations", "V2V's flow networks", "this project"
+SOURCES = dict.fromkeys(
+    (
+        "voxels_per_clip", "bins", "frames_per_bin", "crop_height_px", "crop_width_px", "resize_scale",
+        "flip_probability", "pause_probability", "pause_stay_probability", "threshold", "threshold_ratio",
+        "noise_sigma", "hot_pixel_share", "hot_pixel_sigma",
+    ),
+    _SHIPPED,
+) | {
+    "lead_frames": _FLOW,
+    "lead_voxels": _FLOW,
+    "contrast_probability": "V2V's ablation LDR, there 0.8",
+    "contrast_scale": "V2V's ablation LDR",
+    "gamma": "V2V's released code",
+    "log_eps": "V2V's released code",
+    "threshold_source": "V2V's ablation with fixed thresholds",
+    "noise_scales_with_threshold": "an option of V2V's released code",
+    "frame_stride": _OURS,
+    "noise_unit": _OURS,
+}  # fmt: skip
+"""Where a recipe's field and its default come from; those of the effects are on a page of their own."""
 
 
 def page() -> str:
@@ -50,9 +72,16 @@ def _section(title: str, cls: type[Any], *, flags: bool) -> Iterator[str]:
     for group, rows in groupby(shown, key=lambda row: row[1].group):
         if group != title:
             yield f"### {group}\n"
-        yield "| key | default | allowed | what it is |\n|---|---|---|---|"
-        yield from (_row(name, setting) for name, setting in rows)
+        sourced = cls is Recipe
+        yield "| key | default | allowed | what it is |" + (" source |" if sourced else "")
+        yield "|---|---|---|---|" + ("---|" if sourced else "")
+        for name, setting in rows:
+            yield _row(name, setting) + (f" {_source(name, group)} |" if sourced else "")
         yield ""
+
+
+def _source(name: str, group: str) -> str:
+    return "[effects](../effects.md#equations-and-sources)" if group == EFFECTS else SOURCES[name]
 
 
 def _row(name: str, setting: Setting) -> str:

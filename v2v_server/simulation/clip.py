@@ -50,14 +50,17 @@ def simulate(
     Args:
         frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or what ``grey.py`` makes these of: colour
             (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``.
-        threshold_pos, threshold_neg: contrast thresholds, log-intensity units; equal when only one is given.
+        threshold_pos: contrast threshold of brighter events, log-intensity units.
+        threshold_neg: that of darker events; None: the same.
         noise_sigma: standard deviation of the noise, log units per frame.
         hot_pixel_count: how many pixels drift by themselves.
         hot_pixel_sigma: standard deviation of their drift, log units per frame.
         start_residual: every pixel's residual before the first step, log units; None draws it uniformly between
             -threshold_neg and threshold_pos, as the paper does.
-        bins, frames_per_bin: shape of a voxel grid, see ``voxel.py``.
-        gamma, log_eps: see ``intensity.py``.
+        bins: of a voxel grid.
+        frames_per_bin: steps between frames that fall into one bin.
+        gamma: exponent of the reverse gamma correction (``intensity.py``).
+        log_eps: what is added inside the logarithm, as a share of white.
         seed: 0 .. 2**64 - 1; the same seed gives the same bytes.
         dtype: "int8", "int16" or "float32".
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
