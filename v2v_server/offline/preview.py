@@ -104,7 +104,7 @@ def preview(
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
     write(out, _content(out.suffix, cameras, title, moments))
-    say(f"{out}: {len(cameras)} cameras")
+    say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
 def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:

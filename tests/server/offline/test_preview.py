@@ -45,7 +45,7 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
     preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
     assert "all cameras: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
-    assert said[1] == f"{tmp_path / 'p.png'}: 1 cameras"
+    assert said[1] == f"{tmp_path / 'p.png'}: 1 camera"
 
 
 def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
