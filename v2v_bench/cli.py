@@ -39,6 +39,7 @@ BENCHMARKS = {
     "store": "tradeoff.store",
     "tradeoff": "tradeoff.tradeoff",
     "training_trade": "tradeoff.training_trade",
+    "matters": "tradeoff.matters",
     "flow": "accuracy.flow",
     "physics": "accuracy.physics",
     "sensor": "accuracy.sensor",

@@ -101,14 +101,14 @@ def judge_weights(weights: Path, batches: Sequence[Batch]) -> Judgement:
     return judge(prediction, torch.cat([batch.arrays["frames"] for batch in batches]) / 255.0)
 
 
-def train(address: str, preset: str, seed: int, limit: Sequence[str], out: Path) -> int:
-    """One run of `v2v-train`; returns the number of steps.
+def train(address: str, configuration: str, name: str, seed: int, settings: Sequence[str], out: Path) -> int:
+    """One run of `v2v-train`, called ``name`` where it fails; returns the number of steps.
 
     Raises:
         TrainingFailed: it ended with another status than 0.
     """
-    settings = [f"stream.seed={seed}", f"compute.seed={seed}", f"stream.spec={{preset: {preset}}}", *limit]
-    command = [sys.executable, "-m", "trainer.train", CONFIGURATION, "--connect", address, "--out", str(out)]
+    settings = [f"stream.seed={seed}", f"compute.seed={seed}", *settings]
+    command = [sys.executable, "-m", "trainer.train", configuration, "--connect", address, "--out", str(out)]
     done = subprocess.run(
         [*command, *(part for setting in settings for part in ("--set", setting))],
         capture_output=True,
@@ -116,7 +116,7 @@ def train(address: str, preset: str, seed: int, limit: Sequence[str], out: Path)
         check=False,
     )
     if done.returncode:
-        raise TrainingFailed(f"{preset}, seed {seed}: status {done.returncode}: {done.stderr.strip()[-500:]}")
+        raise TrainingFailed(f"{name}, seed {seed}: status {done.returncode}: {done.stderr.strip()[-500:]}")
     return load_checkpoint(out / LAST).step
 
 
@@ -135,7 +135,8 @@ def compare(asked: argparse.Namespace) -> list[dict[str, Any]]:
             for limit, settings in limits.items():
                 for preset in SPEED_PRESETS:
                     out = Path(folder) / f"{preset}-{seed}-{settings[0]}"
-                    steps = train(server.address, preset, seed, settings, out)
+                    changes = (f"stream.spec={{preset: {preset}}}", *settings)
+                    steps = train(server.address, CONFIGURATION, preset, seed, changes, out)
                     judgement = judge_weights(out / LAST, judges)
                     found.setdefault((preset, limit), []).append((steps, judgement))
                     words = f"{judgement.correlation:.3f}, {judgement.error_of_constant:.1%} of constant"
@@ -160,7 +161,8 @@ def _summary(runs: Sequence[tuple[int, Judgement]]) -> dict[str, float]:
     }
 
 
-def _seeds(text: str) -> tuple[int, ...]:
+def seeds(text: str) -> tuple[int, ...]:
+    """An argparse type: numbers separated by commas."""
     return tuple(int(part) for part in text.split(","))
 
 
@@ -179,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--videos", required=True, help="to train on")
     parser.add_argument("--held-out", required=True, help="videos to judge by")
     parser.add_argument("--rows", default="full", help="of --videos")
-    parser.add_argument("--seeds", type=_seeds, default=(0, 1, 2), metavar="0,1,2")
+    parser.add_argument("--seeds", type=seeds, default=(0, 1, 2), metavar="0,1,2")
     parser.add_argument(
         "--steps", type=int, default=60, help="batches of each run of equal samples (default 60; 0: none)"
     )

@@ -56,7 +56,7 @@ def test_correlation_is_that_of_the_later_half_within_each_frame() -> None:
 @pytest.mark.slow
 def test_a_failed_training_says_which_and_why(tmp_path: Path) -> None:
     with pytest.raises(training_trade.TrainingFailed, match=r"exact, seed 4: status 2: .*optimizer.nonsense"):
-        training_trade.train("tcp://127.0.0.1:1", "exact", 4, ["optimizer.nonsense=1"], tmp_path)
+        training_trade.train("tcp://127.0.0.1:1", "tiny-cpu", "exact", 4, ["optimizer.nonsense=1"], tmp_path)
 
 
 @pytest.mark.slow
