@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -116,6 +117,21 @@ def test_one_compiled_time_step_makes_the_same_step(tmp_path: Path, monkeypatch:
     settings = ["compute.compile=step", "network.name=evflownet", "loss.flow=stream"]
     with pytest.raises(UsageError, match=r"compute\.compile = step: EVFlowNet has no loop .*; take clip, or none"):
         build(load_config(configured(tmp_path), settings), ALONE)
+
+
+def test_dropout_differs_between_ranks_and_steps_and_not_between_runs(tmp_path: Path) -> None:
+    """One process for each rank in turn, with the same weights and the same batch."""
+    voxels, frames = torch.randint(-3, 4, (2, 3, 2, 16, 20)), torch.rand(2, 3, 1, 16, 20)
+    settings = ["network.name=etnet", "optimizer.learning_rate=1e-12"]
+
+    def loss(rank: int, step: int) -> float:
+        built = build(load_config(configured(tmp_path), settings), ALONE)
+        alone = dataclasses.replace(built, rank=rank)  # without its siblings
+        return float(alone.step(Work(voxels=voxels, truth={"frames": frames}), step, 0)["total"])
+
+    found = [loss(rank, step) for rank, step in ((0, 0), (1, 0), (0, 1), (0, 0))]
+    assert len(set(found)) == 3
+    assert found[0] == found[3]
 
 
 def test_a_batch_is_cut_into_equal_pieces(tmp_path: Path) -> None:
