@@ -18,6 +18,7 @@ from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
 from trainer.evaluation.voxelise import VoxelSettings
+from trainer.evaluation.windows import picture_windows, regular_windows, windows_of_events, windows_of_seconds
 from trainer.models import VoxelNetwork
 from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
@@ -108,14 +109,14 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
 
 def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
     if run.fps is not None:
-        return recording.regular_windows(run.fps)
+        return regular_windows(recording, run.fps)
     cut = data_set.cuts[recording.name] if run.use_cuts else None
     if run.window_seconds is not None:
-        return recording.windows_of_seconds(run.window_seconds, cut)
+        return windows_of_seconds(recording, run.window_seconds, cut)
     if run.window_events is not None:
-        return recording.windows_of_events(run.window_events, cut)
+        return windows_of_events(recording, run.window_events, cut)
     later = data_set.published_later if run.as_published else 0
-    return recording.windows(cut, pictures=run.window_pictures, later=later)
+    return picture_windows(recording, cut, pictures=run.window_pictures, later=later)
 
 
 def evaluate_data_set(

@@ -31,6 +31,7 @@ from trainer import pictures
 from trainer.evaluation import paper
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.evaluation.windows import flow_windows
 from trainer.models import VoxelNetwork
 from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
@@ -110,7 +111,7 @@ def evaluate_flow(
     """
     scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
     with Recording(path, as_published=run.as_published) as recording, ieee_products():
-        windows = recording.flow_windows(cut, one_later=run.as_published)
+        windows = flow_windows(recording, cut, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]
         for number, (window, grid, prediction) in enumerate(_estimate(run, recording, windows), start=1):

@@ -1,19 +1,16 @@
 """Reads recordings in the h5 layout (IJRR, MVSEC, HQF, EVAID, own ones), window by window, in bounded memory.
 
-A window is what lies between two consecutive pictures: its voxel grid is to become the later one. Window i holds the
-events with t_i <= t < t_(i+1), found by the pictures' time stamps. Two known faults of published files are mended so:
-``event_idx`` one event early (HQF), and a picture whose time stamp goes back (HQF ``engineering_posters``, picture
-528), which gets the mean of its neighbours. ``as_published=True`` takes ``event_idx`` as it is stored; a window that
-ends before it begins is empty then.
+Which windows there are is said in :mod:`trainer.evaluation.windows`. Where they begin and end is found by the time
+stamps of the pictures. Two known faults of published files are mended so: ``event_idx`` one event early (HQF), and a
+picture whose time stamp goes back (HQF ``engineering_posters``, picture 528), which gets the mean of its neighbours.
+``as_published=True`` takes ``event_idx`` as it is stored; a window that ends before it begins is empty then.
 """
 
 from __future__ import annotations
 
 import bisect
 import contextlib
-import dataclasses
 import functools
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +91,7 @@ class Recording:
         name: of the sequence, the file's name without its ending.
         size: height and width of the sensor.
         images: in order; may be empty.
+        times: of the events, seconds; reads blocks of the file, for searching.
         repaired_images: how many time stamps were mended.
 
     Raises:
@@ -113,7 +111,7 @@ class Recording:
         try:
             with _reading(self.path):
                 self._columns = self._checked_columns()
-                self._times = _Times(self._columns["ts"], self.path)
+                self.times: Sequence[float] = _Times(self._columns["ts"], self.path)
                 self.repaired_images = 0
                 self.images = self._listed_images(as_published)
                 self.size = self._sensor_size()
@@ -129,12 +127,12 @@ class Recording:
 
     def __len__(self) -> int:
         """Number of events."""
-        return len(self._times)
+        return len(self.times)
 
     @property
     def span(self) -> tuple[float, float]:
         """Times of the first and the last event, seconds."""
-        return self._times[0], self._times[len(self._times) - 1]
+        return self.times[0], self.times[len(self.times) - 1]
 
     def _checked_columns(self) -> dict[str, h5py.Dataset]:
         columns = {name: self._file.get(f"events/{name}") for name in layout.EVENT_COLUMNS}
@@ -172,7 +170,7 @@ class Recording:
             raise UsageError(f"{self.path}: pictures without the attribute event_idx")
         stored = [int(index) for index in indices]
         if any(stamp is None for stamp in stamps):
-            times = [self._times[min(index, len(self) - 1)] for index in stored]
+            times = [self.times[min(index, len(self) - 1)] for index in stored]
             return self._paired(keys, times, stored)
         times = [float(stamp) for stamp in stamps]
         if as_published:
@@ -187,7 +185,7 @@ class Recording:
                 time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
             ):
                 raise self._two_clocks(times)
-        return self._paired(keys, times, [bisect.bisect_left(self._times, time) for time in times])
+        return self._paired(keys, times, [bisect.bisect_left(self.times, time) for time in times])
 
     def _two_clocks(self, times: Sequence[float]) -> UsageError:
         first, last = self.span
@@ -231,82 +229,14 @@ class Recording:
             )
         return int(stated[0]), int(stated[1])
 
-    def windows(
-        self, cut: tuple[float, float] | None = None, *, pictures: int = 1, later: int = 0
-    ) -> list[EventWindow]:
-        """Windows from picture to picture.
-
-        Args:
-            cut: from which second on and before which, counted from the first picture of the recording; None takes
-                all pictures.
-            pictures: how many pictures on a window ends; those between are not looked at.
-            later: by how many pictures the cut begins and ends later.
-
-        Raises:
-            UsageError: fewer than two pictures in the cut, or the recording ends before the cut does; ``pictures`` not
-                above 0.
-        """
-        if pictures < 1:
-            raise UsageError(f"windows of {pictures} pictures: give at least 1")
-        if not self.images:
-            raise UsageError(f"{self.path} has no pictures to compare with; --fps reconstructs without")
-        found = self._images_in(cut, later)
-        images = found[::pictures]
-        if len(images) < 2:
-            raise UsageError(
-                f"{self.path}: {len(found)} pictures{'' if cut is None else f' in the cut {cut}'}; "
-                f"{pictures + 1} or more make a window"
-            )
-        return [
-            EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
-            for one, other in itertools.pairwise(images)
-        ]
-
-    def _images_in(self, cut: tuple[float, float] | None, later: int = 0) -> list[Image]:
-        images = list(self.images)
-        if cut is not None and images:
-            start, end = cut
-            zero, last = images[0].time, images[-1].time - images[0].time
-            # A recording that was cut before would be cut twice. One that begins at 0 cannot be mistaken.
-            if start > 0 and last < end - CLOCK_SLACK_SECONDS:
-                raise UsageError(
-                    f"{self.path} lasts {last:.2f} s, and the cut is from {start:g} to {end:g} s: if it is already "
-                    "cut, give --cuts none"
-                )
-            since = [image.time - zero for image in images]
-            images = images[bisect.bisect_left(since, start) + later : bisect.bisect_left(since, end) + later]
-        return images
-
-    def flow_windows(self, cut: tuple[float, float] | None = None, *, one_later: bool = False) -> list[EventWindow]:
-        """Windows between the times of consecutive flow fields; the target is the field of the window.
-
-        Args:
-            cut: from which second on and before which, counted from the first picture of the recording, else its
-                first field.
-            one_later: pair each window with the field at its end, as V2V's released code does, not that at its start.
-
-        Raises:
-            UsageError: fewer than two fields in the cut.
-        """
+    def flow_fields(self) -> list[Image]:
+        """The flow fields, in order of their keys; without the indices of events."""
         with _reading(self.path):
             group = self._file.get("flow", {})
-            fields = [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
-        if cut is not None and fields:
-            zero = self.images[0].time if self.images else fields[0].time
-            fields = [each for each in fields if cut[0] <= each.time - zero < cut[1]]
-        if len(fields) < 2:
-            raise UsageError(
-                f"{self.path} has {len(fields)} flow fields{f' in the cut {cut}' if cut else ''}; two or more make a "
-                "window. v2v-convert takes MVSEC's from *_gt.hdf5 beside *_data.hdf5"
-            )
-        made = []
-        for one, other in itertools.pairwise(fields):
-            start, stop = (bisect.bisect_left(self._times, each.time) for each in (one, other))
-            made.append(EventWindow(start, max(start, stop), one.time, other.time, other if one_later else one))
-        return made
+            return [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
 
     def flow(self, window: EventWindow) -> npt.NDArray[np.float32]:
-        """The field of a window of :meth:`flow_windows`, [2, H, W] (x, y) px; NaN or 0 where it is not known.
+        """The field that is the target of a window, [2, H, W] (x, y) px; NaN or 0 where it is not known.
 
         Raises:
             UsageError: it cannot be read, or is of another size.
@@ -317,97 +247,6 @@ class Recording:
         if field.shape != (2, *self.size):
             raise UsageError(f"{self.path}: {window.target.key} is {list(field.shape)}, not {[2, *self.size]}")
         return field
-
-    def regular_windows(self, fps: float) -> list[EventWindow]:
-        """Windows of equal length from the first event to the last; without targets.
-
-        Raises:
-            UsageError: ``fps`` not above 0, or the recording is shorter than one window.
-        """
-        if not fps > 0:
-            raise UsageError(f"{fps:g} windows a second: give more than 0")
-        first, last = self.span
-        count = int((last - first) * fps + 1e-9)
-        if count < 1:
-            raise UsageError(f"{self.path} lasts {last - first:.3f} s, less than one window at {fps:g} a second")
-        edges = [first + step / fps for step in range(count + 1)]
-        indices = [bisect.bisect_left(self._times, edge) for edge in edges]
-        return [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
-
-    def windows_of_seconds(self, seconds: float, cut: tuple[float, float] | None = None) -> list[EventWindow]:
-        """Windows of equal length in time, without regard to pictures; :meth:`_with_targets` says which are scored.
-
-        Args:
-            seconds: of each.
-            cut: as for :meth:`windows`; None takes all events.
-
-        Raises:
-            UsageError: ``seconds`` not above 0, or less than one window.
-        """
-        if not seconds > 0:
-            raise UsageError(f"windows of {seconds:g} s: give more than 0")
-        first, last, images = self._scored_span(cut)
-        count = int((last - first) / seconds + 1e-9)
-        if count < 1:
-            raise UsageError(f"{self.path}: {last - first:.3f} s are less than one window of {seconds:g} s")
-        edges = [first + step * seconds for step in range(count + 1)]
-        indices = [bisect.bisect_left(self._times, edge) for edge in edges]
-        return self._with_targets(
-            [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)], images
-        )
-
-    def windows_of_events(self, events: int, cut: tuple[float, float] | None = None) -> list[EventWindow]:
-        """Windows of as many events each, which are short where much moves; the rest at the end is left out.
-
-        Args:
-            events: of each.
-            cut: as for :meth:`windows`; None takes all events.
-
-        Raises:
-            UsageError: ``events`` not above 0, or less than one window.
-        """
-        if events < 1:
-            raise UsageError(f"windows of {events} events: give at least 1")
-        first, last, images = self._scored_span(cut)
-        begin, end = bisect.bisect_left(self._times, first), bisect.bisect_right(self._times, last)
-        if end - begin < events:
-            raise UsageError(f"{self.path}: {end - begin} events are less than one window of {events}")
-        starts = range(begin, end - events + 1, events)
-        ends = [self._times[min(start + events, len(self) - 1)] for start in starts]
-        begins = [first, *ends[:-1]]
-        return self._with_targets(
-            [
-                EventWindow(start, start + events, at, until, None)
-                for start, at, until in zip(starts, begins, ends, strict=True)
-            ],
-            images,
-        )
-
-    def _scored_span(self, cut: tuple[float, float] | None) -> tuple[float, float, list[Image]]:
-        first, last = self.span
-        images = self._images_in(cut)
-        if cut is not None and self.images:
-            zero = self.images[0].time
-            first, last = max(first, zero + cut[0]), min(last, zero + cut[1])
-        return first, last, images
-
-    @staticmethod
-    def _with_targets(windows: Sequence[EventWindow], images: Sequence[Image]) -> list[EventWindow]:
-        """Each picture is the target of the window whose end is nearest to it, if that is at most half a window away;
-        of several for one window, the nearest."""
-        ends = [window.end for window in windows]
-        nearest: dict[int, tuple[float, Image]] = {}
-        for image in images:
-            after = bisect.bisect_left(ends, image.time)
-            places = [place for place in (after - 1, after) if 0 <= place < len(ends)]
-            place = min(places, key=lambda place: abs(ends[place] - image.time))
-            away = abs(ends[place] - image.time)
-            if 2 * away <= windows[place].end - windows[place].begin and away < nearest.get(place, (away + 1,))[0]:
-                nearest[place] = away, image
-        return [
-            dataclasses.replace(window, target=nearest[place][1]) if place in nearest else window
-            for place, window in enumerate(windows)
-        ]
 
     def events(self, window: EventWindow) -> Events:
         """The events of a window, in order of time.

@@ -21,6 +21,7 @@ from trainer.evaluation.evaluate import find_recordings
 from trainer.evaluation.flow import TITLES, FlowRun, evaluate_flow
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings
+from trainer.evaluation.windows import flow_windows
 from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.models.sequence import VoxelNetwork
 from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
@@ -132,7 +133,7 @@ class Flow(Task):
         files = list(find_recordings(recordings, data_set).values())
         for file in files:
             with Recording(file) as recording:
-                recording.flow_windows()
+                flow_windows(recording)
         run = FlowRun(network, VoxelSettings(bins=network.bins), str(self.device))
 
         def scores() -> dict[str, float]:

@@ -17,6 +17,7 @@ from trainer.convert import convert
 from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.evaluation.windows import picture_windows, regular_windows
 from v2v_protocol.errors import UsageError
 
 Write = Callable[[Path, Scene], None]
@@ -94,7 +95,7 @@ def test_conversion_reader_and_voxels(tmp_path: Path, case: str, kind: str) -> N
     with Recording(destination) as recording:
         assert recording.size == (HEIGHT, WIDTH)
         assert recording.repaired_images == 0
-        windows = recording.windows()
+        windows = picture_windows(recording)
         assert len(windows) == WINDOWS
         for number, window in enumerate(windows):
             assert window.end - window.begin == pytest.approx(PERIOD_US / 1e6, abs=1e-9)
@@ -118,9 +119,9 @@ def test_events_alone(tmp_path: Path, case: str) -> None:
     with Recording(tmp_path / "own.h5") as recording:
         assert recording.size == (HEIGHT, WIDTH)
         with pytest.raises(UsageError, match="no pictures"):
-            recording.windows()
+            picture_windows(recording)
         # 39 ms at 100 windows a second: three whole ones, the first three of the scene.
-        windows = recording.regular_windows(100)
+        windows = regular_windows(recording, 100)
         assert len(windows) == 3
         for number, window in enumerate(windows):
             grid = voxel_grid(recording.events(window), recording.size, VoxelSettings(), (window.begin, window.end))

@@ -12,6 +12,7 @@ from trainer.convert import Converted, convert
 from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.evaluation.windows import picture_windows, regular_windows
 from v2v_protocol.errors import UsageError
 
 EVENTS = WEIGHTS.parent / "events"
@@ -28,7 +29,7 @@ def test_aedat4_of_a_davis(tmp_path: Path) -> None:
     assert (done.form, done.written.events, done.written.images) == ("aedat4", 117_667, 3)
     assert done.written.size == SensorSize(346, 260)
     with Recording(done.destination) as recording:
-        windows = recording.windows()
+        windows = picture_windows(recording)
         assert [round(window.end - window.begin, 6) for window in windows] == [0.04, 0.04]
         times = recording.events(windows[0]).t
         assert windows[0].begin <= times[0] <= times[-1] < windows[0].end
@@ -62,5 +63,5 @@ def test_text_of_a_davis240(tmp_path: Path) -> None:
     done = converted("ijrr_boxes_translation_slice.txt", tmp_path, ConvertOptions(size=SensorSize(240, 180)))
     assert (done.form, done.written.events) == ("ijrr", 162_100)
     with Recording(done.destination) as recording:
-        windows = recording.regular_windows(25)
+        windows = regular_windows(recording, 25)
         assert sum(len(recording.events(window)) for window in windows) > 150_000

@@ -12,6 +12,7 @@ from trainer.convert import conversion
 from trainer.convert.conversion import FORMS, RawForm, convert, recognise
 from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 from trainer.evaluation.readers import EventWindow, Recording
+from trainer.evaluation.windows import picture_windows
 
 
 def recognises(path: Path) -> bool:
@@ -35,7 +36,7 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
     assert recognise(raw) == "toy"
     assert convert(raw, tmp_path / "made.h5").form == "toy"
     with Recording(tmp_path / "made.h5") as made:
-        (window,) = made.windows()
+        (window,) = picture_windows(made)
         assert isinstance(window, EventWindow)
         events = made.events(window)
         assert events.x.tolist() == [0, 5, 2]

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tests.trainer.evaluation.h5_file import random_recording, write_h5
 from trainer.evaluation import readers
 from trainer.evaluation.readers import EventWindow, Recording
+from trainer.evaluation.windows import picture_windows, regular_windows, windows_of_events, windows_of_seconds
 from v2v_protocol.errors import UsageError
 
 PIXELS = np.arange(12, dtype=np.uint8).reshape(3, 4)
@@ -48,7 +49,7 @@ def test_layouts(tmp_path: Path, data_set: str, options: dict[str, Any]) -> None
                  [(PIXELS + i, a) for i, a in enumerate(stamped(1.05, 1.25, 1.45))], **options)  # fmt: skip
     with Recording(path) as opened:
         assert (opened.name, opened.size, len(opened)) == ("a", (3, 4), 6)
-        first, second = opened.windows()
+        first, second = picture_windows(opened)
         events = opened.events(first)
         assert events.x.tolist() == [1, 2]
         assert events.p.tolist() == [1, -1]
@@ -60,16 +61,16 @@ def test_layouts(tmp_path: Path, data_set: str, options: dict[str, Any]) -> None
 
 def test_an_event_at_the_time_of_a_picture_belongs_to_the_window_after_it(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, stamped(1.0, 1.2, 1.4))) as opened:
-        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.0, 1.1], [1.2, 1.3]]
+        assert [opened.events(window).t.tolist() for window in picture_windows(opened)] == [[1.0, 1.1], [1.2, 1.3]]
 
 
 def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path) -> None:
     path = recording(tmp_path, stamped(1.05, 1.25, 1.45, shift=-1))
     with Recording(path) as opened:
-        assert [len(opened.events(window)) for window in opened.windows()] == [2, 2]
-        assert opened.events(opened.windows()[0]).t.tolist() == [1.1, 1.2]
+        assert [len(opened.events(window)) for window in picture_windows(opened)] == [2, 2]
+        assert opened.events(picture_windows(opened)[0]).t.tolist() == [1.1, 1.2]
     with Recording(path, as_published=True) as opened:
-        assert opened.events(opened.windows()[0]).t.tolist() == [1.0, 1.1]
+        assert opened.events(picture_windows(opened)[0]).t.tolist() == [1.0, 1.1]
 
 
 def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Path) -> None:
@@ -78,10 +79,14 @@ def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Pa
     with Recording(path) as opened:
         assert opened.repaired_images == 1
         assert [image.time for image in opened.images] == pytest.approx([1.05, 1.25, 1.35, 1.45])
-        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.1, 1.2], [1.3], [1.4]]
+        assert [opened.events(window).t.tolist() for window in picture_windows(opened)] == [[1.1, 1.2], [1.3], [1.4]]
     with Recording(path, as_published=True) as opened:
         assert opened.repaired_images == 0
-        assert [opened.events(window).t.tolist() for window in opened.windows()] == [[1.1, 1.2], [], [1.2, 1.3, 1.4]]
+        assert [opened.events(window).t.tolist() for window in picture_windows(opened)] == [
+            [1.1, 1.2],
+            [],
+            [1.2, 1.3, 1.4],
+        ]
     with Recording(recording(tmp_path, stamped(1.05, 1.25, 1.15))) as opened:
         assert opened.images[-1].time == pytest.approx(1.35)
 
@@ -93,7 +98,7 @@ def test_clocks_that_do_not_fit_are_refused_or_taken_as_published(tmp_path: Path
     with pytest.raises(UsageError, match=r"not one clock.*v2v-convert.*--as-published"):
         Recording(path)
     with Recording(path, as_published=True) as opened:
-        assert [len(opened.events(window)) for window in opened.windows()] == [0]
+        assert [len(opened.events(window)) for window in picture_windows(opened)] == [0]
 
 
 @pytest.mark.parametrize("shift", [0, -1])
@@ -111,78 +116,78 @@ def test_pictures_before_and_after_all_events_are_taken(tmp_path: Path, index: i
     """The released conversion of HQF writes one event less."""
     attributes = [{"timestamp": time, "event_idx": index if time > 2 else 0} for time in (-2.0, 1.25, 3.0, 4.0)]
     with Recording(recording(tmp_path, attributes)) as opened:
-        assert [len(opened.events(window)) for window in opened.windows()] == [3, 3, 0]
+        assert [len(opened.events(window)) for window in picture_windows(opened)] == [3, 3, 0]
 
 
 def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, [{"event_idx": 1}, {"event_idx": 4}])) as opened:
-        assert [window.start for window in opened.windows()] == [1]
-        assert opened.windows()[0].stop == 4
+        assert [window.start for window in picture_windows(opened)] == [1]
+        assert picture_windows(opened)[0].stop == 4
         assert [image.time for image in opened.images] == [1.1, 1.4]
 
 
 def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
     with Recording(path) as opened:
-        windows = opened.windows((1.0, 3.0))
+        windows = picture_windows(opened, (1.0, 3.0))
         assert len(windows) == 19
         assert windows[0].begin == pytest.approx(2.0)
         assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a cut is not in it, as released
-        assert len(opened.windows((0.0, 60.0))) == 50
+        assert len(picture_windows(opened, (0.0, 60.0))) == 50
         with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the cut is from 5 to 20 s.*--cuts none"):
-            opened.windows((5.0, 20.0))
+            picture_windows(opened, (5.0, 20.0))
         with pytest.raises(UsageError, match=r"1 pictures in the cut .* 2 or more"):
-            opened.windows((4.96, 5.5))
+            picture_windows(opened, (4.96, 5.5))
 
 
 def test_a_later_cut_begins_and_ends_so_many_pictures_on(tmp_path: Path) -> None:
     with Recording(random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)) as opened:
         for cut, first, last in (((1.05, 3.05), 12, 31), ((0.0, 60.0), 1, 50)):
-            windows = opened.windows(cut, later=1)
+            windows = picture_windows(opened, cut, later=1)
             assert (windows[0].begin, windows[-1].end) == (opened.images[first].time, opened.images[last].time)
 
 
 def test_windows_end_at_every_third_picture(tmp_path: Path) -> None:
     with Recording(random_recording(tmp_path / "a.h5", images=12, events=500)) as opened:
-        windows = opened.windows(pictures=3)
+        windows = picture_windows(opened, pictures=3)
         assert [window.target for window in windows] == [opened.images[place] for place in (3, 6, 9)]
-        one_by_one = opened.windows()[:9]
+        one_by_one = picture_windows(opened)[:9]
         assert [len(opened.events(window)) for window in windows] == [
             sum(len(opened.events(part)) for part in one_by_one[start : start + 3]) for start in (0, 3, 6)
         ]
         with pytest.raises(UsageError, match="12 pictures; 13 or more"):
-            opened.windows(pictures=12)
+            picture_windows(opened, pictures=12)
         with pytest.raises(UsageError, match="at least 1"):
-            opened.windows(pictures=0)
+            picture_windows(opened, pictures=0)
 
 
 def test_windows_of_time_have_the_picture_nearest_to_their_end(tmp_path: Path) -> None:
     path = recording(tmp_path, stamped(1.0, 1.19, 1.26, 1.33, 1.5))
     with Recording(path) as opened:
-        windows = opened.windows_of_seconds(0.1)
+        windows = windows_of_seconds(opened, 0.1)
         assert [(window.start, window.stop) for window in windows] == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
         assert [window.end for window in windows] == pytest.approx([1.1, 1.2, 1.3, 1.4, 1.5])
         # 1.0 is more than half a window from an end; of 1.26 and 1.33, both nearest to 1.3, 1.33 is the nearer one.
         times = [None if window.target is None else window.target.time for window in windows]
         assert times == [None, 1.19, 1.33, None, 1.5]
         with pytest.raises(UsageError, match="give more than 0"):
-            opened.windows_of_seconds(0.0)
+            windows_of_seconds(opened, 0.0)
         with pytest.raises(UsageError, match="less than one window of 2 s"):
-            opened.windows_of_seconds(2.0)
+            windows_of_seconds(opened, 2.0)
 
 
 def test_windows_of_events_have_as_many_each(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, stamped(1.05, 1.21, 1.4))) as opened:
-        windows = opened.windows_of_events(2)
+        windows = windows_of_events(opened, 2)
         assert [(window.start, window.stop) for window in windows] == [(0, 2), (2, 4), (4, 6)]
         assert [window.begin for window in windows] == pytest.approx([1.0, 1.2, 1.4])
         assert [window.end for window in windows] == pytest.approx([1.2, 1.4, 1.5])
         times = [None if window.target is None else window.target.time for window in windows]
         assert times == [1.21, 1.4, None]
-        assert [len(opened.events(window)) for window in opened.windows_of_events(4)] == [4]
+        assert [len(opened.events(window)) for window in windows_of_events(opened, 4)] == [4]
         for wrong, why in ((0, "at least 1"), (7, "6 events are less than one window of 7")):
             with pytest.raises(UsageError, match=why):
-                opened.windows_of_events(wrong)
+                windows_of_events(opened, wrong)
 
 
 @settings(deadline=None, max_examples=30)
@@ -194,7 +199,7 @@ def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
     cut = (0.1, 0.35) if is_cut else None
     with Recording(path) as opened:
         allowed = {image.key for image in opened.images if cut is None or cut[0] <= image.time - 1.0 < cut[1]}
-        for windows in (opened.windows_of_seconds(seconds, cut), opened.windows_of_events(min(events, 200), cut)):
+        for windows in (windows_of_seconds(opened, seconds, cut), windows_of_events(opened, min(events, 200), cut)):
             for one, other in itertools.pairwise(windows):
                 assert (one.stop, one.end) == (other.start, other.begin)
             for window in windows:
@@ -253,12 +258,12 @@ def test_search_in_blocks_equals_search_in_memory(
 
 def test_regular_windows(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, [], sensor_resolution=(3, 4))) as opened:
-        windows = opened.regular_windows(5)
+        windows = regular_windows(opened, 5)
         assert [opened.events(window).t.tolist() for window in windows] == [[1.0, 1.1], [1.2, 1.3]]
         assert all(window.target is None for window in windows)
         for fps, message in ((0, "more than 0"), (float("nan"), "more than 0"), (1.9, "less than one window")):
             with pytest.raises(UsageError, match=message):
-                opened.regular_windows(fps)
+                regular_windows(opened, fps)
 
 
 def broken(path: Path, kind: str) -> Path:
@@ -320,7 +325,9 @@ def disordered(path: Path, order: list[int]) -> Path:
 
 def test_late_events_are_sorted_in(tmp_path: Path) -> None:
     with Recording(disordered(tmp_path, [0, 2, 1, 4, 3, 5])) as opened:
-        for window, times, columns in zip(opened.windows(), ([1.1, 1.2], [1.3, 1.4]), ([1, 2], [3, 0]), strict=True):
+        for window, times, columns in zip(
+            picture_windows(opened), ([1.1, 1.2], [1.3, 1.4]), ([1, 2], [3, 0]), strict=True
+        ):
             events = opened.events(window)
             assert events.t.tolist() == times
             assert events.x.tolist() == columns
@@ -362,7 +369,7 @@ def test_damage_is_told(tmp_path: Path, name: str) -> None:
 
     def read() -> None:
         with Recording(file) as opened:
-            opened.events(opened.windows()[0])
+            opened.events(picture_windows(opened)[0])
             opened.image(opened.images[2])
 
     with pytest.raises(UsageError, match=r"a.h5 cannot be read as HDF5: .*HDF5_PLUGIN_PATH"):

@@ -12,6 +12,7 @@ from tests.trainer.evaluation.h5_file import random_recording
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, _stretched, reconstruct
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
+from trainer.evaluation.windows import picture_windows, regular_windows
 from trainer.models import E2VID, FireNet, VoxelNetwork
 from trainer.run.checkpoint import Checkpoint, save_checkpoint
 from trainer.weights import load_network
@@ -29,7 +30,7 @@ def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelN
     count = 2 * WINDOWS_PER_CALL + 3
     path = random_recording(tmp_path / "a.h5", size=(37, 43), images=count + 1, events=4000)
     with Recording(path) as recording:
-        windows = recording.windows()
+        windows = picture_windows(recording)
         steps = list(reconstruct(recording, windows, network, VoxelSettings()))
         grids = [voxel_grid(recording.events(w), recording.size, VoxelSettings(), (w.begin, w.end)) for w in windows]
         assert [step.events for step in steps] == [len(recording.events(window)) for window in windows]
@@ -50,7 +51,7 @@ def test_the_memory_is_new_for_every_sequence(tmp_path: Path) -> None:
     def predictions(path: Path) -> np.ndarray:
         with Recording(path) as recording:
             return np.stack(
-                [s.prediction for s in reconstruct(recording, recording.windows(), network, VoxelSettings())]
+                [s.prediction for s in reconstruct(recording, picture_windows(recording), network, VoxelSettings())]
             )
 
     alone = predictions(second)
@@ -61,7 +62,7 @@ def test_the_memory_is_new_for_every_sequence(tmp_path: Path) -> None:
 def test_windows_without_a_picture_show_the_latest(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=4, period=0.1, events=500)
     with Recording(path) as recording:
-        steps = list(reconstruct(recording, recording.regular_windows(20), FireNet(base_channels=2), VoxelSettings()))
+        steps = list(reconstruct(recording, regular_windows(recording, 20), FireNet(base_channels=2), VoxelSettings()))
         for step in steps:
             assert step.window.target is None
             assert step.camera_time is not None
@@ -73,11 +74,11 @@ def test_what_the_network_cannot_take_or_gives_is_refused(tmp_path: Path) -> Non
     network = FireNet(base_channels=2)
     with Recording(path) as recording:
         with pytest.raises(UsageError, match="voxels of 4 bins, and the network takes 5"):
-            next(reconstruct(recording, recording.windows(), network, VoxelSettings(bins=4)))
+            next(reconstruct(recording, picture_windows(recording), network, VoxelSettings(bins=4)))
         with torch.no_grad():
             network.net.pred.conv2d.bias.fill_(float("nan"))  # type: ignore[union-attr]
         with pytest.raises(UsageError, match="not finite in windows 0 to 4"):
-            next(reconstruct(recording, recording.windows(), network, VoxelSettings()))
+            next(reconstruct(recording, picture_windows(recording), network, VoxelSettings()))
 
 
 def test_stretching_maps_each_picture_to_the_whole_range() -> None:
