@@ -38,6 +38,8 @@ class ERAFT(VoxelNetwork):
     Args:
         bins: bins of a voxel grid; the published network has 15.
         warm_start: begin where the window before leads, else with no flow.
+        context_by_window: in training, batch norm of the context has the statistics of each window by itself, as in the
+            published code, instead of those of all windows of the batch.
         normalize_voxels: see :class:`VoxelNetwork`; the published network was trained so.
         padding: see :class:`VoxelNetwork`.
     """
@@ -51,6 +53,7 @@ class ERAFT(VoxelNetwork):
         *,
         bins: int = 5,
         warm_start: bool = True,
+        context_by_window: bool = False,
         normalize_voxels: bool = False,
         padding: Padding = "top-left",
     ) -> None:
@@ -59,6 +62,7 @@ class ERAFT(VoxelNetwork):
         super().__init__(bins=bins, size_multiple=SIZE_MULTIPLE_PX, normalizes=normalize_voxels, padding=padding)
         self.raft = RAFT("large", inputs=bins)
         self.warm_start = warm_start
+        self.context_by_window = context_by_window
 
     def unroll(
         self, x: Tensor, state: ERAFTState | None, steps: int, _guide: Guide | None
@@ -67,16 +71,20 @@ class ERAFT(VoxelNetwork):
         start = None if state is None else state.start
         batch = len(x) // steps
         voxels = x if state is None else torch.cat([state.voxel, x])
-        # What has no memory runs on all windows at once. Batch norm of the context so counts once a sequence.
+        # What has no memory runs on all windows at once.
         features = torch.split(self.raft.features(voxels), batch)
-        hidden, context = (torch.split(tensor, batch) for tensor in self.raft.context(voxels[batch:]))
+        windows = voxels[batch:]
+        found = [
+            self.raft.context(each) for each in (torch.split(windows, batch) if self.context_by_window else [windows])
+        ]
+        hidden, context = (torch.split(torch.cat(tensors), batch) for tensors in zip(*found, strict=True))
         outputs = []
         for step in range(len(features) - 1):
             pyramid = correlation_pyramid(features[step], features[step + 1])
-            found = list(self.raft.refine(pyramid, hidden[step], context[step], UPDATES, start))
+            refined = list(self.raft.refine(pyramid, hidden[step], context[step], UPDATES, start))
             if self.warm_start:
-                start = forward_splat(found[-1][0].detach())
-            outputs.append([self.raft.upsampled(*each) for each in (found if self.training else found[-1:])])
+                start = forward_splat(refined[-1][0].detach())
+            outputs.append([self.raft.upsampled(*each) for each in (refined if self.training else refined[-1:])])
         flow = torch.stack([torch.cat(of_update) for of_update in zip(*outputs, strict=True)])
         return flow if self.training else flow[0], ERAFTState(voxels[-batch:], start)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from tests.trainer.models import numpy_networks as oracle
+from trainer.models import ERAFT
 from trainer.models.etnet import HEADS, _Layer, _Positions
 from trainer.models.hypere2vid import ATOMS, DynamicDecoder, bases, fourier_bessel
 from trainer.models.raft import LEVELS, convex_upsampling, correlation_pyramid, forward_splat, look_up
@@ -178,3 +181,20 @@ def test_uniform_flow_is_carried_along_and_leaves_a_hole() -> None:
     carried = forward_splat(flow)
     assert (carried[0, 0, :, 2:] == 2).all()
     assert (carried[0, 0, :, :2] == 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by_window", [False, True])
+def test_batch_norm_of_the_context_is_that_of_one_window_only_if_asked(by_window: bool) -> None:
+    """In training, as a loop over windows has it."""
+    torch.manual_seed(0)
+    network = ERAFT(bins=2, context_by_window=by_window, warm_start=False).train()
+    looped = copy.deepcopy(network)
+    voxels = torch.randint(-3, 4, (2, 4, 2, 64, 64)).float()
+    with torch.no_grad():
+        whole, _ = network(voxels)
+        parts = [looped(voxels[:, step : step + 2])[0] for step in range(3)]
+    assert torch.allclose(torch.cat(parts, dim=2), whole, rtol=0, atol=1e-3) == by_window
+    statistics = [dict(each.named_buffers())["raft.context_encoder.layer1.0.convnormrelu1.1.running_mean"]
+                  for each in (network, looped)]  # fmt: skip
+    assert torch.allclose(*statistics, rtol=0, atol=1e-5) == by_window
