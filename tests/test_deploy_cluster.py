@@ -238,7 +238,7 @@ def said(folder: Path) -> list[str]:
 
 
 def test_the_batch_job_starts_all_three_and_leaves_nothing(tmp_path: Path) -> None:
-    job = start_batch(tmp_path, "exit 0")
+    job = start_batch(tmp_path, 'until grep -q "^v2v-worker" "$LOG"; do sleep 0.05; done; exit 0')
     assert job.wait(timeout=60) == 0
     serve, *others = said(tmp_path)
     port = 20000 + 1234567 % 20000

@@ -1,0 +1,130 @@
+"""The component of keys: what kustomize makes of it, and that a server and a worker take what its pods find."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION, container
+from v2v_protocol.errors import KeyRefused
+from v2v_protocol.keys import read_key
+from v2v_server.commands import serve as serve_command
+from v2v_server.commands.keys import main as keys_command
+from v2v_server.config import ServeConfig
+from v2v_server.keys.folder import KeyFolder
+
+COMPONENT = KUBERNETES / "keys"
+NOTES = [line.removeprefix("#").strip() for line in (COMPONENT / "kustomization.yaml").read_text().splitlines()]
+
+
+def patch_of(name: str) -> dict[str, Any]:
+    """The pod that a patch of the component describes."""
+    spec: dict[str, Any] = yaml.safe_load((COMPONENT / name).read_text())["spec"]["template"]["spec"]
+    return spec
+
+
+def secrets() -> dict[str, str]:
+    """Files that the secrets of the notes are made from, by their names."""
+    lines = [re.fullmatch(r"kubectl -n v2v create secret generic (\S+) --from-file=(\S+)", line) for line in NOTES]
+    return {found[1]: found[2] for found in lines if found}
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not here")
+@pytest.mark.parametrize("components", [["keys"], ["keys", "autoscale"]])
+def test_with_keys_the_manifests_build_and_nothing_is_insecure(
+    components: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    validate = pytest.importorskip("kubernetes_validate")
+    shutil.copytree(KUBERNETES, tmp_path / "k")
+    file = tmp_path / "k" / "kustomization.yaml"
+    file.write_text(file.read_text() + yaml.safe_dump({"components": components}))
+    built = subprocess.run(["kubectl", "kustomize", tmp_path / "k"], capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    made = {(each["kind"], each["metadata"]["name"]): each for each in yaml.safe_load_all(built.stdout)}
+    for kind, document in made.items():
+        if kind[0] != "ScaledObject":
+            validate.validate(document, KUBERNETES_VERSION, strict=True)
+    asked: list[ServeConfig] = []
+    monkeypatch.setattr(serve_command, "serve", asked.append)
+    pods = {name: made["Deployment", name]["spec"]["template"]["spec"] for name in ("v2v-broker", "v2v-workers")}
+    keys = KeyFolder(tmp_path / "keys")
+    keys.init()
+    arguments = pods["v2v-broker"]["containers"][0]["args"]
+    assert "--keys=/keys" in arguments
+    here = [argument.replace("=/keys", f"={keys.path}") for argument in arguments]
+    assert serve_command.main(here) == 0
+    assert (asked[0].keys, asked[0].insecure) == (str(keys.path), False)
+    named = set()
+    for spec in pods.values():
+        volumes = {volume["name"]: volume for volume in spec["volumes"]}
+        for each in [*spec["containers"], *spec["initContainers"]]:
+            assert each["image"] == "registry.example/v2v-server:1"
+            assert {mount["name"] for mount in each["volumeMounts"]} <= set(volumes)
+            assert each["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+        named |= {volume["secret"]["secretName"] for volume in volumes.values() if "secret" in volume}
+    assert named == set(secrets()) - {"v2v-consumer-key"}
+
+
+def test_the_flag_that_keys_take_the_place_of_is_where_the_patch_looks() -> None:
+    (test, replace) = yaml.safe_load(
+        yaml.safe_load((COMPONENT / "kustomization.yaml").read_text())["patches"][-1]["patch"]
+    )
+    place = int(test["path"].rpartition("/")[2])
+    assert test["path"] == replace["path"] == f"/spec/template/spec/containers/0/args/{place}"
+    assert container("v2v-broker")["args"][place] == test["value"] == "--insecure"
+
+
+def mounted(folder: Path, files: dict[str, bytes]) -> Path:
+    """A folder as Kubernetes mounts a secret for the group of a pod: links to links, which the group may read."""
+    data = folder / "..2026_11_24"
+    data.mkdir(parents=True)
+    for name, content in files.items():
+        (data / name).write_bytes(content)
+        (data / name).chmod(0o440)
+        (folder / name).symlink_to(f"..data/{name}")
+    (folder / "..data").symlink_to(data.name)
+    return folder
+
+
+def test_a_server_and_a_worker_take_the_keys_that_their_pods_find(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for line in NOTES:
+        if line.startswith("v2v-keys "):
+            assert keys_command(shlex.split(line)[1:]) == 0
+    found: dict[str, dict[str, bytes]] = {}
+    for name, source in secrets().items():
+        path = Path(source)
+        found[name] = {each.name: each.read_bytes() for each in (path.iterdir() if path.is_dir() else [path])}
+    for patch, key in ("broker.yaml", "server.key"), ("workers.yaml", "worker.key"):
+        pod, place = patch_of(patch), tmp_path / patch.removesuffix(".yaml")
+        by_volume = {each["name"]: each["secret"]["secretName"] for each in pod["volumes"] if "secret" in each}
+        (init,), (main,) = pod["initContainers"], pod["containers"]
+        for mount in [*init["volumeMounts"], *main["volumeMounts"]]:
+            where = place / mount["mountPath"].removeprefix("/")
+            if mount["name"] in by_volume:
+                mounted(where, found[by_volume[mount["name"]]])
+            else:
+                where.mkdir(parents=True, exist_ok=True)
+        with pytest.raises(KeyRefused, match="others may have it"):  # why there is a copy
+            read_key(place / "secret" / key)
+        here = [str(place / part.removeprefix("/")) if part.startswith("/") else part for part in init["command"]]
+        subprocess.run(here, check=True)
+    keys = KeyFolder(tmp_path / "broker" / "keys")
+    public, _ = keys.server_keys()
+    assert {side: sorted(names.values()) for side, names in keys.allowed().items()} == {
+        "consumer": ["trainer"], "worker": ["cluster"],
+    }  # fmt: skip
+    (variable,) = patch_of("workers.yaml")["containers"][0]["env"]
+    assert variable["name"] == "V2V_KEYS"
+    worker = read_key(tmp_path / "workers" / variable["value"].removeprefix("/"))
+    assert (worker.side, worker.server) == ("worker", public.decode())
+    assert keys.allowed()["worker"][worker.public] == "cluster"
