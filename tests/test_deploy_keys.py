@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION, container
+from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION
 from v2v_protocol.errors import KeyRefused
 from v2v_protocol.keys import read_key
 from v2v_server.commands import serve as serve_command
@@ -38,7 +38,7 @@ def secrets() -> dict[str, str]:
 
 @pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not here")
 @pytest.mark.parametrize("components", [["keys"], ["keys", "autoscale"]])
-def test_with_keys_the_manifests_build_and_nothing_is_insecure(
+def test_with_keys_the_manifests_build_and_the_broker_asks_for_them(
     components: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     validate = pytest.importorskip("kubernetes_validate")
@@ -60,7 +60,7 @@ def test_with_keys_the_manifests_build_and_nothing_is_insecure(
     assert "--keys=/keys" in arguments
     here = [argument.replace("=/keys", f"={keys.path}") for argument in arguments]
     assert serve_command.main(here) == 0
-    assert (asked[0].keys, asked[0].insecure) == (str(keys.path), False)
+    assert (asked[0].keys, asked[0].page_host) == (str(keys.path), "0.0.0.0")
     named = set()
     for spec in pods.values():
         volumes = {volume["name"]: volume for volume in spec["volumes"]}
@@ -70,15 +70,6 @@ def test_with_keys_the_manifests_build_and_nothing_is_insecure(
             assert each["securityContext"]["capabilities"] == {"drop": ["ALL"]}
         named |= {volume["secret"]["secretName"] for volume in volumes.values() if "secret" in volume}
     assert named == set(secrets()) - {"v2v-consumer-key"}
-
-
-def test_the_flag_that_keys_take_the_place_of_is_where_the_patch_looks() -> None:
-    (test, replace) = yaml.safe_load(
-        yaml.safe_load((COMPONENT / "kustomization.yaml").read_text())["patches"][-1]["patch"]
-    )
-    place = int(test["path"].rpartition("/")[2])
-    assert test["path"] == replace["path"] == f"/spec/template/spec/containers/0/args/{place}"
-    assert container("v2v-broker")["args"][place] == test["value"] == "--insecure"
 
 
 def mounted(folder: Path, files: dict[str, bytes]) -> Path:
