@@ -1,26 +1,36 @@
 """Which files are new or changed since the index was written: asks the system for the size and times of each.
 
-Of a million files that takes seconds, so several processes do it; they import little, and are there in a moment.
+Of a million files that takes seconds, so other processes help. They are started by a command of their own: a script
+that opens a catalogue needs no guard for them, and a loader's worker, which may have no children of multiprocessing,
+has them too.
+
+    python -m v2v_server.catalogue.changed      jobs come in on stdin, the answer goes out on stdout, all pickled
 """
 
 from __future__ import annotations
 
 import os
+import pickle
+import signal
+import subprocess
+import sys
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from types import TracebackType
 
+from v2v_protocol.programs import environment
 from v2v_server.catalogue.files import Notice, by_parts
 from v2v_server.cloud.copies import Copies
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.process import die_with_parent
 
 _State = tuple[int, int, int]
 _NO_STATE: _State = (-1, 0, 0)  # no file has that size
-_FILES_A_PROCESS = 100_000
-"""With fewer another process costs more than it saves."""
-_TOGETHER = 20_000
+_FILES_A_PROCESS = 50_000
+"""For fewer another process costs more than it saves."""
+_TOGETHER = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +38,13 @@ class _Some:
     """Some of the files.
 
     Attributes:
+        root: the folder, or what lies in object storage, that ids are relative to.
         first: number of the first of them.
         ids: relative paths.
         states: that the index knows, size, mtime and ctime of each, one after the other.
     """
 
+    root: Path | Copies
     first: int
     ids: Sequence[str]
     states: array[int]
@@ -41,56 +53,123 @@ class _Some:
 def changed(
     root: Path | Copies, ids: Sequence[str], states: array[int], processes: int, notice: Notice | None
 ) -> list[int]:
-    """The numbers of the files that are not as the index knows them.
+    """The numbers of the files that are not as the index knows them, rising.
 
     Args:
         root: the folder, or what lies in object storage, that ids are relative to.
         ids: relative paths.
         states: that the index knows, size, mtime and ctime of each, one after the other.
-        processes: how many may ask; up to 1 asks in this one.
+        processes: how many may ask, this one among them.
         notice: told how far it is.
     """
-    if isinstance(root, Copies) or len(ids) < _FILES_A_PROCESS:
-        processes = 0
-    some = (
-        _Some(at, ids[at : at + _TOGETHER], states[3 * at : 3 * (at + _TOGETHER)])
-        for at in range(0, len(ids), _TOGETHER)
-    )
-    found, done, ask = list[int](), 0, partial(_changed, root)
-    for part, numbers in run_isolated(ask, some, processes if processes > 1 else 0):
-        found += ask(part) if isinstance(numbers, Died) else numbers
-        done += len(part.ids)
+    shares = 1 if isinstance(root, Copies) else max(1, min(processes, len(ids) // _FILES_A_PROCESS))
+    ends = [len(ids) * share // shares for share in range(shares + 1)]
+
+    def some(share: int) -> Iterator[_Some]:
+        for start in range(ends[share], ends[share + 1], _TOGETHER):
+            end = min(start + _TOGETHER, ends[share + 1])
+            yield _Some(root, start, ids[start:end], states[3 * start : 3 * end])
+
+    done, found = 0, list[int]()
+
+    def tell(more: int, changed: int) -> None:
+        nonlocal done
+        done += more
         if notice is not None:
-            notice(f"looking at files: {done} of {len(ids)}, {len(found)} of them new or changed")
-    return sorted(found)
+            notice(f"looking at files: {done} of {len(ids)}, {changed} of them new or changed")
+
+    with ExitStack() as helpers:
+        others = [helpers.enter_context(_Helper(some(share))) for share in range(1, shares)]
+        for mine in some(0):
+            found += _changed(mine)
+            tell(len(mine.ids), len(found))
+        for share, helper in enumerate(others, 1):
+            answer = helper.answer()
+            found += [number for theirs in some(share) for number in _changed(theirs)] if answer is None else answer
+            tell(ends[share + 1] - ends[share], len(found))
+    return found
 
 
-def _changed(root: Path | Copies, some: _Some) -> list[int]:
-    folder, listed = os.path.join(root, ""), root.listed if isinstance(root, Copies) else None
+class _Helper:
+    """A process that looks at some of the files meanwhile."""
 
-    def state(id: str) -> _State:
-        if listed is not None:
-            found = listed.get(id)
-            return _NO_STATE if found is None else (found.size_bytes, found.mark, 0)
+    def __init__(self, jobs: Iterable[_Some]) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        command = [sys.executable, "-m", __name__]
+        with suppress(OSError):  # it does not start, or ends at once: whoever asks it does the work
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment())
+            assert self._process.stdin is not None
+            pickle.dump(os.getpid(), self._process.stdin)
+            for job in jobs:
+                pickle.dump(job, self._process.stdin)
+            self._process.stdin.close()
+
+    def answer(self) -> list[int] | None:
+        """What it found; None if it ended without an answer."""
+        if self._process is None or self._process.stdout is None:
+            return None
         try:
-            status = os.stat(folder + id)
-        except OSError:
-            return _NO_STATE
-        return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+            answer: list[int] = pickle.loads(self._process.stdout.read())
+        except (OSError, EOFError, pickle.UnpicklingError):
+            return None
+        return answer
 
-    def those(part: Sequence[str]) -> array[int]:
+    def __enter__(self) -> _Helper:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process is not None:
+            self._process.kill()
+            for pipe in (self._process.stdin, self._process.stdout):
+                with suppress(OSError):  # what it was not told any more
+                    if pipe is not None:
+                        pipe.close()
+            self._process.wait()
+
+
+def _changed(some: _Some) -> list[int]:
+    folder = os.path.join(some.root, "")
+    listed = some.root.listed if isinstance(some.root, Copies) else None
+
+    def states(ids: Sequence[str]) -> array[int]:
         found = array("q")
-        for id in part:
-            found.extend(state(id))
+        for id in ids:
+            if listed is not None:
+                state = listed.get(id)
+                found.extend(_NO_STATE if state is None else (state.size_bytes, state.mark, 0))
+                continue
+            try:
+                status = os.stat(folder + id)
+            except OSError:
+                found.extend(_NO_STATE)
+            else:
+                found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns))
         return found
 
-    now = array("q")
-    for _, found in by_parts(those, some.ids):
-        now += found
-    if now == some.states and -1 not in now[::3]:
+    found = array("q")
+    for _, those in by_parts(states, some.ids):
+        found += those
+    if found == some.states and -1 not in found[::3]:
         return []
     return [
         some.first + at
         for at in range(len(some.ids))
-        if now[3 * at] < 0 or now[3 * at : 3 * at + 3] != some.states[3 * at : 3 * at + 3]
+        if found[3 * at] < 0 or found[3 * at : 3 * at + 3] != some.states[3 * at : 3 * at + 3]
     ]
+
+
+def _help() -> None:
+    """Reads all jobs before it begins: who asks has work of its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; who asked decides what follows
+    die_with_parent(pickle.load(sys.stdin.buffer))
+    jobs: list[_Some] = []
+    with suppress(EOFError):
+        while True:
+            jobs.append(pickle.load(sys.stdin.buffer))
+    sys.stdout.buffer.write(pickle.dumps([number for job in jobs for number in _changed(job)]))
+
+
+if __name__ == "__main__":
+    _help()
