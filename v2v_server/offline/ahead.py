@@ -10,7 +10,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.corpus import find_corpus
-from v2v_server.catalogue.files import Notice
+from v2v_server.catalogue.files import Notice, corpus_root
 from v2v_server.catalogue.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
 from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
 from v2v_server.catalogue.scenes import Looking
@@ -63,8 +63,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     if parts is not None:
         complete = parts_in(parts)
         bucket = copies_of(asked.videos, asked.copies, asked.copies_gib, asked.cache_dir)
-        corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, None)
-        take_in_parts(index_path(corpus.root, asked.cache_dir), complete)
+        take_in_parts(index_path(bucket or corpus_root(Path(asked.videos)), asked.cache_dir), complete)
     return open_catalogue(
         asked.videos,
         list_file=asked.list_file,

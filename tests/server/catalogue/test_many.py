@@ -83,3 +83,10 @@ def test_what_stays_is_not_looked_through_again_and_again(corpus: Path, tmp_path
         gc.set_threshold(*before)
     assert gc.isenabled()
     assert collections[0] < 2 * VIDEOS / 100, "as often as the objects that are made ask for"
+
+
+def test_what_was_probed_is_written_down_after_a_while_even_if_it_is_little() -> None:
+    """A kill may not cost the hours that a few long videos took."""
+    seconds = iter(range(0, 1000, 4))
+    batches = refresh._batches((IndexRow(str(number), 1) for number in range(10)), 10, None, lambda: next(seconds))
+    assert [len(batch) for batch in batches] == [3, 3, 3, 1]

@@ -156,6 +156,8 @@ def test_parts_that_cannot_be_put_together_are_said(tmp_path: Path, run: Run) ->
     with closing(sqlite3.connect(parts / "part-1-of-1.sqlite3")) as old:
         old.execute("PRAGMA user_version = 1")
     assert "is an index of version 1, this program reads" in run("server", "--merge", str(parts))[2]
+    (tmp_path / "full").touch()
+    assert "full/catalogue-" in run("full", "--merge", str(parts))[2]
     (parts / "part-1-of-1.sqlite3").write_bytes(b"SQLite format 3\0" + b"x" * 5000)
     status, out, said = run("server", "--merge", str(parts))
     assert (status, out) == (2, "")

@@ -126,14 +126,17 @@ def take_in_parts(index: Path, parts: list[Path]) -> int:
     Raises:
         CorpusError: a part cannot be read, or the index not be written.
     """
-    records = 0
     try:
-        with closing(Store(index)) as store:
-            for part in parts:
-                try:
-                    records += store.take_in(part)
-                except ValueError as error:
-                    raise CorpusError(f"{part}: {error}; make that shard again with this program") from error
+        store = Store(index)
     except (sqlite3.Error, OSError) as error:
-        raise CorpusError(f"{part}: cannot be put into {index}: {error}") from error
+        raise CorpusError(f"the catalogue's index {index} cannot be opened: {error}") from error
+    records = 0
+    with closing(store):
+        for part in parts:
+            try:
+                records += store.take_in(part)
+            except ValueError as error:
+                raise CorpusError(f"{part}: {error}; make that shard again with this program") from error
+            except sqlite3.Error as error:
+                raise CorpusError(f"{part}: cannot be put into {index}: {error}") from error
     return records
