@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from pathlib import Path
 
 import av
@@ -108,6 +109,27 @@ def test_a_file_that_claims_a_thousand_million_frames_is_given_no_room_for_them(
     assert records["good.mov"].frames == 5
     assert records["claim.mov"].problem is not None
     assert records["claim.mov"].size_bytes > 0  # it is not read again at each start
+
+
+def _atom(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + len(content), name) + content
+
+
+@pytest.mark.parametrize("claimed", [64 << 20, 1 << 20, 2**32 - 1], ids=["as it says", "more than it says", "4 GiB"])
+def test_metadata_that_grow_when_they_are_unpacked_are_refused(tmp_path: Path, claimed: int) -> None:
+    """QuickTime may compress its table of contents (cmov): 64 kB make 64 MiB here. What may be made at all is the
+    limit of the process's memory."""
+    packed = zlib.compress(bytes(64 << 20), 9)
+    moov = _atom(b"cmov", _atom(b"dcom", b"zlib") + _atom(b"cmvd", struct.pack(">I", claimed) + packed))
+    content = _atom(b"ftyp", b"qt  \0\0\0\0qt  ") + _atom(b"moov", moov) + _atom(b"mdat", bytes(100))
+    (tmp_path / "bomb.mov").write_bytes(content)
+    (record,) = survey(tmp_path, ["bomb.mov"], 1)
+    assert record.problem in (
+        "has no video track",
+        "cannot be opened: Invalid data found when processing input",
+        "cannot be opened: Cannot allocate memory",
+    )
+    assert record.size_bytes == len(content)  # it is not read again at each start
 
 
 def test_a_list_of_frames_that_never_ends_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
