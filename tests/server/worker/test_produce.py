@@ -14,7 +14,7 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from tests.server.corpus import SMALL_SPEC
-from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Verdict, quarantine_path, read_quarantine, write_verdict
@@ -59,6 +59,15 @@ def test_a_whole_index_and_its_slice_make_the_same_sample(catalogue: Catalogue, 
     whole, part = (make_sample(each, decode_for(each, each.indices, catalogue.root)[0]) for each in (lease, cut))
     assert whole.provenance == part.provenance
     assert all(np.array_equal(array, part.arrays[name]) for name, array in whole.arrays.items())
+
+
+@pytest.mark.parametrize("video", ["../a.mp4", "sub/../../a.mp4", "/etc/passwd", "..", "//a.mp4"])
+def test_a_lease_that_leads_out_of_the_corpus_opens_nothing(catalogue: Catalogue, lease: Lease, video: str) -> None:
+    """Its worker may be on another host than the server that sent it."""
+    assert isinstance(catalogue.root, Path)
+    write_clip(catalogue.root.parent / "a.mp4", panned_luma(30, 16, 24), gop=12)
+    with pytest.raises(ProtocolError, match="leads out of the corpus folder"):
+        decode_for(dataclasses.replace(lease, video=video), lease.indices, catalogue.root)
 
 
 class TestASecondAttempt:
