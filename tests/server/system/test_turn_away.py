@@ -147,6 +147,26 @@ def test_the_kernel_turns_away(listener: socket.socket) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux has such filters")
+def test_the_kernel_turns_away_by_either_kind_of_address() -> None:
+    try:
+        server = socket.create_server(("::", 0), family=socket.AF_INET6, dualstack_ipv6=True)
+    except OSError:
+        pytest.skip("no IPv6 here")
+
+    def reaches(host: str) -> bool:
+        try:
+            with socket.create_connection((host, server.getsockname()[1]), 0.3):
+                return True
+        except TimeoutError:
+            return False
+
+    with server:
+        for away, four, six in (([], True, True), (["::1"], True, False), (["127.0.0.1"], False, True)):
+            assert turn_away(server.fileno(), [*map(network_of, away)])
+            assert (reaches("127.0.0.1"), reaches("::1")) == (four, six)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux has such filters")
 def test_sockets_of_other_kinds_are_left_alone(listener: socket.socket) -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs, socket.create_connection(listener.getsockname()) as connection:
