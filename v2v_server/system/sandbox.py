@@ -34,7 +34,8 @@ _UNIX = 1
 _LANDLOCK = (444, 445, 446)  # create, add a rule, restrict; the same on all machines
 _PATH_BENEATH = 1
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
-_KNOWN_TO = {1: 13, 2: 14, 3: 15, 4: 15}  # version of Landlock -> how many rights over files it knows; later ones 16
+_LEAST_VERSION = 2  # the first keeps everyone from moving files from one folder to another
+_KNOWN_TO = {2: 14, 3: 15, 4: 15}  # version of Landlock -> how many rights over files it knows; later ones 16
 _FILE_RIGHTS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14 | 1 << 15
 """Rights that a rule may give over something that is no folder: execute, write, read, truncate, control a device."""
 
@@ -82,7 +83,7 @@ def can_confine() -> Confined:
         return Confined(calls=False, files=False)
     kernel = ctypes.CDLL(None, use_errno=True)
     has_calls = _call(kernel, machine.seccomp, _SECCOMP_GET_ACTION_AVAIL, 0, struct.pack("=I", _REFUSE & 0xFFFF0000))
-    return Confined(has_calls == 0, _call(kernel, _LANDLOCK[0], None, 0, 1) >= 1)
+    return Confined(has_calls == 0, _call(kernel, _LANDLOCK[0], None, 0, 1) >= _LEAST_VERSION)
 
 
 def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
@@ -127,7 +128,7 @@ def program(machine: _Machine, *, network: bool) -> bytes:
 
 def _allow_writing(kernel: ctypes.CDLL, folders: Iterable[Path]) -> bool:
     version = _call(kernel, _LANDLOCK[0], None, 0, 1)
-    if version < 1:
+    if version < _LEAST_VERSION:
         return False
     every = (1 << _KNOWN_TO.get(version, 16)) - 1
     handled = every & ~(_READ_FILE | _READ_FOLDER | _EXECUTE)
