@@ -16,7 +16,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT
 
-VIDEOS = ("my.mp4", "VIDEO")
+VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
 FOLDERS = ("DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
 SMALLER = {
