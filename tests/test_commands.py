@@ -138,7 +138,7 @@ def wrong_with(words: list[str]) -> str:
         return wrong_with(rest[rest.index("--from") + 2 :])
     if program == "make":
         targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M)
-        return "" if set(rest) <= set(targets) else f"make knows {targets}"
+        return "" if {word for word in rest if "=" not in word} <= set(targets) else f"make knows {targets}"
     if program == "pip":
         extras = re.findall(r"\[([a-z,]+)\]", " ".join(rest))
         known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
