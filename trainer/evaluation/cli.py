@@ -15,7 +15,16 @@ from typing import Any, get_args
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 from trainer.convert.items import SensorSize
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
@@ -125,11 +134,16 @@ def _run(arguments: argparse.Namespace) -> int:
     for data_set in config.data_sets:
         check_data_set(run, data, data_set)
     scores: dict[str, list[SequenceScore]] = {}
-    with _progress() as advance:
-        for data_set in config.data_sets:
-            found = evaluate_data_set(run, data, data_set, advance)
-            if found:
-                scores[data_set.name] = found
+    try:
+        with _progress() as advance:
+            for data_set in config.data_sets:
+                for score in evaluate_data_set(run, data, data_set, advance):
+                    scores.setdefault(data_set.name, []).append(score)
+    except KeyboardInterrupt:
+        if scores:
+            print("interrupted; these sequences were done:", file=sys.stderr)
+            _print(config, scores)
+        raise
     if not scores:
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
         raise UsageError(f"--data {data} holds no sequence of {wanted}; v2v-convert makes the files")
@@ -255,9 +269,18 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
                 )
 
 
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        """Windows a second."""
+        return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+
 @contextlib.contextmanager
 def _progress() -> Iterator[Advance]:
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Rate(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("", total=None)

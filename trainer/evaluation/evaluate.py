@@ -121,13 +121,14 @@ def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWin
 
 def evaluate_data_set(
     run: Run, data: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
-) -> list[SequenceScore]:
-    """Scores of the sequences that are there.
+) -> Iterator[SequenceScore]:
+    """Scores of the sequences that are there, one after another.
 
     Raises:
         UsageError: see :class:`Recording` and :func:`reconstruct`.
     """
-    return [evaluate_sequence(run, path, data_set, advance) for path in find_recordings(data, data_set).values()]
+    for path in find_recordings(data, data_set).values():
+        yield evaluate_sequence(run, path, data_set, advance)
 
 
 def evaluate_sequence(

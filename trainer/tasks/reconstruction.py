@@ -127,7 +127,7 @@ class Reconstruction(Task):
 
         def scores() -> dict[str, float]:
             training = network.training
-            means = mean_over_sequences(evaluate_data_set(run, recordings, data_set))
+            means = mean_over_sequences(list(evaluate_data_set(run, recordings, data_set)))
             network.train(training)
             if not means:
                 raise UsageError(f"run.validate = {recordings}: no recording has pictures to compare with")

@@ -22,14 +22,17 @@ from rich.table import Table
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_client.tools.progress import Tell, measuring
 from v2v_client.tools.schedule_check import ScheduleCheck
-from v2v_protocol.command import Parser, run_command
+from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import SPEED_PRESETS
 
 _RSS_EVERY_SECONDS = 0.5
+_LEAST_WIDTH = 110
+"""Of a terminal, for a table of all columns."""
 
 _COLUMNS = (
     ("workers", "workers", "{}"),
@@ -106,8 +109,10 @@ def measure(
     seconds: float,
     warmup_batches: int,
     trainer_seconds: float,
+    tell: Tell = lambda _measured, _batches: None,
 ) -> tuple[dict[str, Any], ScheduleCheck]:
-    """Consumes the dataset for ``seconds`` after warm-up, over as many epochs as that takes.
+    """Consumes the dataset for ``seconds`` after warm-up, over as many epochs as that takes. A Ctrl-C ends that sooner:
+    the record is of what was measured until then, and ``interrupted``.
 
     Returns:
         one flat record, and what the schedule says of the samples that came.
@@ -117,16 +122,23 @@ def measure(
     check: ScheduleCheck | None = None
     measured = Measurement()
     received = epochs = 0
+    interrupted = False
     batches = iter(dataset)
     began = ended = time.perf_counter()
     cpu_began = usage.cpu_seconds()
     while not measured.waits or ended - began < seconds:
         asked = time.perf_counter()
-        batch = next(batches, None)
-        if batch is None:
-            epochs += 1
-            batches = iter(dataset)
-            batch = next(batches)
+        try:
+            batch = next(batches, None)
+            if batch is None:
+                epochs += 1
+                batches = iter(dataset)
+                batch = next(batches)
+        except KeyboardInterrupt:
+            if not measured.waits:
+                raise
+            interrupted = True
+            break
         wait = time.perf_counter() - asked
         if check is None:
             stream = dataset.stream
@@ -141,6 +153,7 @@ def measure(
             continue
         usage.sample(ended)
         measured.add(batch, wait, trainer_seconds)
+        tell(ended - began, len(measured.waits))
     cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
     elapsed = ended - began
     count = len(measured.waits)
@@ -167,20 +180,26 @@ def measure(
         "warmup_batches": warmup_batches,
         "batch_size": batch_size,
         "epochs": epochs,
+        "interrupted": interrupted,
         "address": address,
     }
     return record, check
 
 
-def table(records: Sequence[dict[str, Any]]) -> Table:
-    """The records as a person reads them."""
-    shown = Table(box=None, pad_edge=False)
-    for _, title, _ in _COLUMNS:
-        shown.add_column(title, justify="right", no_wrap=True)
+def table(records: Sequence[dict[str, Any]], width: int) -> Table:
+    """The records as a person reads them: a line for each, or, where ``width`` characters are too few, a column."""
+    rows = [[title for _, title, _ in _COLUMNS]]
     for record in records:
         values = {**record, "bytes_per_second": record["bytes_per_second"] / 1e6}
         values["peak_rss_bytes"] = record["peak_rss_bytes"] / 1e6
-        shown.add_row(*("-" if values[key] is None else form.format(values[key]) for key, _, form in _COLUMNS))
+        rows.append(["-" if values[key] is None else form.format(values[key]) for key, _, form in _COLUMNS])
+    if width < _LEAST_WIDTH:
+        rows = [list(column) for column in zip(*rows, strict=True)]
+    shown = Table(box=None, pad_edge=False, show_header=False)
+    for row in rows:
+        shown.add_row(*row)
+    for column in shown.columns:
+        column.justify, column.no_wrap = "right", True
     return shown
 
 
@@ -294,22 +313,33 @@ def run(arguments: argparse.Namespace) -> int:
     results = []
     if arguments.connect:
         dataset = _dataset(arguments, arguments.connect)
-        results.append(measure(dataset, address=arguments.connect, workers=None, server=None, **options))
+        with measuring(arguments.connect, arguments.seconds) as tell:
+            results.append(measure(dataset, address=arguments.connect, workers=None, server=None, tell=tell, **options))
     else:
         _dataset(arguments, "tcp://127.0.0.1:0")  # a wrong option should not cost the start of a server
         for workers in arguments.workers or (1, 2):
-            with LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server:
+            with (
+                LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server,
+                measuring(f"{workers} workers", arguments.seconds) as tell,
+            ):
                 dataset = _dataset(arguments, server.address)
-                results.append(measure(dataset, address=server.address, workers=workers, server=server, **options))
+                results.append(
+                    measure(dataset, address=server.address, workers=workers, server=server, tell=tell, **options)
+                )
+            if results[-1][0]["interrupted"]:
+                break
     records = [record for record, _ in results]
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    console.print(table(records))
+    console.print(table(records, console.width))
     print(
         f"batch size {arguments.batch_size}; {arguments.warmup_batches} warm-up batches not timed; p50 and p99: time "
         "between asking for and having a batch; CPU: " + _cpu_scope(arguments)
     )
     if arguments.json:
         write_json(arguments.json, records)
+    if records[-1]["interrupted"]:
+        print(f"interrupted after {records[-1]['seconds']:.1f} of {arguments.seconds:g} s", file=sys.stderr)
+        return INTERRUPTED
     return 0 if all(check.faultless for _, check in results) else 1
 
 

@@ -16,7 +16,16 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
@@ -192,11 +201,17 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
     return lines
 
 
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        """Frames a second."""
+        return Text("" if task.speed is None else f"{task.speed:.0f} frames/s")
+
+
 @contextlib.contextmanager
 def _progress() -> Iterator[prepare.Progress]:
     columns = (
         TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[size]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        _Rate(), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:

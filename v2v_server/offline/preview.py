@@ -88,29 +88,47 @@ def preview(
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
     notes: dict[str, list[str]] = {}
-    began = told = 0.0
+    told: _Told | None = None
     try:
         for look in looks:
             cameras.append(_camera(catalogue, look, spec, with_flow, notes))
-            now, left = time.monotonic(), len(looks) - len(cameras)
-            if len(cameras) == 1:  # it may have waited for kernels to be compiled, and says nothing of the others
-                began = told = now
-            elif left and now - told > _TOLD_SECONDS:
-                told, each = now, (now - began) / (len(cameras) - 1)
-                rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
-                say(f"{len(cameras)} of {len(looks)} cameras, {rate}, {left * each:.0f} s left")
+            if told is None:  # the first may have waited for kernels to be compiled, and says nothing of the others
+                told = _Told(say, "cameras", len(looks), done=1)
+            else:
+                told.one_more()
     finally:
         catalogue.close()
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
-    write(out, _content(out.suffix, cameras, title, moments))
+    write(out, _content(out.suffix, cameras, title, moments, say))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
-def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
+class _Told:
+    """Says now and then how many of so many things are done, how fast that goes, and how long it will take."""
+
+    def __init__(self, say: Callable[[str], None], things: str, total: int, done: int = 0) -> None:
+        self._say, self._things, self._total = say, things, total
+        self._done = self._first = done
+        self._began = self._told = time.monotonic()
+
+    def one_more(self) -> None:
+        self._done += 1
+        now, left = time.monotonic(), self._total - self._done
+        if left and now - self._told > _TOLD_SECONDS:
+            self._told, each = now, (now - self._began) / (self._done - self._first)
+            rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
+            self._say(f"{self._done} of {self._total} {self._things}, {rate}, {left * each:.0f} s left")
+
+
+def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]) -> bytes | str:
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments))
-    film = list(draw_film(cameras, title))
+    grids, bins = cameras[0].voxels.shape[:2]
+    told, film = _Told(say, "pictures of the film", grids * bins), []
+    for picture in draw_film(cameras, title):
+        film.append(picture)
+        told.one_more()
     if kind == ".mp4":
         return mp4_bytes(film, FRAMES_PER_SECOND)
     if kind == ".gif":

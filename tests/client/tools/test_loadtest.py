@@ -53,6 +53,26 @@ def test_a_consumer_that_skips_batches_is_found_out(server, tmp_path, monkeypatc
     assert json.loads(file.read_text())[0]["lost"] > 0
 
 
+def test_a_ctrl_c_ends_the_measurement_with_what_there_is(server, tmp_path, monkeypatch, capsys):
+    class Interrupted(loadtest.V2VStreamDataset):
+        def __iter__(self):
+            for batch in super().__iter__():
+                if taken:
+                    raise KeyboardInterrupt
+                taken.append(batch.indices)
+                yield batch
+
+    taken = []
+    monkeypatch.setattr(loadtest, "V2VStreamDataset", Interrupted)
+    status, file = run(server, tmp_path, "--seconds", "60", "--warmup-batches", "0")
+    assert status == 130
+    (record,) = json.loads(file.read_text())
+    assert (record["batches"], record["interrupted"]) == (1, True)
+    shown = capsys.readouterr()
+    assert "batch/s" in shown.out
+    assert "of 60 s" in shown.err
+
+
 @pytest.mark.parametrize(
     ("flags", "word"),
     [

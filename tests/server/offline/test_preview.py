@@ -128,3 +128,10 @@ def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypat
     )
     assert [line.split(" cameras")[0] for line in said] == ["2 of 4", "3 of 4", f"{tmp_path / 'p.png'}: 4"]
     assert all("a second" in line and "s left" in line for line in said[:2])
+    said.clear()
+    preview(
+        str(clip), tmp_path / "p.gif", shots[:1], {}, title="t", cache_dir=str(tmp_path), with_flow=False,
+        say=said.append,
+    )  # fmt: skip
+    assert said[0].startswith("1 of 15 pictures of the film, ")
+    assert len(said) == 15

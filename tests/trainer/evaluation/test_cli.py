@@ -70,6 +70,25 @@ def test_without_weights_the_shipped_network_is_taken(tmp_path: Path) -> None:
     assert (sequence["model"], Path(sequence["weights"]).name) == ("firenet", "firenet.pt")
 
 
+def test_a_ctrl_c_shows_what_was_done(
+    tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.h5", "b.h5"):
+        random_recording(tmp_path / "own" / name)
+    one_by_one = evaluate_module.evaluate_sequence
+
+    def until_the_second(run: Any, path: Path, *rest: Any) -> Any:
+        if path.name == "b.h5":
+            raise KeyboardInterrupt
+        return one_by_one(run, path, *rest)
+
+    monkeypatch.setattr(evaluate_module, "evaluate_sequence", until_the_second)
+    assert cli.main(["--weights", str(weights), "--data", str(tmp_path / "own")]) == 130
+    shown = capsys.readouterr()
+    assert "these sequences were done" in shown.err
+    assert "constant grey" in shown.out
+
+
 def test_scores_of_every_window_are_written(tmp_path: Path, weights: Path) -> None:
     data = random_recording(tmp_path / "a.h5")
     file = tmp_path / "frames.csv"
