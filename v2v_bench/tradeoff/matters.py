@@ -6,6 +6,7 @@
 one sample a decode), for a fixed number of batches. Each row changes one thing of that stream: one camera for all
 samples instead of random thresholds, no noise, a corpus through H.264 (made here by `v2v-prepare --codec h264`), four
 samples a decode, the effects of the preset `davis346` added. All rows of a seed begin with the same weights.
+`--set` changes something in every row, such as the width of the network.
 
 Every network is judged as by `v2v-bench learn`, on the same exact samples of videos that it never saw, under ordinary
 cameras and under the paper's. A row is better or worse than the first one if its LPIPS of all seeds lies on one side of
@@ -158,12 +159,12 @@ def compare(asked: argparse.Namespace) -> list[Record]:
             return stack.enter_context(LocalServer(videos, workers=1, flags=flags)).address
 
         address = served(asked.videos, "cache")
-        lossy = served(_lossy(asked.videos, folder / "lossy"), "lossy-cache")
+        lossy = served(asked.lossy or _lossy(asked.videos, folder / "lossy"), "lossy-cache")
         for seed in asked.seeds:
             for change, (settings, through_h264) in CHANGES.items():
                 out = folder / f"{change}-{seed}"
-                everything = {**STREAM, **loss, "run.steps": asked.steps, **settings}
-                train(lossy if through_h264 else address, CONFIGURATION, change, seed, _flags(everything), out)
+                everything = _flags({**STREAM, **loss, "run.steps": asked.steps, **settings}) + asked.changes
+                train(lossy if through_h264 else address, CONFIGURATION, change, seed, everything, out)
                 network = load_network(out / LAST, ema=True)[0]
                 for cameras, (voxels, frames) in judges.items():
                     scores = score(network.forward_sequence, voxels, frames, lpips)
@@ -190,6 +191,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--lpips", nargs=3, required=True, metavar=("NET", "BACKBONE", "HEADS"),
         help="alex, squeeze or vgg with its weight files: of the loss, and to judge by",
     )  # fmt: skip
+    parser.add_argument(
+        "--lossy", metavar="DIR", help="the videos through `v2v-prepare --codec h264`, if you have them (default: made)"
+    )
+    parser.add_argument(
+        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="of v2v-train, in every row"
+    )
     parser.add_argument("--seeds", type=seeds, default=(0, 1, 2), metavar="0,1,2")
     parser.add_argument("--steps", type=int, default=200, help="batches of each training (default 200)")
     parser.add_argument("--samples", type=int, default=12, help="held-out samples of each sort of cameras (default 12)")
