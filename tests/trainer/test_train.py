@@ -94,9 +94,11 @@ def test_a_resumed_run_is_the_uninterrupted_one(
     ],
 )
 def test_every_network_resumes_exactly(
-    server: FakeServer, tmp_path: Path, name: str, options: dict[str, Any], loss: dict[str, Any]
-) -> None:
+    server: FakeServer, tmp_path: Path, name: str, options: dict[str, Any], loss: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """Dropout and batch norm included."""
+    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)  # the other ten say nothing new
     settings: dict[str, Any] = {
         "network": {"name": name, "options": options}, "loss": loss, "stream": {"batch_size": 2},
         "optimizer": {"learning_rate": 1e-3},

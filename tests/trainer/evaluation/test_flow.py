@@ -104,7 +104,10 @@ def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(tmp_path: Path) -> None:
+def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
     path = recording(tmp_path / "a.h5")
     found = evaluate_flow(run(ERAFT(), as_published=False), path, None)
     assert found["network"].windows == 3

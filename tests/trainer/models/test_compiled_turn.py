@@ -57,10 +57,14 @@ def close(network: VoxelNetwork, eager: VoxelNetwork) -> None:
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6, msg=name)
 
 
-@pytest.mark.parametrize("name", [*list(NETWORKS)[:-1], pytest.param("eraft", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    ["firenet", "hypere2vid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("e2vid", "etnet", "eraft"))],
+)
 def test_a_turn_is_traced_as_it_is(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """All that ``torch.compile`` does but the making of machine code."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
     torch.manual_seed(3)
     compared(NETWORKS[name](bins=2))
 

@@ -33,6 +33,12 @@ def name(request: pytest.FixtureRequest) -> str:
     return chosen
 
 
+@pytest.fixture(autouse=True)
+def _two_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of E-RAFT, whose other ten say nothing new here."""
+    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
+
+
 @pytest.fixture
 def network(name: str) -> VoxelNetwork:
     """Each network, small, with weights that let the memory matter."""

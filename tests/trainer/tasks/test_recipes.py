@@ -34,8 +34,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
 QUICK = ("e2vid", "firenet-cpu", "tiny-cpu")
 """RAFT and E-RAFT have no reduced size, and most kinds of E2VID differ in a number."""
 SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in shipped()]
-SIDE_PX = 33
-"""The least that AlexNet takes, and divides by nothing."""
+SIDES_PX = {"alex": 33}
+OTHER_SIDE_PX = 17
+"""The least that each network of LPIPS takes, and divides by nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +61,15 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def side_px(config: TrainConfig) -> int:
+    return SIDES_PX.get(getattr(config.loss, "lpips_network", ""), OTHER_SIDE_PX)
+
+
 def reduced(name: str, weights: Path) -> TrainConfig:
     """The configuration with a small network, few small voxel grids, and files that are there."""
     config = load_config(name)
-    recipe = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": SIDE_PX, "crop_width_px": SIDE_PX}
+    side = side_px(config)
+    recipe = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": side, "crop_width_px": side}
     preset = config.stream.recipe["preset"] if isinstance(config.stream.recipe, Mapping) else config.stream.recipe
     settings = {
         "stream.recipe": {"preset": preset, **recipe}, "stream.batch_size": 2, "stream.loader_workers": 0,
@@ -131,7 +137,7 @@ def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
     batches = iter(Feed(dataset, ALONE.device).epochs(0, 1))
     for step in range(2):
         work = learner.task.prepare(next(batches), 0)
-        assert work.voxels.shape == (2, 3 + learner.network.lead_voxels, 2, SIDE_PX, SIDE_PX)
+        assert work.voxels.shape == (2, 3 + learner.network.lead_voxels, 2, side_px(config), side_px(config))
         learner.network.train()
         torch.manual_seed(0)
         with torch.no_grad():
@@ -173,6 +179,7 @@ def test_a_step_neither_waits_for_the_device_nor_copies_to_it(
     server: FakeServer, weights: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the batch on the device to the reading of the meter."""
+    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)  # the other ten say nothing new
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # it does not know this device
     config = reduced(name, weights)
     learner = build(config, Ranks(0, 1, torch.device("meta")))
