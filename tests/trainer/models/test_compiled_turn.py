@@ -59,7 +59,7 @@ def close(network: VoxelNetwork, eager: VoxelNetwork) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["firenet", "hypere2vid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("e2vid", "etnet", "eraft"))],
+    [pytest.param(name, marks=[] if name == "firenet" else [pytest.mark.slow]) for name in NETWORKS],
 )
 def test_a_turn_is_traced_as_it_is(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """All that ``torch.compile`` does but the making of machine code."""
