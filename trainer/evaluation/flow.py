@@ -5,13 +5,14 @@ with EE above 3 (3PE) are taken, then the mean over the windows of a sequence. *
 *Sparse*: of these, only those with events in the window's voxel grid. "zeros" is what predicting no motion scores: it
 needs no network, so it checks files, windows and masks.
 
-Two conventions differ, and both are known by what they call the published one:
+Two conventions differ:
 
 | | right (default) | as published |
 |---|---|---|
 | flow field i | is of the window that begins at its time, as EV-FlowNet and E-RAFT define it | of the one before |
 | the car's hood | rows from 190 on do not count in sequences ``outdoor*`` (EV-FlowNet) | counts |
 | a window in which nothing counts | is left out | scores 0 |
+| events of the sparse scores, for E-RAFT | those of the window | those of the window before |
 """
 
 from __future__ import annotations
@@ -114,13 +115,16 @@ def evaluate_flow(
         windows = flow_windows(recording, cut, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]
+        late = run.as_published and run.network.lead_voxels > 0
+        earlier = np.zeros(recording.size, bool)
         for number, (window, grid, prediction) in enumerate(_estimate(run, recording, windows), start=1):
             truth = recording.flow(window)
             events = (grid != 0).any(axis=0)
-            scores["network"].add(prediction, truth, events, rows)
+            scores["network"].add(prediction, truth, earlier if late else events, rows)
             scores["zeros"].add(np.zeros_like(truth), truth, events, rows)
             if run.out is not None and number == max(1, len(windows) // 2):
                 _draw(run.out / f"{recording.name}.png", grid, truth, prediction)
+            earlier = events
             advance(recording.name, number, len(windows))
     return scores
 

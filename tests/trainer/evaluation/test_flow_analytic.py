@@ -10,15 +10,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from tests.trainer.evaluation.test_flow import constant
 from trainer.convert.cli import main as convert
 from trainer.evaluation.cli import main as evaluate
+from trainer.evaluation.flow import FlowRun, evaluate_flow
+from trainer.evaluation.voxelise import VoxelSettings
+from trainer.models import EVFlowNet
 
 HEIGHT, WIDTH = 200, 6
 PARTS = {"A": (0, 100), "B": (100, 190), "hood": (190, 200)}
@@ -88,6 +93,32 @@ def test_aee_and_3pe_of_a_constant_prediction_and_of_none(tmp_path: Path, name: 
             expected = {key: value * 2 / 3 if "sparse" in key else value for key, value in expected.items()}
         assert found[who]["windows"] == 3
         assert {key: found[who][key] for key in expected} == pytest.approx(expected, rel=1e-5)
+
+
+class Late(EVFlowNet):
+    """Also takes the window before, as E-RAFT does, and has no use for it."""
+
+    lead_voxels = 1
+
+    def unroll(self, x: Tensor, state: Any, steps: int, _guide: Any) -> tuple[Tensor, tuple[()]]:
+        return self.unet(x)[0 if state is not None else len(x) // steps :], ()
+
+
+@pytest.mark.parametrize("as_published", [False, True])
+def test_as_published_the_events_of_eraft_are_those_of_the_window_before(tmp_path: Path, as_published: bool) -> None:
+    """Windows 0 and 1 have events; as published windows 1 and 2 count, with fields 2 and 3, and window 0 scores 0."""
+    assert not convert([str(write_raw(tmp_path, "indoor_flying1")), "--out", str(tmp_path)])
+    network = Late(base_channels=2)
+    network.load_state_dict(constant(PREDICTED, 0.0).state_dict())
+    run = FlowRun(network, VoxelSettings(), as_published=as_published)
+    found = evaluate_flow(run, tmp_path / "indoor_flying1.h5", None)
+    every = ("A", "B", "hood")
+    expected = by_hand(PREDICTED, (2, 3) if as_published else (0, 1), every)
+    of_zeros = by_hand(0.0, (1, 2) if as_published else (0, 1), every)
+    share = 2 / 3 if as_published else 1
+    for name in ("aee_sparse", "3pe_sparse"):
+        assert found["network"].means[name] == pytest.approx(share * expected[name], rel=1e-5)
+        assert found["zeros"].means[name] == pytest.approx(share * of_zeros[name], rel=1e-5), "it is no E-RAFT"
 
 
 def test_zeros_by_hand() -> None:
