@@ -105,5 +105,5 @@ def ranks(device: str) -> Iterator[Ranks]:
     # gone, and its threads joined, before that: models lie in reference cycles, which only a collection ends.
     gc.collect()
     # Not on the way out of an error: NCCL would wait for ranks that wait for this one, and nobody would read the error.
-    # A process that ends leaves the group by itself.
+    # A process that ends leaves the group by itself, at worst by the abort of above, after its error was said.
     distributed.destroy_process_group()
