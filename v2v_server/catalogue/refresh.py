@@ -102,7 +102,7 @@ def _refreshed(
                     records.change(place, record)
         records.fingerprints.settle()
         if looking is not None:
-            looking.take_in(store, root, {record.id: record for record in records}, processes, progress)
+            looking.take_in(store, root, records, processes, progress)
         _copy(store, mark)
         return store, records
     except BaseException:

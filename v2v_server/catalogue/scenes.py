@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import hashlib
 from base64 import b64decode
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
+from v2v_server.catalogue.index.columns import Records
+from v2v_server.catalogue.index.copy import NoCopy, copied, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
+from v2v_server.catalogue.videos import Runs
 from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.isolate import Died, run_isolated
@@ -53,7 +57,7 @@ class Looking:
         self,
         store: Store,
         root: Path | Copies,
-        records: Mapping[str, IndexRow],
+        records: Records,
         processes: int,
         progress: Callable[[int, int], None] | None,
     ) -> None:
@@ -62,9 +66,8 @@ class Looking:
         Raises:
             sqlite3.Error: the index cannot be written.
         """
-        sound = [record for record in records.values() if record.problem is None]
-        known = store.looked_at(self.key)
-        missing = [record for record in sound if known.get(record.id) != record.fingerprint]
+        places = (records.ids.find(id) for id in store.not_looked_at(self.key))
+        missing = [records[place] for place in places if place is not None]
         total = len(missing)
         batch: list[tuple[str, str, str, bytes]] = []
         with closing(self._found(store, root, missing, processes)) as found:
@@ -77,26 +80,42 @@ class Looking:
                     batch = []
         store.put_scenes(batch)
 
-    def runs(
+    def cuts(
         self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str
-    ) -> tuple[list[tuple[tuple[int, int], ...]], str]:
-        """The runs of each video, and a digest that names all that is known of them.
+    ) -> tuple[dict[int, Runs], str]:
+        """The runs of the videos whose one run is not the whole of them, by number, and a digest that names all that is
+        known of them. Of a large index the answer is kept, for it takes a minute for a million.
 
         Args:
             records: of the videos of a snapshot, in its order.
             unseen: ids of videos of which nothing is known; receives those that the index has no look at.
             digest: of the snapshot.
         """
+        with store.reading() as mark:
+            state = f"{mark} {self.key} {digest}" if mark and not unseen else ""
+            with suppress(NoCopy), closing(read_copy(store.path, state, "scenes")) as parts:
+                (kept,) = parts
+                unseen.update(kept["unseen"])
+                return {number: tuple(map(tuple, runs)) for number, runs in kept["cuts"]}, kept["digest"]
+            cuts, name = self._cuts(store, records, unseen, digest)
+            answer = {"cuts": list(cuts.items()), "digest": name, "unseen": sorted(unseen)}
+            deque(copied(store.path, state, [answer], "scenes"), maxlen=0)
+        return cuts, name
+
+    def _cuts(
+        self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str
+    ) -> tuple[dict[int, Runs], str]:
         sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
-        runs = []
-        for record in records:
+        cuts: dict[int, Runs] = {}
+        for number, record in enumerate(records):
             data = None if record.id in unseen else store.scene(record.id, record.fingerprint, self.key)
             if data is None:
                 unseen.add(record.id)
             scene = Scene.unknown() if data is None else Scene.from_bytes(data)
             sha.update(scene.to_bytes())
-            runs.append(tuple(scene.runs(record.frames)))
-        return runs, sha.hexdigest()[:32]
+            if (runs := tuple(scene.runs(record.frames))) != ((0, record.frames),):
+                cuts[number] = runs
+        return cuts, sha.hexdigest()[:32]
 
     def _found(
         self, store: Store, root: Path | Copies, missing: list[IndexRow], processes: int

@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from v2v_server.catalogue import refresh
@@ -18,6 +19,9 @@ from v2v_server.catalogue.index import file as file_module
 from v2v_server.catalogue.index.copy import NoCopy, copied, copy_path, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.refresh import index_path
+from v2v_server.catalogue.scene import COLUMNS, Scene
+from v2v_server.catalogue.scenes import Looking
+from v2v_server.video.rows import Rows
 
 PARTS = [{"ids": [b"a", b"1"], "n": [1, 2]}, {"ids": [b"b", b"2"], "n": []}]
 
@@ -169,6 +173,47 @@ def test_who_stops_in_the_middle_leaves_no_copy(tmp_path: Path) -> None:
     next(begun)
     begun.close()
     assert list(tmp_path.iterdir()) == []
+
+
+def with_scenes(corpus: Corpus, *names: str, cut: int = 200) -> None:
+    """Notes down a look at each video: one cut, at a frame of its own."""
+    values = np.full((19, COLUMNS), 2.0)
+    with closing(Store(corpus.index)) as store:
+        store.not_looked_at("")  # makes the table
+        looks = [(name, f"0-{name}", Scene.of(300, (cut + int(name[:3]),), values).to_bytes()) for name in names]
+        store.put_scenes((id, mark, Looking(Rows(), None).key, data) for id, mark, data in looks)
+
+
+def seen(corpus: Corpus) -> tuple[str | None, list[tuple[str, object]]]:
+    with closing(open_catalogue(corpus.folder, cache_dir=corpus.cache, processes=0, scene=True)) as catalogue:
+        return catalogue.scene_digest, [(video.id, video.runs) for video in catalogue.videos]
+
+
+def test_what_is_known_of_scenes_is_kept_until_the_index_changes(
+    corpus: Corpus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [path.name for path in corpus.folder.iterdir()]
+    with_scenes(corpus, *names)
+    first = seen(corpus)
+    assert dict(first[1])["007.mp4"] == ((0, 207), (207, 300))
+    asked: list[str] = []
+    scene = Store.scene
+    monkeypatch.setattr(Store, "scene", lambda store, id, *more: asked.append(id) or scene(store, id, *more))
+    assert seen(corpus) == first
+    assert asked == []
+    with_scenes(corpus, "007.mp4", cut=100)
+    digest, runs = seen(corpus)
+    assert len(asked) == 40
+    assert digest != first[0]
+    assert dict(runs)["007.mp4"] == ((0, 107), (107, 300))
+    path = copy_path(corpus.index, "scenes")
+    path.write_bytes(path.read_bytes()[:-9])
+    assert seen(corpus) == (digest, runs)
+    assert len(asked) == 80
+    (corpus.folder / "003.mp4").unlink()  # another catalogue, with another digest
+    fewer = seen(corpus)
+    assert fewer[0] not in (digest, first[0])
+    assert fewer[1] == [each for each in runs if each[0] != "003.mp4"]
 
 
 def test_a_small_index_has_no_copy(corpus: Corpus, tmp_path: Path) -> None:

@@ -234,7 +234,7 @@ def test_an_index_that_knows_something_already_keeps_it(tmp_path: Path) -> None:
     with closing(Store(tmp_path / "one")) as one, closing(Store(tmp_path / "other")) as other:
         one.put([IndexRow("a", 1, fingerprint="old"), IndexRow("b", 1, fingerprint="kept")])
         other.put([IndexRow("a", 2, fingerprint="new"), IndexRow("c", 3)])
-        other.looked_at("look")  # makes the table
+        other.not_looked_at("look")  # makes the table
         other.put_scenes([("a", "new", "look", b"scene")])
         assert one.take_in(tmp_path / "other") == 2
         assert [(row[0], row[4]) for row in one.rows()] == [("a", "new"), ("b", "kept"), ("c", "")]

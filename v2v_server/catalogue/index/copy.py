@@ -30,17 +30,18 @@ class NoCopy(Exception):
     """There is no copy of that state of the index that can be read."""
 
 
-def copy_path(index: Path) -> Path:
-    """Where the copy of an index lies."""
-    return index.with_suffix(".columns")
+def copy_path(index: Path, kind: str = "columns") -> Path:
+    """Where the copy of an index lies, or what else was made of it."""
+    return index.with_suffix(f".{kind}")
 
 
-def read_copy(index: Path | None, mark: str) -> Generator[Part, None, None]:
+def read_copy(index: Path | None, mark: str, kind: str = "columns") -> Generator[Part, None, None]:
     """The parts of an index's copy, in the order of their records.
 
     Args:
         index: the file; None where it is in memory.
         mark: of its state; empty where it has none.
+        kind: what was made of it.
 
     Raises:
         NoCopy: at any part: what came before it is worth nothing then.
@@ -48,7 +49,7 @@ def read_copy(index: Path | None, mark: str) -> Generator[Part, None, None]:
     if index is None or not mark:
         raise NoCopy
     try:
-        with copy_path(index).open("rb") as file:
+        with copy_path(index, kind).open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC or _body(file) != mark.encode():
                 raise NoCopy
             while body := _body(file):
@@ -69,13 +70,13 @@ def _body(file: BinaryIO) -> bytes:
     return body
 
 
-def copied(index: Path | None, mark: str, parts: Iterable[Part]) -> Generator[Part, None, None]:
+def copied(index: Path | None, mark: str, parts: Iterable[Part], kind: str = "columns") -> Generator[Part, None, None]:
     """Passes parts of an index on, and leaves a copy of them all behind. One that cannot be written costs time at the
     next start, nothing else."""
     if index is None or not mark:
         yield from parts
         return
-    path = copy_path(index)
+    path = copy_path(index, kind)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         file = partial.open("wb", buffering=0)

@@ -178,8 +178,8 @@ class Store:
         row = self._database.execute("SELECT size_bytes, mtime_ns FROM video WHERE id = ?", (id,)).fetchone()
         return None if row is None else (row[0], row[1])
 
-    def looked_at(self, look: str) -> dict[str, str]:
-        """Fingerprint by id of the files whose scene is known.
+    def not_looked_at(self, look: str) -> list[str]:
+        """The sound files whose scene is not known as they are.
 
         Args:
             look: how and at which rows, see :class:`v2v_server.catalogue.scenes.Looking`.
@@ -188,7 +188,12 @@ class Store:
             sqlite3.Error: the file is damaged or cannot be written.
         """
         self._database.execute(_SCENES)
-        return dict(self._database.execute("SELECT id, fingerprint FROM scene WHERE look = ?", (look,)).fetchall())
+        query = (
+            "SELECT video.id FROM video LEFT JOIN scene ON scene.id = video.id AND scene.look = ? "
+            "AND scene.fingerprint = video.fingerprint WHERE scene.id IS NULL AND video.problem IS NULL "
+            "ORDER BY video.id"
+        )
+        return [id for (id,) in self._database.execute(query, (look,))]
 
     def scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
         """The encoded scene of a file; None if the index has none of that state of it.
