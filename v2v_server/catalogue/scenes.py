@@ -139,7 +139,7 @@ class Looking:
             partial(_look_at, root),
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
-            confined=not isinstance(root, Copies),
+            writable=None if isinstance(root, Copies) else (),
         )
         suspects = []
         for job, scene in isolated(jobs(), processes):

@@ -109,13 +109,12 @@ def survey(
         examine: what is done with each file; must be picklable.
         longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
     """
-    confined = not isinstance(root, Copies)  # which fetches: from a network, into a folder
     isolated = partial(
         run_isolated,
         partial(examine, root),
         deadline_seconds=lambda id: longest_seconds,
         memory_bytes=LARGEST_MEMORY_BYTES,
-        confined=confined,
+        writable=None if isinstance(root, Copies) else (),  # copies are fetched: from a network, into a folder
     )
     suspects: list[str] = []
     for id, found in isolated(ids, processes):

@@ -31,6 +31,7 @@ from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.encoding import Encoding
+from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
@@ -250,7 +251,14 @@ def _outcomes(
                 job.window, encoding, target, target / id, scene,
             )  # fmt: skip
 
-    for (job, _), result in run_isolated(_attempt, transcodings(), processes, lambda job: _deadline_seconds(job[0])):
+    isolated = run_isolated(
+        _attempt,
+        transcodings(),
+        processes,
+        lambda job: _deadline_seconds(job[0]),
+        writable=(target, *compile_cache()),
+    )
+    for (job, _), result in isolated:
         if isinstance(result, Died):
             if result.overdue_seconds:
                 result = f"hangs the transcoder: {result.how}"

@@ -67,6 +67,12 @@ def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> 
     environment.pop(_VARIABLE, None)
 
 
+def compile_cache(environment: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
+    """The folder that was chosen, if there is one."""
+    chosen = environment.get(_VARIABLE, "")
+    return (Path(chosen),) if chosen else ()
+
+
 def sources_digest(folder: Path = SOURCES) -> str:
     """Names a state of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
     digest = hashlib.sha256(version("numba").encode() + _processor())

@@ -12,10 +12,11 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from v2v_protocol.errors import UsageError
@@ -74,7 +75,7 @@ def run_isolated(
     processes: int,
     deadline_seconds: Callable[[J], float] | None = None,
     memory_bytes: int = 0,
-    confined: bool = False,
+    writable: Sequence[Path] | None = None,
 ) -> Iterator[tuple[J, R | Died]]:
     """(job, result) for every job, in order of completion.
 
@@ -88,7 +89,8 @@ def run_isolated(
         deadline_seconds: how long a job may take, its process's start included, before that is killed; None: any time.
             Only time that is spent waiting here counts, so that nothing is overdue after the whole program was stopped.
         memory_bytes: how much a process may allocate: more is refused to whatever asks for it; 0 sets no limit.
-        confined: it only reads and answers, see :mod:`v2v_server.system.sandbox`.
+        writable: what a process may write to, where it may do no more than read, compute and answer
+            (:mod:`v2v_server.system.sandbox`); None: it may do anything.
 
     Raises:
         OSError: no process can be started.
@@ -101,7 +103,7 @@ def run_isolated(
     lanes: dict[Connection, _Lane[J, R]] = {}
     try:
         for job in left:
-            lane = _Lane(function, deadline_seconds, memory_bytes, confined)
+            lane = _Lane(function, deadline_seconds, memory_bytes, writable)
             lanes[lane.connection] = lane
             lane.begin(job)
             if len(lanes) == processes:
@@ -115,7 +117,7 @@ def run_isolated(
                     continue
                 for following in left:
                     if isinstance(finished[1], Died):
-                        lane = _Lane(function, deadline_seconds, memory_bytes, confined)
+                        lane = _Lane(function, deadline_seconds, memory_bytes, writable)
                         lanes.pop(ready).end()
                         lanes[lane.connection] = lane
                     lane.begin(following)
@@ -150,14 +152,14 @@ class _Lane(Generic[J, R]):
         function: Callable[[J], R],
         deadline_seconds: Callable[[J], float] | None,
         memory_bytes: int,
-        confined: bool,
+        writable: Sequence[Path] | None,
     ) -> None:
         self._deadline_seconds = deadline_seconds
         self.patience = math.inf
         self._begun = False
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
-        given = other, function, os.getpid(), memory_bytes, confined
+        given = other, function, os.getpid(), memory_bytes, writable
         self._process = context.Process(target=_serve, args=given, daemon=True)
         # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
         resource_tracker.ensure_running()
@@ -220,13 +222,17 @@ def _interrupt_held_back() -> Iterator[None]:
 
 
 def _serve(
-    connection: Connection, function: Callable[[Any], Any], parent_pid: int, memory_bytes: int, confined: bool
+    connection: Connection,
+    function: Callable[[Any], Any],
+    parent_pid: int,
+    memory_bytes: int,
+    writable: Sequence[Path] | None,
 ) -> None:
     die_with_parent(parent_pid)
     if memory_bytes:
         limit_memory(memory_bytes)
-    if confined:
-        confine((), network=False)
+    if writable is not None:
+        confine(writable, network=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
     connection.send(None)  # begun: what ends this process from here on is no fault of its start
     while True:

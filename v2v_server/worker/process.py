@@ -26,6 +26,7 @@ from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
 from v2v_server.cloud.copies import Copies
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
+from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.log import Log
 from v2v_server.system.process import (
     die_with_parent,
@@ -314,8 +315,7 @@ def _written(root: Path | Copies, address: str, cache: Cache | None) -> list[Pat
     tools of object storage write where they like."""
     if isinstance(root, Copies) or not leaves_host(address):
         return None
-    kernels = os.environ.get("NUMBA_CACHE_DIR")
-    return [*([Path(kernels)] if kernels else []), *([] if cache is None else [cache.folder])]
+    return [*compile_cache(), *([] if cache is None else [cache.folder])]
 
 
 def run_worker(
