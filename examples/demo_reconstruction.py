@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer.pictures import Video, contact_sheet, draw_events, draw_grey, side_by_side, write_png
+from trainer.pictures import EVENTS, Video, contact_sheet, draw_events, draw_grey, headed, side_by_side, write_png
 from trainer.weights import SHIPPED, load_network
 from v2v_client import V2VDataset
 
@@ -21,6 +21,7 @@ _RECIPE = {
     "flip_probability": 0.0,
 }
 _ROWS = 4
+_PANELS = (EVENTS, "camera", "reconstruction")
 _FILM_HZ = 10.0
 
 
@@ -37,8 +38,9 @@ def reconstruct(clip: Path, picture: Path) -> None:
         seen = network.forward_sequence(torch.from_numpy(sample["voxels"])[None].float())[0, :, 0].clamp(0, 1).numpy()
     target = sample["frames"][:, 0].astype(np.float32) / 255.0
     film = side_by_side([draw_events(sample["voxels"]), draw_grey(target), draw_grey(seen)])
-    write_png(picture, contact_sheet(film, _ROWS))
+    title = "Reconstructed from events by the shipped network"
+    write_png(picture, headed(contact_sheet(film, _ROWS), _PANELS, title, time_runs_down=True))
     with Video(picture.with_suffix(".mp4"), _FILM_HZ) as video:
         for image in film:
-            video.add(image)
+            video.add(headed(image, _PANELS))
     print(f"picture: {picture} (events, camera, what the shipped network made of the events; time runs down)")

@@ -85,7 +85,7 @@ def train(
         assert held_out is not None
         values, films = task.judge(learner.trained, held_out, run.preview_samples if with_films else 0)
         reporter.held_out(step, values)
-        reporter.preview(step, films)
+        reporter.preview(step, films, task.panels)
 
     def save(name: str) -> None:
         if not ranks.first:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import colours, files
+from v2v_pictures.canvas import SOFT, Canvas
 from v2v_protocol.errors import UsageError
 
 GAP_PX = 4
@@ -22,6 +23,10 @@ LEAST_COUNT = 1e-3
 FULL_COLOUR_QUANTILE = 0.98
 CODEC = "vp09"
 """VP9: the one codec of OpenCV's wheels that browsers show too."""
+
+EVENTS = "events"
+"""The name of a panel of events."""
+_TITLE_PX, _NAMES_PX, _TIME_PX, _SMALL_PT = 40, 42, 44, 13
 
 Image = npt.NDArray[np.uint8]
 
@@ -62,6 +67,39 @@ def contact_sheet(film: Image, steps: int = 5) -> Image:
     """[T, height, width, 3] -> [steps * height, width, 3]: evenly spaced times below each other, the last included."""
     picks = np.unique(np.linspace(0, len(film) - 1, steps + 1).round().astype(int)[1:])
     return np.concatenate(list(film[picks]), axis=0)
+
+
+def headed(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_down: bool = False) -> Image:
+    """A picture of equally wide columns, with the name of each above it; red and blue are said in red and blue.
+
+    Args:
+        picture: [height, width, 3], as :func:`side_by_side` and :func:`contact_sheet` give it.
+        panels: names of its columns; none leaves the picture as it is.
+        title: of the whole, or nothing.
+        time_runs_down: an arrow on the left says so.
+
+    Returns:
+        [height + more, width + more, 3] uint8.
+    """
+    if not panels:
+        return picture
+    left, top = (_TIME_PX if time_runs_down else 0), _NAMES_PX + (_TITLE_PX if title else 0)
+    height, width = picture.shape[:2]
+    page = Canvas(left + width, top + height)
+    if title:
+        page.title(4, 4, title)
+    for number, name in enumerate(panels):
+        x = left + number * width / len(panels) + 2
+        page.text(x, top - _NAMES_PX, name)
+        if name == EVENTS:
+            end = page.text(x, top - _NAMES_PX + 20, "brighter", colour=colours.BRIGHTER, size=_SMALL_PT)
+            page.text(end + 6, top - _NAMES_PX + 20, "darker", colour=colours.DARKER, size=_SMALL_PT)
+    if time_runs_down:
+        page.text(2, top, "time", colour=SOFT)
+        page.vector(left / 2, top + 26, 0, height - 34)
+    drawn = page.image()
+    drawn[top:, left:] = picture
+    return drawn
 
 
 def write_png(path: Path, image: Image) -> None:

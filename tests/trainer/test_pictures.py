@@ -16,6 +16,7 @@ from trainer.pictures import (
     draw_flow,
     draw_grey,
     flow_scale,
+    headed,
     side_by_side,
     write_png,
 )
@@ -65,6 +66,19 @@ def test_a_film_is_large_enough_to_see() -> None:
     assert film.shape == (steps, factor * height + GAP_PX, 3 * (factor * width + GAP_PX), 3)
     assert contact_sheet(film, steps=3).shape == (3 * film.shape[1], film.shape[2], 3)
     assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
+
+
+def test_a_headed_picture_keeps_its_pixels_and_names_its_columns() -> None:
+    picture = np.random.default_rng(0).integers(0, 255, (60, 390, 3)).astype(np.uint8)
+    page = headed(picture, ("events", "target", "reconstruction"), "step 7", time_runs_down=True)
+    assert np.array_equal(page[-60:, -390:], picture)
+    names = page[:-60, -390:]
+    columns = np.split(names, 3, axis=1)
+    assert all((column < 100).all(axis=-1).any() for column in columns)
+    assert (columns[0] == BRIGHTER).all(axis=-1).any()
+    assert (columns[0] == DARKER).all(axis=-1).any()
+    assert not any((column == BRIGHTER).all(axis=-1).any() for column in columns[1:])
+    assert headed(picture, ()) is picture
 
 
 def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:

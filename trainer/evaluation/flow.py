@@ -152,7 +152,8 @@ def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, predictio
     known = np.nan_to_num(truth)
     scale = pictures.flow_scale(known)
     panels = [pictures.draw_events(grid), *(pictures.draw_flow(flow, scale) for flow in (known, prediction))]
-    pictures.write_png(path, pictures.side_by_side([panel[None] for panel in panels])[0])
+    drawn = pictures.side_by_side([panel[None] for panel in panels])[0]
+    pictures.write_png(path, pictures.headed(drawn, (pictures.EVENTS, "true flow", "flow found")))
 
 
 def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:

@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from trainer.config import TrainConfig
 from trainer.config_file import show_config
-from trainer.pictures import Image, Video, contact_sheet, write_png
+from trainer.pictures import Image, Video, contact_sheet, headed, write_png
 from trainer.run.checkpoint import replacing
 from trainer.run.distributed import Ranks
 from v2v_client import V2VStreamDataset
@@ -190,17 +190,17 @@ class Reporter:
                 group = "held_out" if name.startswith("held_out_") else _GROUPS.get(name, "loss")
                 self._board.add_scalar(f"{group}/{name.removeprefix('held_out_')}", value, record["step"])
 
-    def preview(self, step: int, films: Sequence[Image]) -> None:
-        """Films of a task, one per sample, equally large."""
+    def preview(self, step: int, films: Sequence[Image], panels: Sequence[str]) -> None:
+        """Films of a task, one per sample, equally large; ``panels`` names what they show side by side."""
         if self._board is None:
             return
         name = f"step-{step:07d}"
         for number, film in enumerate(films):
-            sheet = contact_sheet(film)
+            sheet = headed(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
             write_png(self._out / "previews" / f"{name}-{number}.png", sheet)
             with Video(self._out / "previews" / f"{name}-{number}.mp4", FRAMES_PER_SECOND) as video:
                 for image in film:
-                    video.add(image)
+                    video.add(headed(image, panels))
             self._board.add_image(f"preview/{number}", sheet, step, dataformats="HWC")
         self._board.flush()
 

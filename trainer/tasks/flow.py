@@ -81,6 +81,7 @@ class Flow(Task):
     """
 
     Settings = FlowTaskSettings
+    panels = (pictures.EVENTS, "flow to find", "flow found")
 
     def __init__(
         self, settings: FlowTaskSettings, network: VoxelNetwork, device: torch.device, *, bfloat16: bool

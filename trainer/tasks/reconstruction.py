@@ -67,6 +67,7 @@ class Reconstruction(Task):
     """
 
     Settings = ReconstructionSettings
+    panels = (pictures.EVENTS, "target", "reconstruction")
 
     def __init__(
         self, settings: ReconstructionSettings, _network: VoxelNetwork | None, device: torch.device, *, bfloat16: bool

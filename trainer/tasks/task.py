@@ -77,6 +77,7 @@ class Task(abc.ABC):
 
     A subclass has as class attribute:
         Settings: frozen dataclass of the keys of section ``loss``.
+        panels: names of what its films show side by side; none: they have no headings.
 
     Args:
         settings: an instance of it.
@@ -89,6 +90,7 @@ class Task(abc.ABC):
     """
 
     Settings: ClassVar[type[Any]]
+    panels: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def __init__(self, settings: Any, network: VoxelNetwork, device: torch.device, *, bfloat16: bool) -> None: ...
