@@ -111,6 +111,7 @@ def draw(curves: dict[str, list[tuple[int, float]]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 3.5))
     for name, curve in curves.items():
         axes.plot([step for step, _ in curve], [loss / curve[0][1] for _, loss in curve], label=name, linewidth=1.2)
+    axes.set_title("Four clips again and again: does each network learn them?")
     axes.set_xlabel("optimiser step")
     axes.set_ylabel("loss / first loss")
     axes.set_ylim(0, 1.1)

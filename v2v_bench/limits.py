@@ -153,7 +153,7 @@ def work(asked: argparse.Namespace) -> int:
     write(records, asked.json)
     if asked.plot is not None:
         values = {record["part"]: record["batches_per_cpu_second"] for record in records}
-        with plots.panels(asked.plot) as (axes,):
+        with plots.panels(asked.plot, title="Upper limits of speed") as (axes,):
             plots.bars(axes, values, f"batches of {size} a second of processor time", log=True)
     return 0
 

@@ -12,12 +12,13 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def panels(file: Path, count: int = 1, *, height_inches: float = 4.0) -> Iterator[Sequence[Axes]]:
+def panels(file: Path, count: int = 1, *, title: str, height_inches: float = 4.0) -> Iterator[Sequence[Axes]]:
     """Axes side by side; the picture is written when the block ends without an error.
 
     Args:
         file: PNG to write.
         count: number of panels.
+        title: of the picture.
         height_inches: of the picture.
     """
     # Only where a picture is asked for: measuring needs no matplotlib.
@@ -28,6 +29,7 @@ def panels(file: Path, count: int = 1, *, height_inches: float = 4.0) -> Iterato
 
     figure, axes = pyplot.subplots(1, count, figsize=(2.2 + 4.6 * count, height_inches), squeeze=False)
     try:
+        figure.suptitle(title)
         yield list(axes[0])
         figure.tight_layout()
         figure.savefig(file, dpi=110)

@@ -52,6 +52,7 @@ def plot(records: Sequence[dict[str, Any]], path: Path) -> None:
     shown = [r for r in records if r["bound"] > 0][::-1]
     figure, axis = pyplot.subplots(figsize=(7.5, 0.28 * len(shown) + 1))
     axis.barh([r["row"] for r in shown], [max(r["measured"] / r["bound"], 1e-6) for r in shown])
+    axis.set_title("Error of extreme settings against its bound (line)")
     axis.axvline(1.0, color="black", lw=1)
     axis.set(xscale="log", xlim=(1e-6, 2), xlabel="measured / bound")
     axis.tick_params(axis="y", labelsize=7)

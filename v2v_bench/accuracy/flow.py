@@ -315,6 +315,7 @@ def plot(records: Sequence[dict[str, Any]], path: Path) -> None:
         axis.set(xscale="log", yscale="log", title=picture, xlabel="CPU ms a pair")
         axis.legend(title="estimated on")
     axes[0].set_ylabel("mean endpoint error, px")
+    figure.suptitle("Optical flow: error against cost")
     figure.tight_layout()
     figure.savefig(path, dpi=120)
     pyplot.close(figure)

@@ -85,6 +85,7 @@ def plot(records: Records, path: Path) -> None:
         axes[0].plot([r["frame_rate_hz"] for r in row], [r["voxel_error"] for r in row], "o-", ms=3, label=name)
     axes[0].set(title="formulas, c = 0.2", xlabel="frames a second")
     axes[0].set_ylabel("voxel error")
+    figure.suptitle("Voxel error of frames against an exact sensor")
     chosen = [r for r in records if r.get("reference") == "light"]
     chosen = [r for r in chosen if r["every"] == max(r["every"] for r in chosen)]
     for number, threshold in enumerate(_thresholds(chosen)):

@@ -300,7 +300,7 @@ _PARTS: tuple[Column, ...] = (
 def draw(records: Sequence[Record], file: Path) -> None:
     """Saved flow against added error, a dot a clip."""
     clips = [record for record in records if record["measure"] == "clip"]
-    with panels(file, 2) as (left, right):
+    with panels(file, 2, title="What choosing by the scene changes") as (left, right):
         kinds = sorted({record["decision"] for record in clips})
         for kind in kinds:
             chosen = [record for record in clips if record["decision"] == kind]

@@ -159,6 +159,7 @@ def plot(file: Path, memory: dict[str, list[tuple[float, float]]], fits: dict[st
         line = [(at / 60, fits[name].slope * (at - mean_at) / 60) for at, _ in after]
         axes.plot([at for at, _ in line], [mib for _, mib in line], "--", color=drawn[0].get_color())
     axes.axvline(warm_up / 60, color="grey", linewidth=0.8)
+    axes.set_title("Memory of each process over the soak, and the slope fitted to it")
     axes.set_xlabel("minutes")
     axes.set_ylabel("resident memory less its mean after warm-up, MiB")
     axes.legend()

@@ -247,7 +247,7 @@ def work(asked: argparse.Namespace) -> int:
 def plot(file: Path, records: Sequence[dict[str, Any]]) -> None:
     """Batches a second and utilisation over server workers, with the ceiling."""
     top, fed_ = records[0], {record["workers"]: record for record in records[1:]}
-    with plots.panels(file, 2) as (speed, utilisation):
+    with plots.panels(file, 2, title="Feeding a GPU") as (speed, utilisation):
         plots.line(speed, {n: record["batches_per_second"] for n, record in fed_.items()}, "fed by the stream")
         speed.axhline(top["batches_per_second"], linestyle="--", color="grey", label="one cached batch")
         speed.set_ylabel("batches/s")

@@ -246,7 +246,7 @@ def plot(file: Path, records: Sequence[dict[str, Any]]) -> None:
         measure: {item["workers"]: item for item in records if item["measure"] == measure}
         for measure in ("workers", "broker")
     }
-    with plots.panels(file, 3) as (speed, carried, memory):
+    with plots.panels(file, 3, title="More workers: speed, traffic and memory") as (speed, carried, memory):
         plots.line(speed, {n: item["batches_per_second"] for n, item in by["workers"].items()}, "measured")
         first = min(by["workers"])
         alone = by["workers"][first]["batches_per_second"] / first

@@ -143,7 +143,10 @@ def _work(asked: argparse.Namespace) -> int:
     show(records, _COLUMNS)
     write(records, asked.json)
     if asked.plot is not None:
-        with panels(asked.plot, 2, height_inches=1.0 + 0.3 * len(records)) as (speed, cost):
+        with panels(asked.plot, 2, title="Speed and cost of batches", height_inches=1.4 + 0.3 * len(records)) as (
+            speed,
+            cost,
+        ):
             ratios = {record["label"]: record["ratio_to_baseline"] for record in records}
             bars(speed, ratios, f"batches/s, multiple of {BASELINE}")
             bars(cost, {record["label"]: record["cpu_seconds_per_batch"] for record in records}, "CPU seconds a batch")

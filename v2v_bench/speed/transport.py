@@ -192,7 +192,7 @@ def plot(file: Path, records: Sequence[dict[str, Any]]) -> None:
             limits[f"{most:.0%} of {record['preset']}"] = (
                 1e3 * record["making_cpu_seconds_per_batch"] * most / (1 - most)
             )
-    with plots.panels(file, 1, height_inches=5.0) as (axes,):
+    with plots.panels(file, 1, title="What moving a batch costs", height_inches=5.0) as (axes,):
         plots.stacked_bars(axes, parts, "processor time of moving a batch, ms", limits=limits)
 
 

@@ -134,7 +134,7 @@ def plot(records: Sequence[Record], file: Path) -> None:
     scale = {record["name"]: record[ERROR_KEY] for record in records if record["measure"] == "scale"}
     markers = dict(zip(dict.fromkeys(record["form"] for record in shown), _MARKERS, strict=False))
     speeds = [record["samples_per_core_second"] for record in shown]
-    with plots.panels(file, 2, height_inches=5.5) as (axes, disk):
+    with plots.panels(file, 2, title="Speed against error and disk space", height_inches=5.5) as (axes, disk):
         for record in shown:
             color = _COLORS[record["samples_per_decode"]]
             for into, height in ((axes, 100 * record[ERROR_KEY]), (disk, record["bytes_per_video_second"] / 1e6)):

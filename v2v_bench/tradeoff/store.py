@@ -241,7 +241,7 @@ def _work(asked: argparse.Namespace) -> int:
     show(medians, _COLUMNS)
     write([*records, *medians], asked.json)
     if asked.plot is not None:
-        with panels(asked.plot, 1) as (axes,):
+        with panels(asked.plot, 1, title="Forms of a store: time to read, and size") as (axes,):
             for record in medians:
                 axes.scatter(record["size_ratio"], 1e3 * record["read_seconds"])
                 axes.annotate(record["form"], (record["size_ratio"], 1e3 * record["read_seconds"]))
