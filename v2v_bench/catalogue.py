@@ -31,6 +31,8 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from v2v_bench.records import Column, at_least, plain_parser, run, show, write
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -39,9 +41,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.refresh import index_path
+from v2v_server.catalogue.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
+from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import examine
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
+from v2v_server.video.rows import Rows
 
 _PER_FOLDER = 1000
 _LINKS = 50_000
@@ -60,8 +65,9 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-def make_up(clip: Path, folder: Path, cache: Path, videos: int) -> None:
-    """Names for ``videos`` videos below ``folder``, and an index in ``cache`` that knows them.
+def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = False) -> None:
+    """Names for ``videos`` videos below ``folder``, and an index in ``cache`` that knows them; with ``scene`` also what
+    they show, a cut in the middle of every third.
 
     Raises:
         UsageError: the clip is no video that can be served.
@@ -89,17 +95,27 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int) -> None:
                 status = (folder / id).stat()
             yield dataclasses.replace(known, id=id, mtime_ns=status.st_mtime_ns, ctime_ns=status.st_ctime_ns)
 
+    def scenes() -> Iterator[tuple[str, str, str, bytes]]:
+        end = min(known.frames, MOST_FRAMES)
+        values = np.random.default_rng(0).uniform(1.0, 10.0, (-(-end // SEGMENT_FRAMES), COLUMNS))
+        whole, cut = (Scene.of(end, cuts, values).to_bytes() for cuts in ((), (end // 2,)))
+        for number, id in enumerate(ids):
+            yield id, known.fingerprint, Looking(Rows(), None).key, whole if number % 3 else cut
+
     try:
         store.put(rows())
+        if scene:
+            store.not_looked_at("")  # makes the table
+            store.put_scenes(scenes())
     finally:
         store.close()
 
 
-def opened(folder: Path, cache: Path) -> dict[str, Any]:
+def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     """Opens the catalogue in this process, which should be a fresh one."""
     before = resident_bytes()
     began, cpu = time.perf_counter(), _cpu_seconds()
-    catalogue = open_catalogue(folder, cache_dir=cache, processes=usable_cores())
+    catalogue = open_catalogue(folder, cache_dir=cache, processes=usable_cores(), scene=scene)
     record: dict[str, Any] = {
         "open_seconds": time.perf_counter() - began,
         "open_cpu_seconds": _cpu_seconds() - cpu,
@@ -116,10 +132,10 @@ def opened(folder: Path, cache: Path) -> dict[str, Any]:
     return record
 
 
-def _in_a_fresh_process(folder: Path, cache: Path) -> dict[str, Any]:
+def _in_a_fresh_process(folder: Path, cache: Path, scene: bool) -> dict[str, Any]:
     # Not a Pool, whose processes may have none of their own.
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
-        return fresh.submit(opened, folder, cache).result()
+        return fresh.submit(opened, folder, cache, scene).result()
 
 
 def _cpu_seconds() -> float:
@@ -128,10 +144,12 @@ def _cpu_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def first_batch(folder: Path, cache: Path) -> dict[str, Any]:
+def first_batch(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     """Seconds from the start of a server to its first batch, and the memory of its process."""
     began = time.perf_counter()
-    with LocalServer(folder, workers=2, flags=["--cache-dir", str(cache)]) as server:
+    with LocalServer(
+        folder, workers=2, flags=["--cache-dir", str(cache), "--scene", "auto" if scene else "off"]
+    ) as server:
         batches = iter(V2VStreamDataset(server.address, rank=0, world_size=1, keys=""))
         next(batches)
         seconds, resident = time.perf_counter() - began, server.rss_bytes()[server.pid]
@@ -143,10 +161,10 @@ def _work(asked: argparse.Namespace) -> int:
     at_least(asked, videos=1)
     with tempfile.TemporaryDirectory(prefix="v2v-catalogue-", dir=asked.folder) as place:
         folder, cache = Path(place, "videos"), Path(place, "cache")
-        make_up(asked.clip, folder, cache, asked.videos)
-        without_copy, record = (_in_a_fresh_process(folder, cache) for _ in range(2))
+        make_up(asked.clip, folder, cache, asked.videos, asked.scene)
+        without_copy, record = (_in_a_fresh_process(folder, cache, asked.scene) for _ in range(2))
         record |= {f"{name}_without_copy": without_copy[name] for name in ("open_seconds", "open_cpu_seconds")}
-        record |= first_batch(folder, cache)
+        record |= first_batch(folder, cache, asked.scene)
     show([record], _COLUMNS)
     write([record], asked.json)
     return 0
@@ -157,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = plain_parser(__doc__, "catalogue")
     parser.add_argument("--clip", required=True, type=Path, help="a short video of at least 201 frames")
     parser.add_argument("--videos", type=int, default=1_000_000, help="how many names (default 1000000)")
+    parser.add_argument("--scene", action="store_true", help="with what the videos show, as v2v-serve --scene auto")
     parser.add_argument("--folder", type=Path, help="where to make them (default: that of temporary files)")
     return run(parser, _work, arguments)
 

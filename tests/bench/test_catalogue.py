@@ -16,7 +16,8 @@ def test_a_made_up_corpus_is_opened_and_served(tmp_path: Path) -> None:
     write_clip(tmp_path / "clip.mp4", panned_luma(210, 160, 200), gop=50)
     made, out = tmp_path / "made", tmp_path / "out.json"
     made.mkdir()
-    asked = ["--clip", str(tmp_path / "clip.mp4"), "--videos", "1200", "--folder", str(made), "--json", str(out)]
+    where = ["--folder", str(made), "--json", str(out)]
+    asked = ["--clip", str(tmp_path / "clip.mp4"), "--videos", "1200", "--scene", *where]
     assert catalogue.main(asked) == 0
     (record,) = json.loads(out.read_text(encoding="utf-8"))
     assert (record["videos"], record["sequences"]) == (1200, 1200)

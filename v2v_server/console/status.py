@@ -30,7 +30,7 @@ def summary(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, lis
         f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
     ]
     if spec.scene != "off":
-        cut = sum(video.runs != ((0, video.frames),) for video in catalogue.videos)
+        cut = 0 if catalogue.videos.cut is None else len(catalogue.videos.cut)
         lines.append(
             f"scene {spec.scene}: {cut} videos have cuts or empty parts; {table.spoilt} sequences are left out or moved"
         )
