@@ -158,9 +158,12 @@ def fuzz_live(
     failures += [f"the healthy consumer: {key} {verdict[key]}" for key in wrong if verdict[key]]
     failures += [f"left over: {text}" for text in left]
     failures += [] if alive else ["the server stopped answering"]
+    sent = (warm_up.sent + attack.sent).total()
+    if sent < messages:
+        failures.append(f"{sent} of {messages} frames were sent: then no new connection was answered for a while")
     return {
         "target": "server",
-        "frames": messages,
+        "frames": sent,
         "seed": seed,
         "healthy_samples": verdict["samples"],
         "healthy_batches_under_attack": under_attack,

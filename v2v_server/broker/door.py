@@ -99,6 +99,7 @@ class Door:
         self._files: dict[bytes, int] = {}
         self._ended: list[bytes] = []
         self._callers = Callers()
+        self._gone_silent: dict[int, bytes] = {}  # whose message may still come, by the descriptor that they had
         self._listening: list[int] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -116,6 +117,9 @@ class Door:
             self._take_events()
             connection = self._connections.get(file)
             if connection is None:  # it has gone already
+                caller = self._gone_silent.pop(file, None)
+                if caller is not None:
+                    self._callers.spoke(caller, time.monotonic())
                 if identity not in self._files:
                     self._ended.append(identity)
                 return
@@ -222,7 +226,10 @@ class Door:
             return
         if connection.identity is not None:
             self._leave(connection.identity, file)
-        elif not self._ended:
+            return
+        if connection.caller is not None:
+            self._gone_silent[file] = connection.caller
+        if not self._ended:
             self._ended.append(b"")
 
     def _leave(self, identity: bytes, file: int) -> None:
