@@ -269,7 +269,7 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
                 )
 
 
-class _Rate(ProgressColumn):
+class _WindowRate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Windows a second."""
         return Text("" if task.speed is None else f"{task.speed:.1f}/s")
@@ -278,7 +278,7 @@ class _Rate(ProgressColumn):
 @contextlib.contextmanager
 def _progress() -> Iterator[Advance]:
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Rate(),
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _WindowRate(),
         TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(file=sys.stderr)

@@ -201,7 +201,7 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
     return lines
 
 
-class _Rate(ProgressColumn):
+class _FrameRate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Frames a second."""
         return Text("" if task.speed is None else f"{task.speed:.0f} frames/s")
@@ -211,7 +211,7 @@ class _Rate(ProgressColumn):
 def _progress() -> Iterator[prepare.Progress]:
     columns = (
         TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[size]}"),
-        _Rate(), TextColumn("left"), TimeRemainingColumn(),
+        _FrameRate(), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
