@@ -18,6 +18,7 @@ from v2v_protocol.wire import encode
 from v2v_server.broker import door
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, Sockets, TurnedAway
+from v2v_server.keys.callers import SILENT_AT_ONCE
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
 
@@ -264,6 +265,28 @@ def test_who_is_gone_before_it_is_seen_costs_strangers_their_turn(
     assert told == [TurnedAway("", "consumer")]
     assert gets_in(where, "127.0.0.2")
     assert not all(gets_in(where, "127.0.0.4") for _ in range(5))
+
+
+@pytest.mark.usefixtures("unwatched")
+def test_who_spoke_and_went_before_it_was_heard_is_not_counted_as_silent(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    sockets = serve()
+    names = [b"%d" % number for number in range(20)]
+    for name in names:
+        peer = consumer(sockets, name)
+        peer.setsockopt(zmq.LINGER, -1)
+        peer.send_multipart(encode(Ping()))
+        peer.close()
+    heard: set[bytes] = set()
+
+    def all_heard() -> bool:
+        heard.update(one.identity for one in sockets.receive(0.05) if isinstance(one, FromConsumer))
+        return heard == set(names)
+
+    until(all_heard)
+    accounts = sockets._door._callers._accounts
+    assert all(account.left >= SILENT_AT_ONCE - len(names) / 2 for account in accounts.values())
 
 
 def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]) -> None:
