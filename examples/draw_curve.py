@@ -1,13 +1,16 @@
 """Draws what a training run has logged: its loss, smoothed, and that of the batch that it is judged by.
 
     python examples/draw_curve.py runs/firenet-cpu curve.png
+    python examples/draw_curve.py runs/a runs/b curve.png --of lpips
 
-Of several runs the steps are counted on, as where one began with the weights of another.
+Of several runs the steps are counted on, as where one began with the weights of another. A part of the loss, as
+`--of lpips`, is the same measure where runs weight it otherwise.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,25 +21,26 @@ SHARE = 0.05
 """Of a new reading in the smoothed loss."""
 
 
-def curves(runs: Sequence[Path]) -> tuple[dict[int, float], dict[int, float]]:
-    """Smoothed training loss and held-out loss, by step."""
-    training: dict[int, float] = {}
-    held_out: dict[int, float] = {}
+def curves(runs: Sequence[Path], part: str = "total") -> tuple[dict[float, float], dict[float, float]]:
+    """Smoothed training loss (or a part of it) and held-out loss, by step."""
+    training: dict[float, float] = {}
+    held_out: dict[float, float] = {}
     begun, smooth = 0, 0.0
     for run in runs:
         records = read_metrics(run / METRICS)
         for record in records:
             step = begun + record["step"]
-            if "total" in record:
-                smooth = smooth + SHARE * (record["total"] - smooth) if training else record["total"]
+            if part in record:
+                smooth = smooth + SHARE * (record[part] - smooth) if training else record[part]
                 training[step] = smooth
-            if "held_out_total" in record:
-                held_out[step] = record["held_out_total"]
+            if f"held_out_{part}" in record:
+                held_out[step] = record[f"held_out_{part}"]
         begun += records[-1]["step"]
+        held_out[begun + 0.5] = math.nan  # a gap: the next run may be judged by another batch
     return training, held_out
 
 
-def draw(training: Mapping[int, float], held_out: Mapping[int, float], path: Path) -> None:
+def draw(training: Mapping[float, float], held_out: Mapping[float, float], path: Path, label: str = "loss") -> None:
     """Both over the steps, as a PNG."""
     from matplotlib import pyplot as plt
 
@@ -44,7 +48,7 @@ def draw(training: Mapping[int, float], held_out: Mapping[int, float], path: Pat
     axes.plot(list(training), list(training.values()), label="training, smoothed", linewidth=1.2)
     axes.plot(list(held_out), list(held_out.values()), "o-", label="held-out batch", linewidth=1.2, markersize=4)
     axes.set_xlabel("optimiser step")
-    axes.set_ylabel("loss")
+    axes.set_ylabel(label)
     axes.legend(frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
@@ -56,9 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="folders of v2v-train, in their order")
     parser.add_argument("picture", type=Path)
+    parser.add_argument("--of", default="total", metavar="PART", help="of the loss: total, lpips, l1 (default total)")
     asked = parser.parse_args(arguments)
-    training, held_out = curves(asked.runs)
-    draw(training, held_out, asked.picture)
+    training, held_out = curves(asked.runs, asked.of)
+    if not training:
+        raise SystemExit(f"no reading of {asked.of!r} in {', '.join(map(str, asked.runs))}")
+    draw(training, held_out, asked.picture, "loss" if asked.of == "total" else asked.of)
     print(f"{len(training)} readings up to step {max(training)}: {asked.picture}")
     return 0
 

@@ -1,4 +1,4 @@
-"""Clips from photographs: smooth, of a fixed size, the same for the same seed."""
+"""Clips from photographs: smooth, of a fixed size, the same frames for the same seed."""
 
 import sys
 
@@ -26,15 +26,22 @@ def test_motion_begins_at_rest_position_and_never_jumps():
     assert jumps.max() < 15
 
 
+def test_the_same_seed_gives_the_same_frames(monkeypatch):
+    """Of the files that cannot be said: x264 does not always give the same bytes for the same frames."""
+    monkeypatch.setattr(pan_photographs, "FRAMES", 5)
+    one, two, other = (
+        pan_photographs.clip([data.chelsea()], [], np.random.default_rng(seed)) for seed in ((3, 0), (3, 0), (3, 1))
+    )
+    np.testing.assert_array_equal(one, two)
+    assert (one != other).any()
+
+
 def test_a_folder_of_photographs_becomes_clips(tmp_path, monkeypatch):
     cv2.imwrite(str(tmp_path / "cat.png"), data.chelsea()[..., ::-1])
     monkeypatch.setattr(pan_photographs, "FRAMES", 12)
-    for name in ("a", "b"):
-        monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / name), "--clips", "1", "--seed", "3"])
-        pan_photographs.main()
-    a, b = (tmp_path / name / "pan_0000.mp4" for name in ("a", "b"))
-    assert a.read_bytes() == b.read_bytes()
-    with av.open(str(a)) as file:
+    monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / "a"), "--clips", "1", "--seed", "3"])
+    pan_photographs.main()
+    with av.open(str(tmp_path / "a" / "pan_0000.mp4")) as file:
         frames = [frame.to_ndarray(format="gray") for frame in file.decode(video=0)]
     assert len(frames) == 12
     assert frames[0].shape == (pan_photographs.HEIGHT, pan_photographs.WIDTH)

@@ -9,8 +9,9 @@ samples a decode, the effects of the preset `davis346` added. All rows of a seed
 `--set` changes something in every row, such as the width of the network.
 
 Every network is judged as by `v2v-bench learn`, on the same exact samples of videos that it never saw, under ordinary
-cameras and under the paper's. A row is better or worse than the first one if its LPIPS of all seeds lies on one side of
-all of the first one's; everything else is not separated from what another seed does.
+cameras and under the paper's. A row is better or worse than the first one, by LPIPS or by correlation, if its values of
+all seeds lie on one side of all of the first one's; everything else is not separated from what another seed does. With
+three seeds each that happens by chance in one of ten comparisons.
 """
 
 from __future__ import annotations
@@ -96,10 +97,11 @@ _COLUMNS: tuple[Column, ...] = (
     ("lpips", "LPIPS", "{:.3f}", 1.0),
     ("lowest_lpips", "lowest", "{:.3f}", 1.0),
     ("highest_lpips", "highest", "{:.3f}", 1.0),
+    ("lpips_verdict", "against the first row", "{}", 1.0),
     ("correlation", "correlation", "{:.3f}", 1.0),
     ("lowest_correlation", "lowest", "{:.3f}", 1.0),
     ("highest_correlation", "highest", "{:.3f}", 1.0),
-    ("verdict", "against the first row", "{}", 1.0),
+    ("correlation_verdict", "against the first row", "{}", 1.0),
 )
 
 Scores = dict[tuple[str, str], list[dict[str, float]]]
@@ -122,8 +124,9 @@ def summary(found: Scores) -> list[Record]:
             values = [each[name] for each in scores]
             record |= {name: statistics.median(values), f"lowest_{name}": min(values), f"highest_{name}": max(values)}
         if change != AS_IT_IS:
-            lpips = ([each["lpips"] for each in found[key, cameras]] for key in (change, AS_IT_IS))
-            record["verdict"] = verdict(*lpips)
+            for name, sign in (("lpips", 1), ("correlation", -1)):
+                ours, theirs = ([sign * each[name] for each in found[key, cameras]] for key in (change, AS_IT_IS))
+                record[f"{name}_verdict"] = verdict(ours, theirs)
         records.append(record)
     return records
 

@@ -33,8 +33,8 @@ def test_rows_have_medians_and_ranges_and_the_first_has_no_verdict() -> None:
     first, second = matters.summary({(matters.AS_IT_IS, "paper"): scores, ("no noise", "paper"): worse})
     assert (first["lpips"], first["lowest_lpips"], first["highest_lpips"]) == (0.3, 0.1, 0.5)
     assert (first["correlation"], first["seeds"]) == (0.7, 3)
-    assert "verdict" not in first
-    assert second["verdict"] == "worse"
+    assert "lpips_verdict" not in first
+    assert second["lpips_verdict"] == second["correlation_verdict"] == "worse"
 
 
 def changed(name: str) -> TrainConfig:
@@ -71,5 +71,5 @@ def test_one_step_of_two_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert status == 0
     records = json.loads(file.read_text())
     assert {record["change"] for record in records} == set(matters.CHANGES)
-    assert [record.get("verdict") is None for record in records] == [True, True, False, False]
+    assert [record.get("lpips_verdict") is None for record in records] == [True, True, False, False]
     assert all(0 < record["lpips"] < 2 for record in records)
