@@ -32,7 +32,8 @@ def draw_strip(
 
     Args:
         page: to draw on.
-        camera: whose activity. Each strip has a scale of its own, whose top is written above it.
+        camera: whose activity. Each strip has a scale of its own. A full bar reaches from the middle to the edge; its
+            rate is written above the strip, and higher rates are cut there.
         left, top, width, height: of the strip itself, px.
         picks: voxel grids to point at.
         cursor: a bin to draw a line at, for films.
@@ -40,7 +41,7 @@ def draw_strip(
     rates, middle = camera.rates, top + height / 2
     highest = max(float(np.quantile(rates, 0.99)), 1e-9)
     x = page.text(left, top - LABEL_PX, "events over the whole clip")
-    page.text(x + 12, top - LABEL_PX, f"strip's height: {highest:.1g} a pixel and bin", colour=canvas.SOFT)
+    page.text(x + 12, top - LABEL_PX, f"full bar: {highest:.2g} or more a pixel and bin", colour=canvas.SOFT)
     count = rates.shape[1]
     at = [left + width * number / count for number in range(count + 1)]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], camera.paused, [False]])))

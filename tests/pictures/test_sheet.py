@@ -23,6 +23,7 @@ from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
 from v2v_pictures.sheet import draw_sheet, flow_panel, whole_panel
+from v2v_pictures.strip import draw_strip
 from v2v_protocol.errors import UsageError
 
 WHITE = (255, 255, 255)
@@ -192,6 +193,29 @@ def test_pauses_are_hatched_and_named() -> None:
     assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED) > has(
         draw_sheet([camera(voxels)], "t"), PAUSED
     )
+
+
+def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the middle to the edge, so half of the strip's height; higher rates are cut there, and the text says so."""
+    voxels = np.zeros((40, 5, 10, 10), np.int8)
+    voxels[:, :, :5] = 1  # half an event a pixel in each bin
+    voxels[10, 0] = 1  # twice as many
+    voxels[20, 0, :5] = 0
+    voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5
+    written: list[str] = []
+    write = Canvas.text
+
+    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
+        written.append(text)
+        return write(page, x, y, text, **style)
+
+    monkeypatch.setattr(Canvas, "text", listen)
+    page = Canvas(1100, 160)
+    draw_strip(page, camera(voxels), 50, 40, 1000, 80)
+    assert "full bar: 0.5 or more a pixel and bin" in written
+    image = page.image()
+    bars = [has(image[40:121, 50 + 5 * number + 2][None], BRIGHTER) for number in (0, 50, 100)]
+    assert bars == pytest.approx([40, 40, 16], abs=2)
 
 
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:
