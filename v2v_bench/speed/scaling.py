@@ -208,6 +208,8 @@ def extrapolated(records: Sequence[dict[str, Any]]) -> list[str]:
     if not real or not null:
         return []
     made = min(item["workers_cpu_seconds_per_batch"] for item in real)
+    if not made:
+        return ["nothing is extrapolated: a run was too short for its processor time to be told"]
     lines = []
     for role in ("broker", "client"):
         carried = null[-1][f"{role}_cpu_seconds_per_batch"]

@@ -26,6 +26,7 @@ from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.catalogue.videos import Runs
 from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import pictures_of
+from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
@@ -139,7 +140,7 @@ class Looking:
             partial(_look_at, root),
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
-            writable=None if isinstance(root, Copies) else (),
+            writable=None if isinstance(root, Copies) else compile_cache(),
         )
         suspects = []
         for job, scene in isolated(jobs(), processes):

@@ -10,6 +10,8 @@ that file system, or the holder of the lock does not get on, each process compil
 The compiler needs about 90 MB that it never gives back. They go with the child process in which it runs.
 
 Kernels that only some streams need (``simulation/variants.py``) are had in the same way, when the first of them comes.
+By then a worker is confined (:mod:`v2v_server.system.sandbox`) and may start no process: the one whose turn it is
+compiles in its own memory.
 """
 
 from __future__ import annotations
@@ -76,7 +78,8 @@ def _place(variant: Variant | None = None) -> tuple[Path, str]:
 def _compile_apart(*variant: str) -> None:
     """Compiles in a child process. Should that fail, so will the caller's loading, or it does the work."""
     command = [sys.executable, "-m", __name__, str(os.getpid()), *variant]
-    subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
+    with suppress(PermissionError):  # a confined worker starts no program: its loading compiles, and keeps the memory
+        subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
 
 
 def _mark(folder: Path, key: str) -> Path:

@@ -75,6 +75,23 @@ def test_one_that_fails_leaves_the_work_to_the_next(tmp_path: Path) -> None:
         assert is_first
 
 
+@pytest.mark.slow
+def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
+    """A stream that needs an unusual kernel may come to workers on a host where nobody compiled it yet."""
+    code = (
+        "import sys\nfrom pathlib import Path\n"
+        "from v2v_server.simulation.variants import Variant\n"
+        "from v2v_server.system.sandbox import can_confine, confine\n"
+        "from v2v_server.worker.warm_up import is_compiled, load_in_turn\n"
+        "variant = Variant('int16', True, 'float32')\n"
+        "assert not is_compiled(variant)\n"
+        "assert confine([Path(sys.argv[1])], network=False).calls == can_confine().calls\n"
+        "load_in_turn(variant)\nassert is_compiled(variant)\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=environment, check=True)
+
+
 def test_one_that_is_killed_leaves_the_work_to_the_next(tmp_path: Path) -> None:
     code = (
         "import sys, time\nfrom pathlib import Path\nfrom v2v_server.worker.warm_up import one_compiles\n"
