@@ -36,6 +36,8 @@ MODULES = {
 _LAUNCHED = {
     "trainer.train": "trainer.train",
     "examples/overfit.py": "examples.overfit",
+    "examples/pan_photographs.py": "examples.pan_photographs",
+    "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",
 }
 """What `python` and `torchrun` start beside benchmarks."""

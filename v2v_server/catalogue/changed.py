@@ -4,13 +4,12 @@ Of a million files that takes seconds, so other processes help. They are started
 that opens a catalogue needs no guard for them, and a loader's worker, which may have no children of multiprocessing,
 has them too.
 
-    python -m v2v_server.catalogue.changed      jobs come in on stdin, the answer goes out on stdout, all pickled
+    python -m v2v_server.catalogue.changed      jobs come in on stdin, the answer goes out on stdout, in msgpack
 """
 
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -20,6 +19,8 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+
+import msgpack
 
 from v2v_protocol.programs import environment
 from v2v_server.catalogue.files import Notice, by_parts
@@ -99,9 +100,10 @@ class _Helper:
         with suppress(OSError):  # it does not start, or ends at once: whoever asks it does the work
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment())
             assert self._process.stdin is not None
-            pickle.dump(os.getpid(), self._process.stdin)
+            self._process.stdin.write(msgpack.packb(os.getpid()))
             for job in jobs:
-                pickle.dump(job, self._process.stdin)
+                given = str(job.root), job.first, job.ids, job.states.tobytes()
+                self._process.stdin.write(msgpack.packb(given, unicode_errors="surrogateescape"))
             self._process.stdin.close()
 
     def answer(self) -> list[int] | None:
@@ -109,8 +111,8 @@ class _Helper:
         if self._process is None or self._process.stdout is None:
             return None
         try:
-            answer: list[int] = pickle.loads(self._process.stdout.read())
-        except (OSError, EOFError, pickle.UnpicklingError):
+            answer: list[int] = msgpack.unpackb(self._process.stdout.read())
+        except (OSError, ValueError, msgpack.UnpackException):
             return None
         return answer
 
@@ -163,12 +165,10 @@ def _changed(some: _Some) -> list[int]:
 def _help() -> None:
     """Reads all jobs before it begins: who asks has work of its own."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; who asked decides what follows
-    die_with_parent(pickle.load(sys.stdin.buffer))
-    jobs: list[_Some] = []
-    with suppress(EOFError):
-        while True:
-            jobs.append(pickle.load(sys.stdin.buffer))
-    sys.stdout.buffer.write(pickle.dumps([number for job in jobs for number in _changed(job)]))
+    given = msgpack.Unpacker(sys.stdin.buffer, unicode_errors="surrogateescape")
+    die_with_parent(next(given))
+    jobs = [_Some(Path(root), first, ids, array("q", states)) for root, first, ids, states in given]
+    sys.stdout.buffer.write(msgpack.packb([number for job in jobs for number in _changed(job)]))
 
 
 if __name__ == "__main__":
