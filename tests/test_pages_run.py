@@ -28,7 +28,7 @@ SMALLER = {
 CANNOT = {
     r"^v2v-convert ": "recordings that nobody may hand on",
     r"^v2v-eval ": "weights and recordings that nobody may hand on; tests of the trainer run v2v-eval on made ones",
-    r"^v2v-train (e2vid|firenet-cpu|my\.yaml) ": "a night, weights of LPIPS, or a configuration of the reader's own",
+    r"^v2v-train (e2vid|firenet-cpu|my\.yaml|scenes\.yaml) ": "weights of LPIPS, or the reader's own configuration",
     r"^v2v-serve .*--page": "a port that somebody may have; tests of the page start it on a free one",
     r"^v2v-serve .*s3://": "a bucket of somebody's; tests/stream/test_object_storage.py starts it on one of its own",
 }
