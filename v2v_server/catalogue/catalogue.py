@@ -325,8 +325,8 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
     scene_digest, unseen = None, set(absent)
     if looking is not None:
         used = (_of_file(records[place], files) for place in places.tolist())
-        cuts, scene_digest = looking.cuts(store, used, unseen, digest)
-        videos = Videos(records, places, thresholds, cuts)
+        cut, scene_digest = looking.cuts(store, used, unseen, digest)
+        videos = Videos(records, places, thresholds, cut)
         if died := sorted(unseen - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
     return Catalogue(

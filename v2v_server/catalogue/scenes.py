@@ -21,9 +21,9 @@ from v2v_server.catalogue.index.columns import Records
 from v2v_server.catalogue.index.copy import NoCopy, copied, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.manifest import Manifest
+from v2v_server.catalogue.runs import CutVideos, Runs
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
-from v2v_server.catalogue.videos import Runs
 from v2v_server.cloud.copies import Copies, lent
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
@@ -81,11 +81,9 @@ class Looking:
                     batch = []
         store.put_scenes(batch)
 
-    def cuts(
-        self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str
-    ) -> tuple[dict[int, Runs], str]:
-        """The runs of the videos whose one run is not the whole of them, by number, and a digest that names all that is
-        known of them. Of a large index the answer is kept, for it takes a minute for a million.
+    def cuts(self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str) -> tuple[CutVideos, str]:
+        """The videos whose one run is not the whole of them, and a digest that names all that is known of them. Of a
+        large index the answer is kept, for it takes a minute for a million.
 
         Args:
             records: of the videos of a snapshot, in its order.
@@ -97,26 +95,26 @@ class Looking:
             with suppress(NoCopy), closing(read_copy(store.path, state, "scenes")) as parts:
                 (kept,) = parts
                 unseen.update(kept["unseen"])
-                return {number: tuple(map(tuple, runs)) for number, runs in kept["cuts"]}, kept["digest"]
-            cuts, name = self._cuts(store, records, unseen, digest)
-            answer = {"cuts": list(cuts.items()), "digest": name, "unseen": sorted(unseen)}
+                return CutVideos.unpacked(kept["cut"]), kept["digest"]
+            sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+            cut = CutVideos.of(self._cut(store, records, unseen, sha.update))
+            name = sha.hexdigest()[:32]
+            answer = {"cut": cut.packed(), "digest": name, "unseen": sorted(unseen)}
             deque(copied(store.path, state, [answer], "scenes"), maxlen=0)
-        return cuts, name
+        return cut, name
 
-    def _cuts(
-        self, store: Store, records: Iterable[IndexRow], unseen: set[str], digest: str
-    ) -> tuple[dict[int, Runs], str]:
-        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
-        cuts: dict[int, Runs] = {}
+    def _cut(
+        self, store: Store, records: Iterable[IndexRow], unseen: set[str], sealed: Callable[[bytes], None]
+    ) -> Iterator[tuple[int, Runs]]:
+        """Number and runs of each that has cuts; ``sealed`` receives what is known of every video."""
         for number, record in enumerate(records):
             data = None if record.id in unseen else store.scene(record.id, record.fingerprint, self.key)
             if data is None:
                 unseen.add(record.id)
             scene = Scene.unknown() if data is None else Scene.from_bytes(data)
-            sha.update(scene.to_bytes())
+            sealed(scene.to_bytes())
             if (runs := tuple(scene.runs(record.frames))) != ((0, record.frames),):
-                cuts[number] = runs
-        return cuts, sha.hexdigest()[:32]
+                yield number, runs
 
     def _found(
         self, store: Store, root: Path | Copies, missing: list[IndexRow], processes: int

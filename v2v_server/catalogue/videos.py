@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.catalogue.index.columns import CHUNK, Records
+from v2v_server.catalogue.runs import CutVideos, Runs
 from v2v_server.video.rows import Rows
 
-Runs = tuple[tuple[int, int], ...]
 Thresholds = tuple[float | None, float | None]
 NO_THRESHOLDS: Thresholds = (None, None)
 
@@ -54,12 +54,12 @@ class Videos(Sequence[VideoEntry]):
         records: sorted by id.
         places: [V] of the usable ones, rising.
         thresholds: (positive, negative) of those that have some, by number of the video.
-        runs: of the videos whose one run is not the whole of them, by number; None where runs are not known.
+        cut: the videos whose one run is not the whole of them; None where runs are not known.
 
     Attributes:
         frames, width_px, height_px: [V] of each.
         interlaced: [V], 1 where it is.
-        cut: the numbers of ``runs``, rising; None where runs are not known.
+        cut: as given.
     """
 
     def __init__(
@@ -67,14 +67,13 @@ class Videos(Sequence[VideoEntry]):
         records: Records,
         places: npt.NDArray[np.intp],
         thresholds: Mapping[int, Thresholds],
-        runs: Mapping[int, Runs] | None = None,
+        cut: CutVideos | None = None,
     ) -> None:
-        self._records, self._thresholds, self._runs = records, thresholds, runs
+        self._records, self._thresholds, self.cut = records, thresholds, cut
         self._places = None if len(places) == len(records) else places
         usable = slice(None) if self._places is None else self._places
         self.frames, self.interlaced = records.frames[usable], records.interlaced[usable]
         self.width_px, self.height_px = records.width_px[usable], records.height_px[usable]
-        self.cut = None if runs is None else np.array(sorted(runs), np.int64)
 
     def find(self, id: str) -> int | None:
         """The number of the video of that id; None if there is none."""
@@ -134,6 +133,9 @@ class Videos(Sequence[VideoEntry]):
             raise IndexError(f"video {at} of {len(self)}")
         record = self._records[self._place(number)]
         pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
+        runs = None if self.cut is None else self.cut.runs(number)
+        if runs is None and self.cut is not None:
+            runs = ((0, record.frames),)
         return VideoEntry(
             id=record.id,
             fingerprint=record.fingerprint,
@@ -144,5 +146,5 @@ class Videos(Sequence[VideoEntry]):
             codec=record.codec,
             threshold_pos=pos,
             threshold_neg=neg,
-            runs=None if self._runs is None else self._runs.get(number, ((0, record.frames),)),
+            runs=runs,
         )

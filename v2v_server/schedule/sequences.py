@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import abc
 from dataclasses import dataclass
-from itertools import islice
 from typing import overload
 
 import numpy as np
@@ -20,6 +19,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.runs import CutVideos
 from v2v_server.catalogue.videos import VideoEntry
 from v2v_server.catalogue.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
@@ -50,7 +50,7 @@ class Columns:
         frames: int64 [N], of each video.
         size: int64 [N], which of ``first_of_size``.
         first_of_size: for each size of picture, the first video that has it.
-        cut: int64, the videos whose one run is not the whole of them; None where a video's runs are not known.
+        cut: the videos whose one run is not the whole of them; None where a video's runs are not known.
     """
 
     def __init__(self, videos: Videos) -> None:
@@ -67,16 +67,15 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
     return height_px.astype(np.int64) << 32 | width_px
 
 
-def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64] | None]:
+def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], CutVideos | None]:
     """Frames, sizes, and which have cuts."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    if any(video.runs is None for video in videos):
-        return frames, sizes, None
-    cut = [place for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
-    return frames, sizes, np.array(cut, np.int64)
+    runs = [(place, video.runs) for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
+    known = [(place, those) for place, those in runs if those is not None]
+    return frames, sizes, CutVideos.of(known) if len(known) == len(runs) else None
 
 
 class SequenceTable:
@@ -103,7 +102,7 @@ class SequenceTable:
         recipe = spec.recipe
         self._all, self._recipe, self._stride = videos, recipe, recipe.frames_per_sequence
         self._frames = columns.frames
-        self._starts: dict[int, tuple[int, ...]] = {}
+        self._cut: _CutSequences | None = None
         self.spoilt = 0
         counts = np.clip((columns.frames - recipe.frames_needed) // self._stride + 1, 0, spec.max_sequences_per_video)
         suits = [_unsuited_size(videos[first], rows, spec) is None for first in columns.first_of_size]
@@ -114,10 +113,9 @@ class SequenceTable:
                     f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                     "start the server with --scene auto"
                 )
-            for place in columns.cut[counts[columns.cut] > 0].tolist():
-                starts = self._starts[place] = _starts(videos[place], spec)
-                self.spoilt += len({self._stride * each for each in range(counts[place])} - set(starts))
-                counts[place] = len(starts)
+            self._cut = _CutSequences(columns.cut, counts[columns.cut.numbers], spec)
+            self.spoilt = self._cut.spoilt
+            counts[columns.cut.numbers] = self._cut.counts
         self._ends = np.cumsum(counts)
         self.count = int(self._ends[-1]) if len(videos) else 0
         self.videos = int(np.count_nonzero(counts))
@@ -127,7 +125,7 @@ class SequenceTable:
     def longest_clips(self) -> tuple[int, ...]:
         """Of the videos that are too short, the ``voxels_per_clip`` that each is long enough for."""
         short = self._frames[self._frames < self._recipe.frames_needed]
-        runs = [_longest_run(self._all[place]) for place, starts in self._starts.items() if not starts]
+        runs = [] if self._cut is None else self._cut.too_short.tolist()
         clips = (_longest_clip(frames, self._recipe) for frames in [*short.tolist(), *runs])
         return tuple(voxels for voxels in clips if voxels)
 
@@ -141,8 +139,45 @@ class SequenceTable:
             raise IndexError(f"sequence {rank} of {self.count}")
         video = int(self._ends.searchsorted(rank, side="right"))
         place = rank - (int(self._ends[video - 1]) if video else 0)
-        start = self._starts[video][place] if video in self._starts else place * self._stride
-        return Sequence(self._all[video], start)
+        start = None if self._cut is None else self._cut.start(video, place)
+        return Sequence(self._all[video], place * self._stride if start is None else start)
+
+
+class _CutSequences:
+    """The sequences of the videos that have cuts: at 0, L, 2L ... of each run.
+
+    Args:
+        cut: these videos.
+        whole: int64 [C], how many sequences each would have without its cuts.
+        spec: says how many frames a sequence needs, and how many a video may give.
+
+    Attributes:
+        counts: int64 [C], how many each has.
+        spoilt: how many in all are not where they would be without cuts.
+        too_short: frames of the longest run of each that has none because of its cuts.
+    """
+
+    def __init__(self, cut: CutVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
+        needed, self._stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
+        self._cut, owners = cut, cut.owners()
+        each = np.clip((cut.end - cut.first - needed) // self._stride + 1, 0, None)
+        upto = np.concatenate(([0], np.cumsum(each)))
+        # How many sequences of its video lie before each run, and how many it may still give.
+        self._before = upto[:-1] - upto[cut.bounds[:-1]][owners]
+        most = np.where(whole > 0, spec.max_sequences_per_video, 0)[owners]
+        each = np.clip(most - self._before, 0, each)
+        self.counts = np.bincount(owners, each, len(whole)).astype(np.int64)
+        in_place = np.where(cut.first % self._stride, 0, np.clip(whole[owners] - cut.first // self._stride, 0, each))
+        self.spoilt = int(whole.sum() - in_place.sum())
+        self.too_short = cut.longest()[(whole > 0) & (self.counts == 0)]
+
+    def start(self, video: int, place: int) -> int | None:
+        """The first frame of that sequence of a video; None if the video is none of these."""
+        if (at := self._cut.find(video)) is None:
+            return None
+        low, high = self._cut.bounds[at : at + 2].tolist()
+        run = low + int(self._before[low:high].searchsorted(place, side="right")) - 1
+        return int(self._cut.first[run]) + self._stride * (place - int(self._before[run]))
 
 
 class Refusals(abc.Sequence[Refusal]):
@@ -176,13 +211,6 @@ class Refusals(abc.Sequence[Refusal]):
         if video.frames < recipe.frames_needed:
             return _too_short(video, recipe)
         return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, _longest_run(video), recipe)
-
-
-def _starts(video: VideoEntry, spec: StreamSpec) -> tuple[int, ...]:
-    """First frames of the sequences that lie within one of the video's runs: at 0, L, 2L ... of each."""
-    needed, stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
-    starts = (start for first, end in video.runs or () for start in range(first, end - needed + 1, stride))
-    return tuple(islice(starts, spec.max_sequences_per_video))
 
 
 def _longest_run(video: VideoEntry) -> int:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from v2v_server.catalogue.index import columns
 from v2v_server.catalogue.index.columns import Records, Texts, joined, merged
 from v2v_server.catalogue.index.file import IndexRow
+from v2v_server.catalogue.runs import CutVideos
 from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 
@@ -112,7 +113,7 @@ def test_videos_are_the_usable_ones_and_have_the_digest_they_always_had(
         records.problems.clear()
     used = [place for place in range(len(ROWS)) if place not in records.problems]
     thresholds: dict[int, Thresholds] = {3: (0.2, 0.3), 50: (0.25, None)}
-    videos = Videos(records, np.array(used), thresholds, {4: (), 5: ((0, 3), (4, 9))})
+    videos = Videos(records, np.array(used), thresholds, CutVideos.of([(4, ()), (5, ((0, 3), (4, 9)))]))
     assert len(videos) == len(used) == (200 if all_usable else 171)
     assert [video.id for video in videos] == [NAMES[place] for place in used]
     assert [videos.find(NAMES[place]) for place in used] == list(range(len(used)))

@@ -187,6 +187,34 @@ def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
     assert all(later - earlier >= 20 for earlier, later in pairwise(found))
 
 
+@st.composite
+def stretches(draw: st.DrawFn) -> tuple[tuple[int, int], ...]:
+    """Runs within 300 frames, some of them none at all, side by side or apart."""
+    bounds = sorted(draw(st.lists(st.integers(0, 300), unique=True, max_size=10)))
+    return tuple(run for run in pairwise(bounds) if draw(st.booleans()))
+
+
+@given(st.lists(stretches(), min_size=1, max_size=5), st.integers(1, 12))
+def test_sequences_are_those_that_each_run_gives_in_turn(
+    all_runs: list[tuple[tuple[int, int], ...]], most: int
+) -> None:
+    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
+    videos = [VideoEntry(str(n), "f", 300, 64, 64, 25.0, "h264", runs=runs) for n, runs in enumerate(all_runs)]
+    whole = VideoEntry("whole", "f", 50, 64, 64, 25.0, "h264", runs=((0, 50),))
+    table = SequenceTable([*videos, whole], Rows(), spec)
+    places = set(range(0, 300 - 21 + 1, 20)[:most])
+    expected, spoilt = [], 0
+    for name, runs in enumerate(all_runs):
+        found = [start for first, end in runs for start in range(first, end - 21 + 1, 20)][:most]
+        expected += [(str(name), start) for start in found]
+        spoilt += len(places - set(found))
+    assert starts(table) == [*expected, *[("whole", 0), ("whole", 20)][:most]]
+    assert table.spoilt == spoilt
+    without = [runs for name, runs in enumerate(all_runs) if str(name) not in dict(expected)]
+    longest = [max((end - first for first, end in runs), default=0) for runs in without]
+    assert table.longest_clips == tuple(voxels for frames in longest if (voxels := max(0, frames - 1) // 5))
+
+
 def test_a_catalogue_without_statistics_says_what_to_do() -> None:
     plain = VideoEntry("a", "f", 61, 64, 64, 25.0, "h264")
     with pytest.raises(UsageError, match="--scene auto"):
