@@ -48,7 +48,7 @@ class Columns:
 
     Attributes:
         frames: int64 [N], of each video.
-        size: int64 [N], which of ``first_of_size``.
+        size: int32 [N], which of ``first_of_size``.
         first_of_size: for each size of picture, the first video that has it.
         cut: the videos whose one run is not the whole of them; None where a video's runs are not known.
     """
@@ -58,7 +58,8 @@ class Columns:
             self.frames, sizes, self.cut = videos.frames, _sizes(videos.height_px, videos.width_px), videos.cut
         else:
             self.frames, sizes, self.cut = _columns(videos)
-        _, first, self.size = np.unique(sizes, return_index=True, return_inverse=True)
+        _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
+        self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
 
 
@@ -152,7 +153,7 @@ class _CutSequences:
         spec: says how many frames a sequence needs, and how many a video may give.
 
     Attributes:
-        counts: int64 [C], how many each has.
+        counts: int32 [C], how many each has.
         spoilt: how many in all are not where they would be without cuts.
         too_short: frames of the longest run of each that has none because of its cuts.
     """
@@ -163,10 +164,10 @@ class _CutSequences:
         each = np.clip((cut.end - cut.first - needed) // self._stride + 1, 0, None)
         upto = np.concatenate(([0], np.cumsum(each)))
         # How many sequences of its video lie before each run, and how many it may still give.
-        self._before = upto[:-1] - upto[cut.bounds[:-1]][owners]
+        self._before = (upto[:-1] - upto[cut.bounds[:-1]][owners]).astype(np.int32)
         most = np.where(whole > 0, spec.max_sequences_per_video, 0)[owners]
         each = np.clip(most - self._before, 0, each)
-        self.counts = np.bincount(owners, each, len(whole)).astype(np.int64)
+        self.counts = np.bincount(owners, each, len(whole)).astype(np.int32)
         in_place = np.where(cut.first % self._stride, 0, np.clip(whole[owners] - cut.first // self._stride, 0, each))
         self.spoilt = int(whole.sum() - in_place.sum())
         self.too_short = cut.longest()[(whole > 0) & (self.counts == 0)]

@@ -23,7 +23,7 @@ Part = Mapping[str, Any]
 """Some of the records in columns, see :meth:`v2v_server.catalogue.index.columns.Records.packed`."""
 
 _HEAD = struct.Struct("<QQ")  # length and checksum of what follows
-_MAGIC = b"v2v index copy 1\n"
+_MAGIC = b"v2v index copy 2\n"
 
 
 class NoCopy(Exception):
