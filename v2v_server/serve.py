@@ -240,8 +240,8 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, seconds in self._supervisor.stopped(now).items():
-                self._dispatcher.worker_stopped(identity, seconds)
+            for identity, withheld in self._supervisor.withheld(now).items():
+                self._dispatcher.worker_withheld(identity, withheld)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")

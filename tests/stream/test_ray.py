@@ -145,7 +145,7 @@ def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, c
 
         until_there_are(2, 0.0)
         until_there_are(6, 0.0)
-        until_there_are(2, 0.4)
+        until_there_are(2, 1.5)  # far from what two can do, on a busy machine too
         said = log_of(server)
     changes = [int(found) for found in re.findall(r"workers: (\d+) from now on, because", said)]
     assert changes[:3] == [3, 5, 6]

@@ -48,7 +48,7 @@ from v2v_server.broker.admission import Admission
 from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
-from v2v_server.broker.leases import LeaseBook, Request
+from v2v_server.broker.leases import LeaseBook, Request, Withheld
 from v2v_server.broker.quarantine import Quarantine, Verdict
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.terms import inspected, lease_for, work_seconds
@@ -276,9 +276,9 @@ class Dispatcher:
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
-    def worker_stopped(self, identity: bytes, seconds: float) -> None:
-        """A worker's process was stopped from outside for so long; no deadline runs meanwhile."""
-        self.leases.put_off(identity, seconds)
+    def worker_withheld(self, identity: bytes, withheld: Withheld) -> None:
+        """A worker was kept from working for so long; no deadline runs meanwhile."""
+        self.leases.put_off(identity, withheld)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
         """Something sent to a worker did not go out, and nobody will say what became of its process."""

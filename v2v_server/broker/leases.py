@@ -70,7 +70,21 @@ class _Grant:
     limit_seconds: float  # from then to the answer
     begun_at: float | None = None
     stopped_seconds: float = 0.0  # of them, in which its worker was stopped from outside
+    queued_seconds: float = 0.0  # and in which it waited for a core
     debtor: bytes | None = None  # who asked for it and waits no more, which does not make it less work
+
+
+@dataclass(frozen=True, slots=True)
+class Withheld:
+    """Time in which a worker could not work, and not for anything that it is at.
+
+    Attributes:
+        stopped_seconds: stopped from outside, by a signal or a debugger.
+        queued_seconds: waiting for a core that other processes had.
+    """
+
+    stopped_seconds: float = 0.0
+    queued_seconds: float = 0.0
 
 
 class LeaseBook:
@@ -170,20 +184,22 @@ class LeaseBook:
             return
         lease.begun_at = now
         for other in map(self._leases.__getitem__, self._held[worker]):
-            other.since, other.stopped_seconds = now, 0.0
+            other.since, other.stopped_seconds, other.queued_seconds = now, 0.0, 0.0
             other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
 
-    def put_off(self, worker: bytes, seconds: float) -> None:
-        """The worker was stopped from outside for so long: that is not time in which it worked.
+    def put_off(self, worker: bytes, withheld: Withheld) -> None:
+        """The worker was kept from working for so long, which counts as no time.
 
-        One that stays stopped is overdue all the same, after twice its time: somebody waits for its samples. And while
-        it is stopped they may be given to a second worker (:meth:`slow`).
+        One that stays stopped is overdue all the same, after twice its time: somebody waits for its samples. One that
+        waits for a core gets one in the end; to end it would only cost more of them. Meanwhile its samples may be given
+        to a second worker (:meth:`slow`).
         """
         for number in self._held.get(worker, ()):
             lease = self._leases[number]
-            lease.stopped_seconds = min(lease.stopped_seconds + seconds, lease.limit_seconds)
+            lease.stopped_seconds = min(lease.stopped_seconds + withheld.stopped_seconds, lease.limit_seconds)
+            lease.queued_seconds += withheld.queued_seconds
             if lease.begun_at is not None:
-                lease.begun_at += seconds
+                lease.begun_at += withheld.stopped_seconds
 
     def limit_seconds(self, worker: bytes) -> float:
         """How long the worker may be silent over what it holds."""
@@ -250,7 +266,7 @@ class LeaseBook:
         return {
             lease.worker
             for lease in self._leases.values()
-            if now > lease.since + lease.limit_seconds + lease.stopped_seconds
+            if now > lease.since + lease.limit_seconds + lease.stopped_seconds + lease.queued_seconds
         }
 
     def slow(self, now: float) -> list[tuple[Request, bytes]]:

@@ -104,6 +104,15 @@ def is_stopped(pid: int) -> bool:
     return state in (b"T", b"t")
 
 
+def queued_seconds(pid: int) -> float:
+    """How long a process has waited for a core since it began, its first thread alone: that which works. 0 where the
+    system does not say."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_bytes().split()[1]) / 1e9
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+
 def status_of(pid: int) -> str:
     """What a process is at, in psutil's words: stopped, also by a debugger, or in the kernel, waiting for a disk ..."""
     try:

@@ -19,7 +19,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from v2v_server.broker.blame import Cause, Loss
-from v2v_server.supervise.child import hung, is_stopped, out_of_memory_kills, post_mortem, start_child, status_of
+from v2v_server.broker.leases import Withheld
+from v2v_server.supervise.child import (
+    hung,
+    is_stopped,
+    out_of_memory_kills,
+    post_mortem,
+    queued_seconds,
+    start_child,
+    status_of,
+)
 from v2v_server.supervise.protocol import Death
 from v2v_server.supervise.restarts import Restarts, crash_budget
 from v2v_server.worker.logbook import Logbook
@@ -27,7 +36,7 @@ from v2v_server.worker.logbook import Logbook
 _MEMORY_SECONDS = 5.0
 """After the kernel has killed for want of memory, a worker's SIGKILL is taken for its doing: to end takes a moment."""
 _LOOK_SECONDS = 1.0
-"""From one look at whether workers are stopped to the next."""
+"""From one look at whether workers are kept from working to the next."""
 _SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _AFTER_SHORTAGE_SECONDS = 5.0
 
@@ -41,6 +50,7 @@ class _Post:
     generation: int = 0
     given_up: bool = False
     start_at: float = 0.0
+    queued_seconds: float = 0.0  # that its process had waited for a core at the last look
 
     def close(self) -> None:
         """Forgets the process, which has ended."""
@@ -156,14 +166,22 @@ class Pool:
                         self._put_off(post, deaths[-1], now)
         return deaths
 
-    def stopped(self, now: float) -> dict[bytes, float]:
-        """Workers that are stopped from outside, and for how many seconds since the last call."""
-        since, self._looked = now - self._looked, now if now - self._looked >= _LOOK_SECONDS else self._looked
+    def withheld(self, now: float) -> dict[bytes, Withheld]:
+        """Workers that were kept from working since the last call, and how long."""
+        since = now - self._looked
         if since < _LOOK_SECONDS:
             return {}
-        processes = {post.identity: post.process for post in self._all() if post.process is not None}
-        stopped = [name for name, process in processes.items() if is_stopped(process.pid)]
-        return dict.fromkeys(stopped, min(since, 2 * _LOOK_SECONDS))
+        self._looked = now
+        found = {}
+        for post in self._all():
+            if post.process is None:
+                continue
+            before, post.queued_seconds = post.queued_seconds, queued_seconds(post.process.pid)
+            stopped = min(since, 2 * _LOOK_SECONDS) if is_stopped(post.process.pid) else 0.0
+            queued = min(since - stopped, post.queued_seconds - before)
+            if stopped or queued > 0:
+                found[post.identity] = Withheld(stopped, max(queued, 0.0))
+        return found
 
     def _put_off(self, post: _Post, death: Death, now: float) -> None:
         """Lets some time pass before the next process of a post.
@@ -213,7 +231,7 @@ class Pool:
 
     def _start(self, post: _Post) -> None:
         post.generation += 1
-        post.given_up = False
+        post.given_up, post.queued_seconds = False, 0.0
         name = f"{self._label}-{post.number}.{post.generation}"
         post.identity = name.encode()
         post.close()

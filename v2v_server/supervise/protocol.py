@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from v2v_server.broker.blame import Loss
+from v2v_server.broker.leases import Withheld
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +55,8 @@ class Supervisor(Protocol):
             WorkerCrashLoop: the workers die again and again without finishing anything.
         """
 
-    def stopped(self, now: float) -> dict[bytes, float]:
-        """Workers that are stopped from outside, and for how many seconds since the last call: no time to work."""
+    def withheld(self, now: float) -> dict[bytes, Withheld]:
+        """Workers that were kept from working since the last call, and how long: no deadline runs meanwhile."""
 
     def watches(self, identity: bytes) -> bool:
         """Whether :meth:`watch` will say how that worker ends."""

@@ -16,7 +16,7 @@ import ray
 
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Loss
-from v2v_server.supervise.child import out_of_memory_kills, post_mortem, start_child, status_of
+from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
 from v2v_server.worker.logbook import Logbook
 
 
@@ -28,6 +28,7 @@ class Sight:
         node: where it is.
         name: of its worker; empty where none runs.
         status: of the worker's process, in psutil's words.
+        queued_seconds: how long that process has waited for a core since it began.
         lease: that the worker is at, 0 for none; None when it never said.
         decodes: whether it decodes a video.
     """
@@ -35,6 +36,7 @@ class Sight:
     node: str
     name: str = ""
     status: str = ""
+    queued_seconds: float = 0.0
     lease: int | None = None
     decodes: bool = False
 
@@ -90,7 +92,8 @@ class RayWorker:
             if self._child is None:
                 return Sight(node())
             name, process, logbook = self._child
-            return Sight(node(), name, status_of(process.pid), logbook.lease(), logbook.decodes())
+            waited = queued_seconds(process.pid)
+            return Sight(node(), name, status_of(process.pid), waited, logbook.lease(), logbook.decodes())
 
     def signal(self, name: str, number: int) -> None:
         """Sends the worker of that name a signal, if it still runs."""

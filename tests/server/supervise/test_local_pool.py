@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -313,15 +314,36 @@ def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int
     pool = start(2, SLEEPS)
     pool.watch(0.0, 0)
     pid, _ = pool.pids()
-    assert pool.stopped(0.0) == {}
+
+    def stopped(now: float) -> dict[bytes, float]:
+        seconds = {name: withheld.stopped_seconds for name, withheld in pool.withheld(now).items()}
+        return {name: each for name, each in seconds.items() if each}
+
+    assert stopped(0.0) == {}
     os.kill(pid, signal.SIGSTOP)
     until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
-    assert pool.stopped(0.5) == {}  # it looks once a second
-    assert pool.stopped(1.5) == {b"label-0.1": 1.5}
-    assert pool.stopped(2.5) == {b"label-0.1": 1.0}
+    assert stopped(0.5) == {}  # it looks once a second
+    assert stopped(1.5) == {b"label-0.1": 1.5}
+    assert stopped(2.5) == {b"label-0.1": 1.0}
     os.kill(pid, signal.SIGCONT)
     until(lambda: psutil.Process(pid).status() != psutil.STATUS_STOPPED)
-    assert pool.stopped(5.0) == {}
+    assert stopped(5.0) == {}
+
+
+def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str], Pool]) -> None:
+    """Many that want the one core that they may use."""
+    pool = start(4, "while True: pass")
+    pool.watch(0.0, 0)
+    core = min(os.sched_getaffinity(0))
+    for pid in pool.pids():
+        os.sched_setaffinity(pid, {core})
+    looks = count(1.0)  # a second between one look and the next, as it goes by the clock that it is told
+
+    def all_waited() -> bool:
+        found = pool.withheld(next(looks)).values()
+        return len(found) == 4 and all(0 < each.queued_seconds <= 1 and not each.stopped_seconds for each in found)
+
+    until(all_waited)
 
 
 def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
