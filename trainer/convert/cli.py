@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -129,10 +131,29 @@ def _progress(name: str) -> Iterator[items.Progress]:
         TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
         TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
-    console = Console(file=sys.stderr)
-    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+    if not sys.stderr.isatty():
+        yield lines_of_progress(name, sys.stderr)
+        return
+    with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def lines_of_progress(
+    name: str, out: TextIO, *, clock: Callable[[], float] = time.monotonic, every_seconds: float = 30.0
+) -> items.Progress:
+    """For a log: a line now and then, with the share that is done and the time left; none where the size of the whole
+    is not known."""
+    began = told = clock()
+
+    def progress(done: int, total: int | None) -> None:
+        nonlocal told
+        if total is not None and 0 < done < total and (now := clock()) - told >= every_seconds:
+            told = now
+            left = (now - began) * (total - done) / done
+            print(f"{name}: {done / total:.0%} converted, about {left:.0f} s left", file=out, flush=True)
+
+    return progress
 
 
 if __name__ == "__main__":

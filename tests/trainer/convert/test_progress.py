@@ -1,0 +1,16 @@
+"""How far a conversion is, where there is no terminal."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+from trainer.convert.cli import lines_of_progress
+
+
+def test_a_line_every_thirty_seconds_and_none_of_what_is_done() -> None:
+    out, times = StringIO(), iter([0.0, 10.0, 40.0, 60.0, 75.0])
+    progress = lines_of_progress("a.bag", out, clock=lambda: next(times))
+    for done in (1, 4, 6, 5):
+        progress(done, 10)
+    progress(10, 10)
+    assert out.getvalue() == "a.bag: 40% converted, about 60 s left\na.bag: 50% converted, about 75 s left\n"
