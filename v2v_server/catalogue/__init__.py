@@ -2,7 +2,6 @@
 
 catalogue        the snapshot that everything else works from
 videos           its videos, in columns
-runs             their stretches between cuts, in columns
 corpus           where a corpus lies, and which files it has
 files            looking for them, and asking about many at a time
 listfile         list files like the paper's

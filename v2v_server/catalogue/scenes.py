@@ -20,8 +20,8 @@ from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.catalogue.index.columns import Records
 from v2v_server.catalogue.index.copy import NoCopy, copied, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
+from v2v_server.catalogue.index.runs import CutVideos, Runs
 from v2v_server.catalogue.manifest import Manifest
-from v2v_server.catalogue.runs import CutVideos, Runs
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.cloud.copies import Copies, lent

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.catalogue.index.columns import CHUNK, Records
-from v2v_server.catalogue.runs import CutVideos, Runs
+from v2v_server.catalogue.index.runs import CutVideos, Runs
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]

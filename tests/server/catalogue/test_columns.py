@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from v2v_server.catalogue.index import columns
 from v2v_server.catalogue.index.columns import Records, Texts, joined, merged
 from v2v_server.catalogue.index.file import IndexRow
-from v2v_server.catalogue.runs import CutVideos
+from v2v_server.catalogue.index.runs import CutVideos
 from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 
