@@ -48,6 +48,8 @@ MOST_PEAK_GROWTH_MIB = 64.0
 MOST_DECODE_SECONDS = 1.0
 """Processor time: a busy host is not the decoder's fault."""
 _SHOWN_BYTES = 400
+_UNDER_ATTACK_SECONDS = 60.0
+"""For how long at most the attack goes on until the healthy consumer has had a batch."""
 _TRIM_SECONDS = 0.5
 _SETTLE_SECONDS = 30.0
 _SETTLED_LOOKS = 4
@@ -142,6 +144,9 @@ def fuzz_live(
         with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up"), fleet.keys) as attack:
             began, committed = time.monotonic(), fleet.committed()[0]
             attack.send(messages - messages // 10)
+            # Few messages are out before the healthy consumer has had time for one batch: then some more.
+            while fleet.committed()[0] == committed and time.monotonic() < began + _UNDER_ATTACK_SECONDS:
+                attack.send(50)
             longest = attack.longest_seconds
             seconds = time.monotonic() - began
             under_attack = fleet.committed()[0] - committed
