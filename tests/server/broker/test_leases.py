@@ -72,13 +72,19 @@ def test_time_stopped_is_not_time_worked() -> None:
     assert overdue_workers(book, 1.5 * DEADLINE + 0.5) == [A, B]
 
 
-def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_and_slow_before() -> None:
+def where_others_are_quick() -> LeaseBook:
+    """A has begun a sample; those before took a tenth of a second each."""
     book = LeaseBook(DEADLINE)
     for index in range(20):
         number = book.grant(numbered(index), B, 0.0)
         book.begun(number, B, 0.0)
         book.finished(number, B, 0.1)
     book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    return book
+
+
+def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_and_slow_before() -> None:
+    book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
         book.put_off(A, Withheld(queued_seconds=0.75))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 4 * DEADLINE)
@@ -92,12 +98,7 @@ def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_an
 
 
 def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_before() -> None:
-    book = LeaseBook(DEADLINE)
-    for index in range(20):
-        number = book.grant(numbered(index), B, 0.0)
-        book.begun(number, B, 0.0)
-        book.finished(number, B, 0.1)
-    book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
         book.put_off(A, Withheld(stopped_seconds=1.0))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 2 * DEADLINE)
