@@ -73,10 +73,11 @@ class StreamIdentity:
         Raises:
             StateMismatch: they would give other samples; the message names what differs, on both sides.
         """
+        # First what explains the others: another version may name the same spec and videos differently.
         remedies = {
+            "numerics_version": "serve with the release that the state was saved with",
             "spec_digest": "ask for the recipe and options that were saved",
             "catalogue_digest": "serve the folder of videos as it was (added, removed or changed files alter it)",
-            "numerics_version": "serve with the release that the state was saved with",
             "sequences": "serve the folder of videos as it was",
         }
         for name, remedy in remedies.items():

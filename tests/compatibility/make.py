@@ -1,0 +1,123 @@
+"""Write a fixture of the present release: the files that users keep, and the bytes that they must go on to give.
+
+    python -m tests.compatibility.make
+
+A fixture is made once for each ``NUMERICS_VERSION``, with the release that first has it, and is never rewritten.
+``test_compatibility.py`` reads all of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from tests.clips import panned_luma, write_clip
+from trainer.run.checkpoint import load_checkpoint
+from v2v_client import Batch, V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol import NUMERICS_VERSION, __version__
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.catalogue.refresh import index_path
+from v2v_server.video.rows import Rows
+
+FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"
+RECIPE_FIELDS = {
+    "preset": "paper", "voxels_per_clip": 2, "crop_height_px": 24, "crop_width_px": 24, "noise_sigma": [0.0, 0.05],
+}  # fmt: skip
+ROWS = "top:0.9"
+SEED = 7
+CUT = 1
+"""Batches that the trainer of the fixture took before it saved its state."""
+
+
+def main() -> int:
+    """Write the fixture of this release, and refuse to replace one."""
+    if FOLDER.exists():
+        print(f"{FOLDER} exists: a fixture is never rewritten", file=sys.stderr)
+        return 2
+    with tempfile.TemporaryDirectory() as scratch:
+        shutil.copytree(_make(Path(scratch)), FOLDER)
+    return 0
+
+
+def stream(videos: Path, *flags: str, recipe: Path, state: Mapping[str, Any] | None = None) -> list[Batch]:
+    """Return the batches of one epoch of a folder of videos, from the start or from a saved state on."""
+    fields = yaml.safe_load(recipe.read_text())
+    with LocalServer(videos, workers=1, flags=["--recipe", str(recipe), *flags]) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=2, recipe=fields, seed=SEED)
+        if state is not None:
+            dataset.load_state_dict(state)
+        return list(dataset)
+
+
+def sample_digests(batch: Batch) -> list[str]:
+    """Return the SHA-256 of the voxels and frames of each sample."""
+    arrays = zip(batch.voxels.numpy(), batch.frames.numpy(), strict=True)
+    return [hashlib.sha256(voxels.tobytes() + frames.tobytes()).hexdigest() for voxels, frames in arrays]
+
+
+def tensors_digest(model: Mapping[str, torch.Tensor]) -> str:
+    """Return the SHA-256 of the names and values of a state dict."""
+    sha = hashlib.sha256()
+    for name in sorted(model):
+        sha.update(name.encode() + model[name].numpy().tobytes())
+    return sha.hexdigest()
+
+
+def train(videos: Path, out: Path, *, steps: int, resume: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Train the smallest network up to a step, in a process of its own."""
+    values = {
+        **{f"stream.recipe.{name}": value for name, value in RECIPE_FIELDS.items() if name != "preset"},
+        "run.steps": steps, "run.seconds": 0, "run.judge_every": 0, "run.preview_every": 0, "run.save_every": 1,
+        "network.options.base_channels": 2,
+    }  # fmt: skip
+    flags = [flag for name, value in values.items() for flag in ("--set", f"{name}={json.dumps(value)}")]
+    flags += ["--out", str(out)] if resume is None else ["--resume", str(resume), "--out", str(out)]
+    command = [sys.executable, "-m", "trainer.train", "tiny-cpu", "--videos", str(videos), *flags]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def _make(scratch: Path) -> Path:
+    os.environ["V2V_CACHE_DIR"] = str(scratch / "user-cache")
+    fixture = scratch / "fixture"
+    videos = fixture / "videos"
+    videos.mkdir(parents=True)
+    write_clip(videos / "a.mp4", panned_luma(50, 40, 48), gop=12, b_frames=2)
+    write_clip(videos / "b.webm", panned_luma(38, 32, 40, step=(2, 1)), codec="libvpx-vp9")
+    (fixture / "recipe.yaml").write_text(yaml.safe_dump(RECIPE_FIELDS))
+    batches = stream(videos, "--cache", str(fixture / "cache"), "--rows", ROWS, recipe=fixture / "recipe.yaml")
+    state = batches[CUT - 1].resume_state
+    prepare = [sys.executable, "-m", "v2v_server.commands.prepare", str(videos), str(fixture / "store"), "--rows", ROWS]
+    subprocess.run(prepare, check=True)
+    with closing(open_catalogue(videos, rows=Rows.parse(ROWS))) as catalogue:
+        shutil.copy(index_path(catalogue.folder, None), fixture / "index.sqlite3")
+        expected = {
+            "release": __version__,
+            "numerics_version": NUMERICS_VERSION,
+            "spec_digest": state["spec_digest"],
+            "catalogue_digest": catalogue.digest,
+            "samples": [digest for batch in batches for digest in sample_digests(batch)],
+        }
+    (fixture / "state.json").write_text(json.dumps(state, indent=1, sort_keys=True))
+    done = train(videos, scratch / "run", steps=3)
+    assert done.returncode == 0, done.stderr
+    shutil.copy(scratch / "run" / "last.pt", fixture / "last.pt")
+    expected["model"] = tensors_digest(load_checkpoint(fixture / "last.pt").model)
+    (fixture / "expected.json").write_text(json.dumps(expected, indent=1))
+    return fixture
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,136 @@
+"""What users kept with an earlier release continues to the same bytes, or is refused with the remedy.
+
+Each folder ``numerics-N`` was written by ``make.py`` with the release that first had ``NUMERICS_VERSION`` N. The present
+version must give the bytes of the fixture. A state or checkpoint of an earlier version is refused by number; stores,
+caches, indexes and recipes of earlier versions go on.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.compatibility.make import CUT, ROWS, sample_digests, stream, tensors_digest, train
+from trainer.run.checkpoint import load_checkpoint
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import StateMismatch
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue import refresh
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.catalogue.index.file import SCHEMA_VERSION
+from v2v_server.video.rows import Rows
+
+FIXTURES = sorted(Path(__file__).parent.glob("numerics-*"))
+
+
+@pytest.fixture(params=FIXTURES, ids=lambda path: path.name)
+def fixture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Return a copy of a fixture that a test may write to."""
+    return Path(shutil.copytree(request.param, tmp_path / "fixture"))
+
+
+def expected(fixture: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((fixture / "expected.json").read_text())
+    return values
+
+
+def is_present(fixture: Path) -> bool:
+    return bool(expected(fixture)["numerics_version"] == NUMERICS_VERSION)
+
+
+def digests(videos: Path, *flags: str, fixture: Path, state: Any = None) -> list[str]:
+    batches = stream(videos, *flags, recipe=fixture / "recipe.yaml", state=state)
+    return [digest for batch in batches for digest in sample_digests(batch)]
+
+
+def test_there_is_a_fixture_of_the_present_version() -> None:
+    assert f"numerics-{NUMERICS_VERSION}" in [path.name for path in FIXTURES]
+
+
+def test_a_recipe_keeps_its_digest(fixture: Path) -> None:
+    state = json.loads((fixture / "state.json").read_text())
+    assert StreamSpec.from_dict(state["spec"]).digest == expected(fixture)["spec_digest"] == state["spec_digest"]
+    fields = yaml.safe_load((fixture / "recipe.yaml").read_text())
+    assert Recipe.from_dict(fields) == StreamSpec.from_dict(state["spec"]).recipe
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["videos", "store", "cache"])
+def test_every_source_gives_the_bytes_of_the_release_that_wrote_it(fixture: Path, source: str) -> None:
+    cache = ["--cache", str(fixture / "cache")] if source == "cache" else []
+    rows = [] if source == "store" else ["--rows", ROWS]
+    videos = fixture / ("store" if source == "store" else "videos")
+    assert digests(videos, *cache, *rows, fixture=fixture) == expected(fixture)["samples"]
+
+
+@pytest.mark.slow
+def test_pieces_of_the_cache_are_read_and_not_made_again(fixture: Path) -> None:
+    def pieces() -> dict[str, int]:
+        return {str(path): path.stat().st_mtime_ns for path in fixture.glob("cache/??/*")}
+
+    before = pieces()
+    digests(fixture / "videos", "--cache", str(fixture / "cache"), "--rows", ROWS, fixture=fixture)
+    assert before
+    assert pieces() == before
+
+
+@pytest.mark.slow
+def test_a_saved_state_continues_or_is_refused_with_both_numbers(fixture: Path) -> None:
+    state = json.loads((fixture / "state.json").read_text())
+    if is_present(fixture):
+        after = digests(fixture / "videos", "--rows", ROWS, fixture=fixture, state=state)
+        assert after == expected(fixture)["samples"][2 * CUT :]
+        return
+    with pytest.raises(StateMismatch) as refused:
+        digests(fixture / "videos", "--rows", ROWS, fixture=fixture, state=state)
+    assert f"has {expected(fixture)['numerics_version']}" in str(refused.value)
+    assert f"has {NUMERICS_VERSION}; serve with the release that the state was saved with" in str(refused.value)
+
+
+def test_a_checkpoint_keeps_its_weights(fixture: Path) -> None:
+    assert tensors_digest(load_checkpoint(fixture / "last.pt").model) == expected(fixture)["model"]
+
+
+@pytest.mark.slow
+def test_a_checkpoint_is_resumed_or_refused_with_both_numbers(fixture: Path, tmp_path: Path) -> None:
+    done = train(fixture / "videos", tmp_path / "run", steps=5, resume=fixture / "last.pt")
+    if is_present(fixture):
+        assert done.returncode == 0, done.stderr
+        assert load_checkpoint(tmp_path / "run" / "last.pt").step == 5
+        return
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert f"has {expected(fixture)['numerics_version']}" in done.stderr
+    assert f"has {NUMERICS_VERSION}; serve with the release that the state was saved with" in done.stderr
+
+
+def test_an_index_is_taken_over_or_its_videos_are_probed_again(fixture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, videos = fixture / "user-cache", fixture / "videos"
+    index = refresh.index_path(videos.resolve(), cache)
+    cache.mkdir()
+    shutil.copy(fixture / "index.sqlite3", index)
+    with closing(sqlite3.connect(index)) as database, database:
+        # The copies have other times of modification than the files that were probed.
+        for path in videos.iterdir():
+            state = path.stat()
+            database.execute(
+                "UPDATE video SET size_bytes = ?, mtime_ns = ?, ctime_ns = ? WHERE id = ?",
+                (state.st_size, state.st_mtime_ns, state.st_ctime_ns, path.name),
+            )
+        is_taken_over = database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION
+    probed: list[str] = []
+    survey = refresh.survey
+    monkeypatch.setattr(refresh, "survey", lambda root, ids, *rest: probed.extend(ids) or survey(root, ids, *rest))
+    with closing(open_catalogue(videos, rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
+        assert probed == ([] if is_taken_over else ["a.mp4", "b.webm"])
+        assert [video.id for video in catalogue.videos] == ["a.mp4", "b.webm"]
+        if is_present(fixture):
+            assert catalogue.digest == expected(fixture)["catalogue_digest"]
