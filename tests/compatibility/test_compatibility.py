@@ -1,8 +1,8 @@
 """What users kept with an earlier release continues to the same bytes, or is refused with the remedy.
 
 Each folder ``numerics-N`` was written by ``make.py`` with the release that first had ``NUMERICS_VERSION`` N. The
-present version must give the bytes of the fixture. A state or checkpoint of an earlier version is refused by number; stores,
-caches, indexes and recipes of earlier versions go on.
+present version must give the bytes of the fixture. A state or checkpoint of an earlier version is refused by number;
+stores, caches, indexes and recipes of earlier versions go on.
 """
 
 from __future__ import annotations
