@@ -125,6 +125,8 @@ class Camera:
             parts.append(f"noise {params.noise_sigma:.3f}")
         if params.hot_pixel_count:
             parts.append(f"{params.hot_pixel_count} hot pixels")
+        if params.log_eps is not None:
+            parts.append(f"dark floor {params.log_eps:.3f}")
         if params.scale != 1.0:
             parts.append(f"resized by {params.scale:.2f}")
         if params.flip:
