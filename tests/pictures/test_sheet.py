@@ -244,6 +244,13 @@ def test_a_drawn_dark_floor_is_described() -> None:
     assert "dark floor 0.125" in floor.describe()
 
 
+def test_a_camera_of_mostly_noise_says_so() -> None:
+    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
+    assert "mostly noise" not in shown.describe()
+    assert "mostly noise: 83% of the events" in dataclasses.replace(shown, noise_share=0.83).describe()
+    assert "mostly noise" not in dataclasses.replace(shown, noise_share=0.4).describe()
+
+
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:
     """A crop of 16 x 16 at (left 20, top 10) of a picture twice as large as the video's: a box of 8 x 8 at (10, 5)."""
     voxels = np.zeros((2, 2, 16, 16), np.int8)
