@@ -40,6 +40,7 @@ class Camera:
         frames_per_bin: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
+        noise_share: share of the clip's events that the same draw without noise does not have, or None: not measured.
     """
 
     voxels: npt.NDArray[Any]
@@ -50,6 +51,7 @@ class Camera:
     frames_per_bin: int = 1
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
+    noise_share: float | None = None
 
     @classmethod
     def of(
@@ -120,11 +122,16 @@ class Camera:
     def describe(self) -> str:
         """The draw in one line: what is nothing is left out."""
         params = self.provenance.params
-        parts = [f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}"]
+        parts = []
+        if self.noise_share is not None and self.noise_share > 0.5:
+            parts.append(f"mostly noise: {self.noise_share:.0%} of the events")
+        parts.append(f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}")
         if params.noise_sigma:
             parts.append(f"noise {params.noise_sigma:.3f}")
         if params.hot_pixel_count:
             parts.append(f"{params.hot_pixel_count} hot pixels")
+        if params.log_eps is not None:
+            parts.append(f"dark floor {params.log_eps:.3f}")
         if params.scale != 1.0:
             parts.append(f"resized by {params.scale:.2f}")
         if params.flip:

@@ -60,4 +60,6 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     if camera.flow is not None:
         page.text(left[2], top - _NAMES_PX, "optical flow", size=canvas.HEADING_PT)
         flow_panel(page, left[2], top, camera.flow[grid], scale.largest_px, tile_px)
-    draw_strip(page, camera, MARGIN_PX, top + tile_px + GAP_PX + LABEL_PX, width, _STRIP_PX, cursor=number)
+    draw_strip(
+        page, camera, MARGIN_PX, top + tile_px + GAP_PX + LABEL_PX, width, _STRIP_PX, scale.highest_rate, cursor=number
+    )

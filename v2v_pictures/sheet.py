@@ -38,10 +38,12 @@ class Scale:
     Attributes:
         full: events that get full colour.
         largest_px: flow that gets full colour.
+        highest_rate: events a pixel and bin that fill a bar of the activity strips.
     """
 
     full: float
     largest_px: float
+    highest_rate: float
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Scale:
@@ -49,7 +51,8 @@ class Scale:
         shown = [camera.voxels[moment] for camera in cameras for moment in camera.moments(3)]
         flows = [camera.flow.astype(np.float32) for camera in cameras if camera.flow is not None]
         longest = max((float(np.quantile(np.hypot(flow[:, 0], flow[:, 1]), 0.99)) for flow in flows), default=1.0)
-        return cls(full_colour(shown), max(1.0, longest))
+        highest = max((float(np.quantile(camera.rates, 0.99)) for camera in cameras), default=0.0)
+        return cls(full_colour(shown), max(1.0, longest), max(highest, 1e-9))
 
 
 def draw_sheet(cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_px: int = 192) -> Image:
@@ -85,7 +88,7 @@ def draw_sheet(cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_
             whole_panel(page, camera, MARGIN_PX, top, tile_px, strip_px - GAP_PX)
             strip_left = left[1]
         strip_width = page.width_px - MARGIN_PX - strip_left
-        draw_strip(page, camera, strip_left, top + LABEL_PX, strip_width, _STRIP_PX, picks)
+        draw_strip(page, camera, strip_left, top + LABEL_PX, strip_width, _STRIP_PX, scale.highest_rate, picks)
         for row, pick in enumerate(picks):
             y = top + strip_px + row * (tile_px + GAP_PX)
             _moment(page, camera, pick, scale, left, y, tile_px)

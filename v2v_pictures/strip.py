@@ -25,6 +25,7 @@ def draw_strip(
     top: int,
     width: int,
     height: int,
+    highest: float,
     picks: Sequence[int] = (),
     cursor: int | None = None,
 ) -> None:
@@ -32,14 +33,14 @@ def draw_strip(
 
     Args:
         page: to draw on.
-        camera: whose activity. Each strip has a scale of its own. A full bar reaches from the middle to the edge; its
-            rate is written above the strip, and higher rates are cut there.
+        camera: whose activity.
         left, top, width, height: of the strip itself, px.
+        highest: events a pixel and bin of a full bar, which reaches from the middle to the edge; above 0, written above
+            the strip. Higher rates are cut there. One value for all strips of a page makes them comparable.
         picks: voxel grids to point at.
         cursor: a bin to draw a line at, for films.
     """
     rates, middle = camera.rates, top + height / 2
-    highest = max(float(np.quantile(rates, 0.99)), 1e-9)
     x = page.text(left, top - LABEL_PX, "events over the whole clip")
     page.text(x + 12, top - LABEL_PX, f"full bar: {highest:.2g} or more a pixel and bin", colour=canvas.SOFT)
     count = rates.shape[1]

@@ -211,11 +211,44 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
 
     monkeypatch.setattr(Canvas, "text", listen)
     page = Canvas(1100, 160)
-    draw_strip(page, camera(voxels), 50, 40, 1000, 80)
+    draw_strip(page, camera(voxels), 50, 40, 1000, 80, 0.5)
     assert "full bar: 0.5 or more a pixel and bin" in written
     image = page.image()
     bars = [has(image[40:121, 50 + 5 * number + 2][None], BRIGHTER) for number in (0, 50, 100)]
     assert bars == pytest.approx([40, 40, 16], abs=2)
+
+
+@pytest.mark.parametrize("draw", [draw_sheet, lambda cameras, title: list(draw_film(cameras, title))])
+def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera that sees next to nothing must not look as busy as one that sees motion."""
+    busy, quiet = np.ones((4, 2, 16, 16), np.int8), np.zeros((4, 2, 16, 16), np.int8)
+    quiet[:, :, 0, 0] = 1
+    written: list[str] = []
+    write = Canvas.text
+
+    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
+        written.append(text)
+        return write(page, x, y, text, **style)
+
+    monkeypatch.setattr(Canvas, "text", listen)
+    draw([camera(quiet), camera(busy)], "one scale")
+    assert {text for text in written if text.startswith("full bar")} == {"full bar: 1 or more a pixel and bin"}
+
+
+def test_a_drawn_dark_floor_is_described() -> None:
+    """It is all in which the preset `sensor` differs from `paper`."""
+    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
+    params = dataclasses.replace(PARAMS, log_eps=0.125)
+    floor = dataclasses.replace(shown, provenance=dataclasses.replace(PROVENANCE, params=params))
+    assert "dark floor" not in shown.describe()
+    assert "dark floor 0.125" in floor.describe()
+
+
+def test_a_camera_of_mostly_noise_says_so() -> None:
+    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
+    assert "mostly noise" not in shown.describe()
+    assert "mostly noise: 83% of the events" in dataclasses.replace(shown, noise_share=0.83).describe()
+    assert "mostly noise" not in dataclasses.replace(shown, noise_share=0.4).describe()
 
 
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:

@@ -4,7 +4,7 @@ Its keys:
 
     model: {name: e2vid, options: {final_activation: none}}    # both optional: the weights tell
     voxels: {kind: discrete, bins: 5, span: events}
-    metrics: [mse, ssim_range2, ssim, lpips_alex]
+    metrics: [mse, ssim_range2, ssim, correlation, lpips_alex]
     data:
       - HQF                                                    # of the paper, with its cuts
       - {name: mine, folder: recordings, sequences: {corridor: [0, 10], desk: null}}
@@ -28,6 +28,7 @@ from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.voxelise import VoxelSettings
 from v2v_protocol.errors import UsageError
 
+DEFAULT_METRICS = ("mse", "ssim_range2", "ssim", "correlation")
 KEYS = ("model", "voxels", "metrics", "data", "paper")
 
 
@@ -48,7 +49,7 @@ class EvaluationConfig:
     model: str | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     voxels: VoxelSettings | None = None
-    metrics: tuple[str, ...] = ("mse", "ssim_range2", "ssim")
+    metrics: tuple[str, ...] = DEFAULT_METRICS
     paper: tuple[str, ...] = ()
 
 
@@ -94,7 +95,7 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
         model=model.get("name"),
         model_options=_options(model.get("options"), f"{where}: model: options"),
         voxels=VoxelSettings(**voxels) if voxels else None,
-        metrics=_known(top.get("metrics", ["mse", "ssim_range2", "ssim"]), METRICS, f"{where}: metrics"),
+        metrics=_known(top.get("metrics", list(DEFAULT_METRICS)), METRICS, f"{where}: metrics"),
         paper=_known(top.get("paper", []), (*paper.RESULTS, *paper.FLOW), f"{where}: paper"),
     )
 

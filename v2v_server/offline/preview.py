@@ -6,6 +6,7 @@ trainer gets. A video too short or too small for the recipe is shown with shorte
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from v2v_server.video.decode import decode_luma
 KINDS = (".png", ".mp4", ".gif", ".html")
 _TOLD_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
+_NOISE = ("noise_sigma", "hot_pixel_share", "shot_noise_hz", "leak_hz")
 _GIF_EVERY = 2  # every other bin: half the size
 
 
@@ -153,7 +155,14 @@ def _camera(
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
     sample = remake(catalogue, stream, seed=look.seed, epoch=0, index=0, arrays=arrays)
     whole = _whole_picture(catalogue, sample.provenance)
-    return Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin, whole)
+    camera = Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin, whole)
+    quiet_recipe = stream.recipe.replace(**dict.fromkeys(_NOISE, (0.0, 0.0)))
+    quiet_stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": quiet_recipe})
+    quiet = remake(catalogue, quiet_stream, seed=look.seed, epoch=0, index=0, arrays=("voxels", "frames"))
+    without = Camera.of(quiet.arrays, quiet.provenance, look.title)
+    events = float(camera.rates.sum())
+    share = max(0.0, 1.0 - float(without.rates.sum()) / events) if events else 0.0
+    return dataclasses.replace(camera, noise_share=share)
 
 
 def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8] | None:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import av
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image as Pictures
 
 from tests.clips import panned_luma, write_clip
+from v2v_pictures.camera import Camera
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands import preview as command
 from v2v_server.offline.preview import Shot, preview
@@ -135,3 +137,24 @@ def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypat
     )  # fmt: skip
     assert said[0].startswith("1 of 15 pictures of the film, ")
     assert len(said) == 15
+
+
+def _shares(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: dict[str, object]) -> list[float]:
+    cameras: list[Camera] = []
+
+    def keep(shown: list[Camera], title: str, *, moments: int) -> npt.NDArray[np.uint8]:
+        cameras.extend(shown)
+        return np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr("v2v_server.offline.preview.draw_sheet", keep)
+    shots = [Shot("a", TINY | recipe, 0)]
+    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    return [camera.noise_share for camera in cameras if camera.noise_share is not None]
+
+
+def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = write_clip(tmp_path / "still.mp4", np.full((40, 96, 128), 90, np.uint8))
+    loud = {"noise_sigma": [0.3, 0.3], "pause_probability": 0.0}
+    assert _shares(still, tmp_path, monkeypatch, loud) == [1.0]
+    quiet = {"preset": "noise-free"}
+    assert _shares(clip, tmp_path, monkeypatch, quiet) == [0.0]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from trainer.evaluation import paper
-from trainer.evaluation.config import folder_config, parse_config, read_config, shipped
+from trainer.evaluation.config import EvaluationConfig, folder_config, parse_config, read_config, shipped
 from trainer.evaluation.cuts import DATA_SETS
 from trainer.evaluation.voxelise import VoxelSettings
 from v2v_protocol.errors import UsageError
@@ -22,8 +22,15 @@ def test_shipped_configurations_name_the_whole_paper() -> None:
         config = read_config(name)
         assert [data_set.name for data_set in config.data_sets] == ["HQF", "EVAID", "IJRR", "MVSEC"]
         assert config.voxels is not None
+        assert "correlation" in config.metrics
     assert read_config("paper-discrete").voxels == VoxelSettings(kind="discrete")
     assert read_config("firenet").model_options == {"normalize_voxels": True}
+
+
+def test_the_default_metrics_tell_a_picture_from_constant_grey() -> None:
+    content = {"data": [{"name": "mine", "sequences": ["desk"]}]}
+    assert "correlation" in parse_config(content, "a.yaml").metrics
+    assert "correlation" in EvaluationConfig(()).metrics
 
 
 def test_sequences_and_cuts_of_the_paper() -> None:
