@@ -7,10 +7,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from trainer.config import TrainConfig
 from v2v_protocol.errors import UsageError
+from v2v_protocol.safe_yaml import YamlError, format_yaml, parse_yaml, read_yaml
 
 EXTENDS = "extends"
 
@@ -40,8 +39,7 @@ def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
 
 def show_config(config: TrainConfig) -> str:
     """All keys of a configuration as YAML, which ``v2v-train`` takes again."""
-    shown: str = yaml.safe_dump(config.to_dict(), sort_keys=False)
-    return shown
+    return format_yaml(config.to_dict())
 
 
 def _read(file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -51,11 +49,11 @@ def _read(file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     if str(path.resolve()) in seen:
         raise UsageError(f"{file}: extends itself")
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = read_yaml(path)
     except OSError as error:
         raise UsageError(f"{file}: {error.strerror}; shipped configurations: {', '.join(shipped())}") from error
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that does not exist
-        raise UsageError(f"{file}: not YAML: {' '.join(str(error).split())[:200]}") from error
+    except YamlError as error:
+        raise UsageError(f"{file}: not YAML: {error}") from error
     values = {} if values is None else values
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise UsageError(f"{file}: expected sections of keys and values, found {type(values).__name__}")
@@ -81,8 +79,8 @@ def _set(values: dict[str, Any], setting: str) -> None:
     if not equals or not groups or not all((*groups, key)):
         raise UsageError(f"--set {setting}: write SECTION.KEY=VALUE, for instance --set optimizer.learning_rate=1e-4")
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as error:
+        value = parse_yaml(text)
+    except YamlError as error:
         raise UsageError(f"--set {setting}: {text!r} is not a value in YAML") from error
     place = values
     for group in groups:

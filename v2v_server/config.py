@@ -5,15 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_server.system.log import LOG_FORMATS
@@ -212,8 +210,8 @@ def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any 
         if not equals:
             raise UsageError(f"--set {setting}: write KEY=VALUE, for instance --set voxels_per_clip=5")
         try:
-            fields[key.strip()] = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
+            fields[key.strip()] = parse_yaml(text)
+        except YamlError as error:
             raise UsageError(f"--set {setting}: {text!r} is not a value") from error
     return Recipe.from_dict(fields)
 
@@ -225,38 +223,16 @@ def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
         UsageError: it cannot be read, has a key twice, or holds something else; the message names the flag.
     """
     try:
-        values = yaml.load(Path(file).read_text(encoding="utf-8"), _Loader)
+        values = read_yaml(file)
     except OSError as error:
         raise UsageError(f"{flag} {file}: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, or a date that does not exist
-        raise UsageError(f"{flag} {file}: not YAML: {' '.join(str(error).split())[:200]}") from error
+    except YamlError as error:
+        raise UsageError(f"{flag} {file}: not YAML: {error}") from error
     if values is None:
         return {}
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise UsageError(f"{flag} {file}: expected keys and values, found {type(values).__name__}")
     return values
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a mapping that has a key twice, of which SafeLoader would take the last without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                continue  # no key of ours
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
-    """8:32 is text, not 512 as a number of base 60 in YAML 1.1."""
-    return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _whole_or_text)
 
 
 def _check_address(flag: str, address: str, *, is_safe: bool) -> None:

@@ -19,14 +19,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from trainer.evaluation import paper
 from trainer.evaluation.cuts import DATA_SETS, Cut, DataSet
 from trainer.evaluation.layout import SUFFIXES
 from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.voxelise import VoxelSettings
 from v2v_protocol.errors import UsageError
+from v2v_protocol.safe_yaml import YamlError, read_yaml
 
 DEFAULT_METRICS = ("mse", "ssim_range2", "ssim", "correlation")
 KEYS = ("model", "voxels", "metrics", "data", "paper")
@@ -74,9 +73,11 @@ def read_config(name: str) -> EvaluationConfig:
             raise UsageError(f"no file {name}; configurations that ship with the project: {', '.join(sorted(known))}")
         path = known[name]
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+        content = read_yaml(path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except YamlError as error:
+        raise UsageError(f"{path} is not YAML: {error}") from error
     return parse_config(content, str(path))
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from v2v_bench.tradeoff.forms import ENCODINGS, SOURCE
+from v2v_protocol.safe_yaml import format_yaml
 
 SAMPLES_PER_DECODE = (1, 2, 4)
 
@@ -44,7 +43,7 @@ class Setting:
             flags = f"--rows {rows} --codec {how.codec} {kind}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
         chosen = {"rows": rows, "samples_per_decode": self.samples_per_decode}
-        return "\n".join([*lines, yaml.safe_dump(chosen, sort_keys=False)])
+        return "\n".join([*lines, format_yaml(chosen)])
 
 
 EXACT = Setting()

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import psutil
-import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -27,6 +26,7 @@ from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
+from v2v_protocol.safe_yaml import YamlError, parse_yaml
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import SPEED_PRESETS
 
@@ -262,8 +262,8 @@ def recipe_of(preset: str | None, changes: Sequence[str]) -> str | dict[str, Any
     for change in changes:
         key, equals, text = change.partition("=")
         try:
-            value = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that does not exist
+            value = parse_yaml(text)
+        except YamlError as error:
             raise UsageError(f"--set {change}: the value is not YAML") from error
         if not equals or not key or value is None:
             raise UsageError(f"--set {change}: give KEY=VALUE, for example --set threshold='[0.1, 0.5]'")

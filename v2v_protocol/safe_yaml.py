@@ -1,0 +1,122 @@
+"""The one reader of YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
+
+An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values, so the
+bound is on the values after aliases are replaced, and it is checked before any of them is built.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+LARGEST_BYTES = 1 << 20
+MOST_VALUES = 100_000
+"""Scalars, lists and mappings of a text, each alias counted as all that it stands for."""
+MOST_LEVELS = 32
+
+
+class YamlError(ValueError):
+    """A text that is not YAML, or exceeds a limit of this module. The message is one line."""
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the value of a YAML text; None for an empty one.
+
+    Raises:
+        YamlError: it is not YAML, has a key twice, or exceeds :data:`MOST_VALUES` or :data:`MOST_LEVELS`.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise YamlError(" ".join(str(error).split())[:200]) from error
+    # Of values that do not fit their tag: a date that does not exist, `!!int ""`, `!!bool 3`, `!!timestamp x`.
+    except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:
+        raise YamlError(f"a value does not fit its type: {' '.join(str(error).split())[:160]}") from error
+
+
+def read_yaml(path: str | os.PathLike[str]) -> Any:
+    """Return the value of a YAML file.
+
+    Raises:
+        YamlError: it is not UTF-8, is larger than :data:`LARGEST_BYTES`, or see :func:`parse_yaml`.
+        OSError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST_BYTES + 1)
+    except ValueError as error:  # a NUL in the name
+        raise YamlError(f"the file's name: {error}") from error
+    if len(data) > LARGEST_BYTES:
+        raise YamlError(f"the file has more than {LARGEST_BYTES} bytes, the limit; is it the right file?")
+    try:
+        return parse_yaml(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise YamlError(f"not UTF-8 text: {error.reason} at byte {error.start}") from error
+
+
+def format_yaml(value: Any) -> str:
+    """Return plain values as YAML that :func:`parse_yaml` reads back, keys in their order."""
+    formatted: str = yaml.safe_dump(value, sort_keys=False)
+    return formatted
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuse what expands beyond the limits, and a key that is there twice (SafeLoader takes the last silently)."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._values = 0
+        self._level = self._deepest = 0
+        self._extents: dict[int, tuple[int, int]] = {}  # by id of a composed node: its values and levels
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        mark = self.peek_event().start_mark
+        is_alias = self.check_event(yaml.AliasEvent)
+        before, outer = self._values, self._deepest
+        self._level += 1
+        self._deepest = self._level
+        self._check_limits(mark)  # before a deep text is descended into
+        node = super().compose_node(parent, index)
+        if is_alias:
+            if id(node) not in self._extents:
+                raise yaml.composer.ComposerError(None, None, "an alias refers to what it is part of", mark)
+            values, levels = self._extents[id(node)]
+        else:
+            values, levels = self._values - before + 1, self._deepest - self._level + 1
+            self._extents[id(node)] = values, levels
+        self._values = before + values
+        self._deepest = max(outer, self._level + levels - 1)
+        self._check_limits(mark)
+        self._level -= 1
+        return node
+
+    def _check_limits(self, mark: yaml.Mark | None) -> None:
+        for count, limit, unit in (
+            (self._values, MOST_VALUES, "values (aliases count as what they stand for)"),
+            (self._deepest, MOST_LEVELS, "levels"),
+        ):
+            if count > limit:
+                raise yaml.composer.ComposerError(
+                    None, None, f"more than {limit} {unit}; write it with fewer or without aliases", mark
+                )
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue  # no key of ours
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
+    """8:32 is text, not 512 as a number of base 60 in YAML 1.1."""
+    return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_or_text)
