@@ -158,7 +158,7 @@ class Copies:
         """The open copy, locked against eviction; None if it is not there."""
         with contextlib.ExitStack() as undo, contextlib.suppress(OSError):  # evicted, before or just now
             file = undo.enter_context(path.open("rb"))
-            fcntl.flock(file, fcntl.LOCK_SH)
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a copy that another process locks is fetched again
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 os.utime(path)
                 undo.pop_all()

@@ -61,7 +61,7 @@ class ConsumerState:
     """One consumer: a session.
 
     Attributes:
-        id: of its connection, in hexadecimal digits.
+        id: hexadecimal digits that name the session until the server ends. Not its routing id.
         name, host: as it calls itself: "rank 0 of 2".
         state: "stalled": it waits for samples a tenth of the time or more; "taking"; "idle": it has asked for nothing;
             "gone": its connection has ended, and it may come back for ten seconds.

@@ -232,7 +232,7 @@ class Cache:
         try:
             partial.parent.mkdir(exist_ok=True)
             with StoreWriter(partial, head, QUICK) as writer:
-                fcntl.flock(writer.fileno(), fcntl.LOCK_EX)  # as long as we live: see _remove_abandoned
+                fcntl.flock(writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as we live: see _remove_abandoned
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
@@ -277,7 +277,7 @@ def make_cache(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with locked_use(folder) as used:
+        with contextlib.suppress(BlockingIOError), locked_use(folder) as used:
             used.bytes = counted(folder)
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error

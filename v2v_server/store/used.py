@@ -6,13 +6,18 @@ Files lie one folder deep (``ab/ab12...``); what is being written lies in ``part
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import stat
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 _USED, PARTIAL = "used", "partial"
+_PAUSES_SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
+"""Between attempts to take the lock: other workers hold it for less than a millisecond."""
 
 
 @dataclass(slots=True)
@@ -27,9 +32,10 @@ class Used:
 
 
 def used_bytes(folder: Path) -> int:
-    """How much lies there; 0 where that cannot be told."""
+    """Return how many bytes the folder holds; 0 if that is unknown."""
     try:
-        text = (folder / _USED).read_bytes()
+        with open(_open_regular(folder / _USED, os.O_RDONLY), "rb") as file:
+            text = file.read(64)
     except OSError:
         return 0
     return int(text) if text.isdigit() else 0
@@ -37,15 +43,44 @@ def used_bytes(folder: Path) -> int:
 
 @contextlib.contextmanager
 def locked_use(folder: Path) -> Iterator[Used]:
-    """The number of bytes that are there, for one process at a time."""
-    with open(os.open(folder / _USED, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    """Lend the number of bytes to one process at a time.
+
+    Raises:
+        BlockingIOError: another process keeps the lock for longer than an update takes. Callers go on without.
+        OSError: the file cannot be opened or written.
+    """
+    with open(_open_regular(folder / _USED, os.O_RDWR | os.O_CREAT), "r+b") as file:
+        _lock_briefly(file.fileno())
         text = file.read(64)
         used = Used(int(text) if text.isdigit() else counted(folder))
         yield used
         file.seek(0)
         file.write(b"%020d" % used.bytes)
         file.truncate()
+
+
+def _open_regular(path: Path, flags: int) -> int:
+    """Open a file of ours that other users cannot read, since reading is enough to lock it. Never blocks."""
+    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW, 0o600)
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) & 0o077:
+            os.fchmod(descriptor, 0o600)  # an earlier release made it readable
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _lock_briefly(descriptor: int) -> None:
+    for pause in _PAUSES_SECONDS:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(pause)
+    raise BlockingIOError(errno.EAGAIN, "another process keeps its `used` file locked; end that process")
 
 
 def counted(folder: Path) -> int:

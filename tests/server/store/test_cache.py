@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -270,3 +271,27 @@ def test_samples_of_real_footage(tmp_path: Path, folder: Path, monkeypatch: pyte
                 if turn:
                     assert said == "hit"
                     require_equal(sample, whole_sample(lease, root), "cache")
+
+
+def test_a_lock_that_is_never_released_costs_no_sample(source: Path, folder: Path) -> None:
+    with (folder / "used").open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        cache = Cache(folder, 1 << 30, 0)
+        epoch(source, cache)
+        assert "locked" in cache.trouble
+        make_cache(folder)  # a server starts all the same
+    assert set(epoch(source, Cache(folder, 1 << 30, 0))) <= {"miss", "hit"}
+
+
+def test_other_users_cannot_open_the_used_file(folder: Path) -> None:
+    (folder / "used").chmod(0o644)
+    make_cache(folder)
+    assert (folder / "used").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_pipe_in_place_of_the_used_file_blocks_nothing(folder: Path) -> None:
+    (folder / "used").unlink()
+    os.mkfifo(folder / "used")
+    assert used_bytes(folder) == 0
+    with pytest.raises(CorpusError, match="cannot be written to"):
+        make_cache(folder)
