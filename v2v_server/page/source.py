@@ -64,7 +64,7 @@ class Source:
             return self._latest
 
     async def known(self) -> Glimpse:
-        """Return what is known without waiting for the server, except for the first answer.
+        """Return what is known without waiting for the server, unless nothing recent is known.
 
         A state up to :data:`KNOWN_SECONDS` old counts; the next one is asked for in the background.
         """
@@ -72,7 +72,9 @@ class Source:
             self._asking = asyncio.ensure_future(self.latest())
         if self._answered is not None and self._clock() - self._answered.at < KNOWN_SECONDS:
             return self._answered
-        return self._latest or await asyncio.shield(self._asking)
+        if self._latest is not None and self._clock() - self._latest.at < KNOWN_SECONDS:
+            return self._latest
+        return await asyncio.shield(self._asking)
 
     def _look(self) -> Glimpse:
         try:
@@ -83,5 +85,5 @@ class Source:
             return Glimpse(None, str(error), self._clock())
         except V2VError as error:
             return Glimpse(None, str(error), self._clock())
-        self._answered = Glimpse(state, "", self._clock())
-        return self._answered
+        answered = self._answered = Glimpse(state, "", self._clock())
+        return answered
