@@ -12,6 +12,7 @@ import uvicorn
 
 from v2v_server.console.asking import Looker
 from v2v_server.page.app import make_app
+from v2v_server.page.silent import BoundedProtocol
 from v2v_server.page.source import Source
 from v2v_server.system.process import die_with_parent
 
@@ -40,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ws="none",
         timeout_graceful_shutdown=1,
         limit_concurrency=256,
+        http=BoundedProtocol,
     )
     with socket.socket(fileno=arguments.fd) as listening:
         uvicorn.Server(config).run(sockets=[listening])

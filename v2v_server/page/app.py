@@ -48,12 +48,12 @@ class Pages:
 
     async def healthz(self, request: Request) -> Response:
         """Whether the server answers."""
-        sight = await self._source.latest()
+        sight = await self._source.known()
         return _said(sight.trouble)
 
     async def readyz(self, request: Request) -> Response:
         """Whether somebody can make samples."""
-        sight = await self._source.latest()
+        sight = await self._source.known()
         if sight.state is None:
             return _said(sight.trouble)
         return _said("" if sight.state["is_ready"] and sight.state["worker_count"] else "no worker is connected")

@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from v2v_protocol.errors import V2VError
+from v2v_protocol.errors import RemoteError, V2VError
+from v2v_protocol.messages import ErrorCode
 
 FRESH_SECONDS = 0.4
 """A state of this age is as good as a new one, however many ask."""
 _ANSWER_SECONDS = 3.0
+KNOWN_SECONDS = 15.0
+"""A health check accepts a state of this age."""
 
 
 class Looks(Protocol):
@@ -50,6 +53,8 @@ class Source:
         self._clock = clock
         self._lock = asyncio.Lock()
         self._latest: Glimpse | None = None
+        self._answered: Glimpse | None = None
+        self._asking: asyncio.Future[Glimpse] | None = None
 
     async def latest(self) -> Glimpse:
         """The newest state, which is at most :data:`FRESH_SECONDS` old."""
@@ -58,9 +63,27 @@ class Source:
                 self._latest = await asyncio.to_thread(self._look)
             return self._latest
 
+    async def known(self) -> Glimpse:
+        """Return what is known without waiting for the server, unless nothing recent is known.
+
+        A state up to :data:`KNOWN_SECONDS` old counts; the next one is asked for in the background.
+        """
+        if self._asking is None or self._asking.done():
+            self._asking = asyncio.ensure_future(self.latest())
+        if self._answered is not None and self._clock() - self._answered.at < KNOWN_SECONDS:
+            return self._answered
+        if self._latest is not None and self._clock() - self._latest.at < KNOWN_SECONDS:
+            return self._latest
+        return await asyncio.shield(self._asking)
+
     def _look(self) -> Glimpse:
         try:
             state = self._looker.look(_ANSWER_SECONDS)
+        except RemoteError as error:
+            if error.code == ErrorCode.BUSY and self._answered is not None:  # the server lives
+                self._answered = replace(self._answered, at=self._clock())
+            return Glimpse(None, str(error), self._clock())
         except V2VError as error:
             return Glimpse(None, str(error), self._clock())
-        return Glimpse(state, "", self._clock())
+        answered = self._answered = Glimpse(state, "", self._clock())
+        return answered

@@ -149,3 +149,16 @@ def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(
     now[0] = FRESH_SECONDS
     ask(make_app(source), "/state")
     assert looker.looks == 2
+
+
+def test_health_does_not_wait_for_a_server_that_is_asked_again(watched: Watched) -> None:
+    now = [0.0]
+    source = Source(LookerAt(watched), lambda: now[0])
+
+    async def known_while_another_question_is_under_way() -> bool:
+        before = await source.latest()
+        now[0] = FRESH_SECONDS
+        async with source._lock:
+            return await source.known() is before
+
+    assert asyncio.run(known_while_another_question_is_under_way())
