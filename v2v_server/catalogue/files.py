@@ -265,7 +265,7 @@ def regular_files(
         if is_regular:
             found.append(id)
         else:
-            refused[id] = "is no regular file, or one of the kernel (/proc, /sys)"
+            refused[id] = "is no regular file"
     return tuple(found)
 
 
