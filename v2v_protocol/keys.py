@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from v2v_protocol.errors import KeyRefused
+from v2v_protocol.safe_json import parse_json
 
 SIDES = ("consumer", "worker")
 VARIABLE = "V2V_KEYS"
@@ -82,7 +83,7 @@ def read_key(file: Path) -> PeerKey:
         KeyRefused: it cannot be read, others can read it, or it is no key file.
     """
     try:
-        key = PeerKey(**json.loads(read_private(file)))
+        key = PeerKey(**parse_json(read_private(file)))
     except (ValueError, TypeError):
         raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made") from None
     if key.side not in SIDES or not all(map(is_key, (key.server, key.public, key.secret))):

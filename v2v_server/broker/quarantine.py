@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
+from v2v_protocol.safe_json import parse_json
 from v2v_server.catalogue.refresh import index_path
 
 VERDICTS_PER_VIDEO = 2
@@ -236,7 +237,7 @@ def _parse(file: Path, whole: bytes) -> Quarantine:
     quarantine = Quarantine()
     for number, line in enumerate(whole.split(b"\n")[:-1], 1):
         try:
-            quarantine.extend([_verdict(json.loads(line))])
+            quarantine.extend([_verdict(parse_json(line))])
         except (ValueError, TypeError, CorpusError) as error:
             raise CorpusError(
                 f"quarantine file {file}, line {number} is damaged ({error}); mend or delete it"

@@ -319,6 +319,8 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
             "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
             "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
         ]
+    if corpus.left_out:
+        notes = [*notes, corpus.left_out]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     digest = videos.digest(corpus.rows)

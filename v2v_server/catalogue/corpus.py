@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from v2v_server.catalogue.files import (
     bucket_files,
     corpus_root,
     is_said,
+    left_out_note,
     printable,
     regular_files,
     video_files,
@@ -36,6 +38,7 @@ class Corpus:
         listed: the lines of the list; empty without one.
         refused: files, folders and lines of the list that give no video, by id, with reasons.
         manifest: of a prepared folder.
+        left_out: reports files whose endings are not looked at; "" where there is no such file.
     """
 
     root: Path | Copies
@@ -44,6 +47,7 @@ class Corpus:
     listed: tuple[ListEntry, ...]
     refused: Mapping[str, str]
     manifest: Manifest | None
+    left_out: str = ""
 
 
 def find_corpus(
@@ -73,16 +77,21 @@ def find_corpus(
     except OSError as error:  # a folder that this user may not enter, a share that has gone
         raise CorpusError(f"{source}: cannot be looked at: {error.strerror or error}") from error
     refused: dict[str, str] = {}
+    left_out = Counter[str]()
     named = None if listed is None else [entry.id for entry in listed]
     if manifest is not None:
         rows = manifest.served_rows(rows)
         ids = manifest.wanted(named, refused)
     else:
-        ids = _found(root, refused, notice) if named is None else regular_files(root, named, refused, notice)
+        ids = _found(root, refused, left_out, notice) if named is None else regular_files(root, named, refused, notice)
         refuse_prepared_below(root, ids)
+    note = left_out_note(left_out)
     if not ids:
-        raise CorpusError(f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}{told(refused)}")
-    return Corpus(root, rows or Rows(), tuple(ids), listed or (), refused, manifest)
+        raise CorpusError(
+            f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}"
+            f"{told(refused)}{note and '. '}{note}"
+        )
+    return Corpus(root, rows or Rows(), tuple(ids), listed or (), refused, manifest, note)
 
 
 def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Path, tuple[ListEntry, ...] | None]:
@@ -99,10 +108,16 @@ def _wanted(source: Path, list_file: str | os.PathLike[str] | None) -> tuple[Pat
     return folder, (ListEntry(source.name),)
 
 
-def _found(root: Path | Copies, refused: dict[str, str], notice: Notice | None) -> tuple[str, ...]:
+def _found(
+    root: Path | Copies, refused: dict[str, str], left_out: Counter[str], notice: Notice | None
+) -> tuple[str, ...]:
     """The videos below a folder, or an address."""
     ids = []
-    for id in bucket_files(root.listed, refused) if isinstance(root, Copies) else video_files(root, refused):
+    if isinstance(root, Copies):
+        files = bucket_files(root.listed, refused, left_out)
+    else:
+        files = video_files(root, refused, left_out)
+    for id in files:
         ids.append(id)
         if notice is not None and is_said(len(ids)):
             notice(f"looking for videos: {len(ids)} so far")

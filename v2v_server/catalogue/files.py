@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -38,28 +38,76 @@ VIDEO_SUFFIXES = frozenset({
     ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
 })  # fmt: skip
 
+_NO_VIDEO_SUFFIXES = frozenset({
+    ".7z", ".aac", ".ac3", ".aedat", ".aedat4", ".ass", ".bag", ".bib", ".bin", ".bmp", ".bz2", ".c", ".cfg", ".conf",
+    ".cpp", ".csv", ".dat", ".db", ".doc", ".docx", ".exr", ".flac", ".gz", ".h", ".h5", ".hdf5", ".htm", ".html",
+    ".info", ".ini", ".ipynb", ".jpeg", ".jpg", ".json", ".jsonl", ".log", ".lst", ".m4a", ".mat", ".md", ".md5",
+    ".mp3", ".nfo", ".npy", ".npz", ".ogg", ".opus", ".parquet", ".pdf", ".pickle", ".pkl", ".png", ".pt", ".pth",
+    ".py", ".raw", ".rst", ".sh", ".sha256", ".sqlite3", ".srt", ".sub", ".tar", ".tgz", ".thm", ".tif", ".tiff",
+    ".tmp", ".toml", ".tsv", ".txt", ".vtt", ".wav", ".webp", ".xlsx", ".xml", ".xz", ".yaml", ".yml", ".zip", ".zst",
+})  # fmt: skip
+_MOST_SUFFIXES_SHOWN = 10
+
+PSEUDO_FILE_SYSTEMS = frozenset({
+    "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs", "fusectl",
+    "mqueue", "nsfs", "proc", "pstore", "securityfs", "selinuxfs", "sysfs", "tracefs",
+})  # fmt: skip
+"""Kinds whose files are the kernel's: reading one may block, end never, or change something."""
+PSEUDO = "lies in a file system of the kernel, such as /proc or /sys, where no videos are"
+MOST_PATHS = 64
+"""Paths with two or more links by which one folder is searched."""
+
 UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
 # C0 and C1 controls, separators of lines, and what changes the direction of text (Unicode 16, UAX 9).
 _STEERING = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 
 
-def video_files(root: Path, refused: dict[str, str]) -> Iterator[str]:
-    """Relative POSIX paths of the video files below ``root``, known by their suffixes.
+def video_files(root: Path, refused: dict[str, str], left_out: Counter[str] | None = None) -> Iterator[str]:
+    """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
 
-    Links are followed; a link to a folder that it lies in is not. Hidden files and folders (".name") are passed over.
+    Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos
+    under each path, because each such id is part of the digests of existing corpora. Folders that link to each other
+    have a factorial number of paths, so a folder is searched by at most :data:`MOST_PATHS` paths with two or more
+    links; paths with fewer links are not limited. Kernel file systems (/proc, /sys, /dev) are not entered. Hidden files
+    and folders (".name") are passed over.
 
     Args:
         root: the folder.
         refused: receives, by relative path, why a folder or file cannot be taken in.
+        left_out: counts, by suffix, files that may be videos of other endings.
     """
-    return chain.from_iterable(_below(root, "", frozenset(), refused))
+    walk = _Walk(refused, Counter() if left_out is None else left_out)
+    return chain.from_iterable(walk.below(root, "", frozenset(), 0))
 
 
-def bucket_files(names: Iterable[str], refused: dict[str, str]) -> Iterator[str]:
+def left_out_note(left_out: Counter[str]) -> str:
+    """Return the line that reports files with other endings; "" where there is no such file."""
+    if not left_out:
+        return ""
+    shown = ", ".join(f"{suffix} ({count})" for suffix, count in sorted(left_out.items())[:_MOST_SUFFIXES_SHOWN])
+    more = len(left_out) - _MOST_SUFFIXES_SHOWN
+    return (
+        f"{left_out.total()} files have endings that are not looked at and were left out: {shown}"
+        f"{f' and {more} other endings' if more > 0 else ''}. Name those that are videos in a list file to serve them"
+    )
+
+
+def _count_left_out(name: str, left_out: Counter[str]) -> None:
+    stem, _, ending = name.rpartition(".")
+    suffix = printable(f".{ending.lower()}")
+    if stem and len(suffix) <= 12 and suffix not in _NO_VIDEO_SUFFIXES:
+        left_out[suffix] += 1
+
+
+def bucket_files(names: Iterable[str], refused: dict[str, str], left_out: Counter[str] | None = None) -> Iterator[str]:
     """Those of the names of objects below an address that :func:`video_files` would take from a folder."""
     for name in names:
         parts = name.split("/")
-        if f".{name.rpartition('.')[2].lower()}" not in VIDEO_SUFFIXES or any(part.startswith(".") for part in parts):
+        if any(part.startswith(".") for part in parts):
+            continue
+        if f".{name.rpartition('.')[2].lower()}" not in VIDEO_SUFFIXES:
+            if left_out is not None:
+                _count_left_out(parts[-1], left_out)
             continue
         if printable(name) != name:
             refused[printable(name)] = UNPRINTABLE
@@ -69,43 +117,92 @@ def bucket_files(names: Iterable[str], refused: dict[str, str]) -> Iterator[str]
             yield name
 
 
-def _below(
-    folder: Path, prefix: str, above: frozenset[tuple[int, int]], refused: dict[str, str]
-) -> Iterator[list[str]]:
-    try:
-        here = folder.stat()
-        with os.scandir(folder) as listing:
-            entries = sorted(listing, key=attrgetter("name"))
-    except OSError as error:
-        refused[printable(prefix.rstrip("/") or ".")] = f"the folder cannot be read: {error.strerror or error}"
-        return
-    identity = (here.st_dev, here.st_ino)
-    if identity in above:
-        return
-    found: list[str] = []
-    for entry in entries:
-        name = entry.name
-        if name[0] == ".":
-            continue
-        relative = prefix + name
+class _Walk:
+    """One search of a folder for videos.
+
+    Args:
+        refused, left_out: as in :func:`video_files`.
+    """
+
+    def __init__(self, refused: dict[str, str], left_out: Counter[str]) -> None:
+        self._refused, self._left_out = refused, left_out
+        self._pseudo = pseudo_devices()
+        self._paths = Counter[tuple[int, int]]()
+
+    def below(self, folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
+        """Yield the videos below a folder, some at a time.
+
+        Args:
+            prefix: of their ids.
+            above: identities (device, inode) of the folders that it lies in.
+            links: of the path that leads here.
+        """
+        refused = self._refused
+        name = printable(prefix.rstrip("/") or ".")
         try:
-            is_file = entry.is_file()
-            is_folder = not is_file and entry.is_dir()
-        except OSError as error:  # a link that leads in a circle, or where this user may not look
-            refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
-            continue
-        if is_folder:
-            yield found
-            found = []
-            yield from _below(folder / name, f"{relative}/", above | {identity}, refused)
-        elif f".{name.rpartition('.')[2].lower()}" in VIDEO_SUFFIXES and "." in name:
-            if printable(relative) != relative:
-                refused[printable(relative)] = UNPRINTABLE
-            elif not is_file:
-                refused[relative] = "is no regular file, or a link that leads nowhere"
-            else:
-                found.append(relative)
-    yield found
+            here = folder.stat()
+            if here.st_dev in self._pseudo:
+                refused[name] = PSEUDO
+                return
+            identity = (here.st_dev, here.st_ino)
+            if identity in above:
+                return
+            if links > 1:
+                self._paths[identity] += 1
+                if (paths := self._paths[identity]) > MOST_PATHS:
+                    if paths == MOST_PATHS + 1:
+                        refused[name] = f"links lead to this folder by more than {MOST_PATHS} paths: remove some links"
+                    return
+            with os.scandir(folder) as listing:
+                entries = sorted(listing, key=attrgetter("name"))
+        except OSError as error:
+            refused[name] = f"the folder cannot be read: {error.strerror or error}"
+            return
+        found: list[str] = []
+        for entry in entries:
+            if entry.name[0] == ".":
+                continue
+            relative = prefix + entry.name
+            try:
+                is_file = entry.is_file()
+                is_folder = not is_file and entry.is_dir()
+                is_pseudo = is_file and entry.is_symlink() and entry.stat().st_dev in self._pseudo
+            except OSError as error:  # a link that leads in a circle, or where this user may not look
+                refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
+                continue
+            if is_folder:
+                yield found
+                found = []
+                more = links + entry.is_symlink()
+                yield from self.below(folder / entry.name, f"{relative}/", above | {identity}, more)
+            elif f".{entry.name.rpartition('.')[2].lower()}" in VIDEO_SUFFIXES and "." in entry.name:
+                if printable(relative) != relative:
+                    refused[printable(relative)] = UNPRINTABLE
+                elif not is_file:
+                    refused[relative] = "is no regular file, or a link that leads nowhere"
+                elif is_pseudo:
+                    refused[relative] = PSEUDO
+                else:
+                    found.append(relative)
+            elif is_file:
+                _count_left_out(entry.name, self._left_out)
+        yield found
+
+
+def pseudo_devices() -> frozenset[int]:
+    """Return the device numbers (``st_dev``) of the kernel file systems that are mounted here."""
+    found = set()
+    try:
+        mounts = Path("/proc/self/mountinfo").read_bytes().splitlines()
+    except OSError:
+        return frozenset()
+    for mount in mounts:
+        before, _, after = mount.partition(b" - ")
+        is_dev = before.split()[4] == b"/dev"  # in a container a tmpfs of its own
+        if is_dev or after.split()[0].decode("ascii", "replace") in PSEUDO_FILE_SYSTEMS:
+            major, _, minor = before.split()[2].partition(b":")
+            found.add(os.makedev(int(major), int(minor)))
+    return frozenset(found)
 
 
 def printable(name: str) -> str:
@@ -152,11 +249,14 @@ def regular_files(
     if isinstance(root, Copies):
         return tuple(ids)
 
+    pseudo = pseudo_devices()
+
     def may_be_read(id: str) -> bool:
         try:
-            return stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
+            status = os.stat(os.path.join(root, id))
         except OSError:
             return True
+        return stat.S_ISREG(status.st_mode) and status.st_dev not in pseudo
 
     found = []
     for done, (id, is_regular) in enumerate(answers(may_be_read, ids), 1):

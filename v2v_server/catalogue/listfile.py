@@ -22,7 +22,7 @@ from v2v_server.catalogue.files import printable
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
-_SUFFIX = re.compile(r"\.(?=.*[a-z])[a-z0-9]+", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
 _MOST_COLUMNS = 4
 
 

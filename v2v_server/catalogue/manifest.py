@@ -11,7 +11,6 @@ that a run that asks for it again need not make it again, but it is not served.
 
 from __future__ import annotations
 
-import json
 import math
 from base64 import b64decode
 from collections.abc import Iterable
@@ -20,7 +19,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
-from v2v_server.catalogue.files import answers
+from v2v_protocol.safe_json import parse_json
+from v2v_server.catalogue.files import UNPRINTABLE, answers, printable
 from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.catalogue.scene import Scene
 from v2v_server.cloud.copies import Copies
@@ -293,6 +293,8 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
         raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
     video = PreparedVideo(**data)
     path = PurePosixPath(video.id)
+    if printable(video.id) != video.id:
+        raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"id {video.id!r} leads out of the folder")
     sizes = (video.height_px, video.width_px)
@@ -307,7 +309,7 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
 
 
 def _object(line: bytes) -> dict[str, Any]:
-    data = json.loads(line)
+    data = parse_json(line)
     if not isinstance(data, dict):
         raise ValueError("is no JSON object")
     return data

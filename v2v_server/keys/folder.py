@@ -20,6 +20,7 @@ import zmq
 
 from v2v_protocol.errors import KeyRefused, UsageError
 from v2v_protocol.keys import SIDES, PeerKey, is_key, read_private, write_key, write_private
+from v2v_protocol.safe_json import parse_json
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -68,7 +69,7 @@ class KeyFolder:
                     f"chmod 700 {folder}, and look at what `v2v-keys list` shows"
                 )
         try:
-            keys = json.loads(text)
+            keys = parse_json(text)
             public, secret = keys["public"], keys["secret"]
         except (ValueError, KeyError, TypeError):
             public = secret = None

@@ -34,6 +34,8 @@ BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
 GROUP_FRAMES = 32
 PIECE_FRAMES = 256
 """Frames of a piece of the cache, at most: pieces begin at its multiples, or at those of a half or quarter."""
+LARGEST_BLOCK_BYTES = 2 * GROUP_FRAMES * BLOCK_ROWS * BLOCK_COLUMNS
+"""Of a packed block: no packing doubles what it is given."""
 _LARGEST_GROUP_BYTES = 64 << 20
 _PREFIX = struct.Struct("<8sIQ")
 _LARGEST_HEAD_BYTES = 64 << 20
@@ -143,11 +145,13 @@ def read_head(path: str, file: int) -> tuple[Head, int]:
     _, length, check = _PREFIX.unpack(prefix)
     head = os.pread(file, length, _PREFIX.size) if length <= _LARGEST_HEAD_BYTES else b""
     if len(head) != length or _check(head, 0) != check:
-        raise VideoError(path, None, "its head is damaged; have the file made anew")
+        raise VideoError(path, None, "the store file is corrupt (its head is damaged): re-create it with v2v-prepare")
     try:
         return Head(**msgpack.unpackb(head)), _PREFIX.size + length
     except (ProtocolError, TypeError, ValueError) as error:
-        raise VideoError(path, None, f"its head makes no sense: {error}") from error
+        raise VideoError(
+            path, None, f"the store file is corrupt (its head: {error}): re-create it with v2v-prepare"
+        ) from error
 
 
 def is_store_file(path: str | os.PathLike[str]) -> bool:
@@ -191,6 +195,8 @@ class BlockRecord:
 def unpack_record(group: int, data: bytes) -> BlockRecord | None:
     """The record of a group; None if it is damaged."""
     if len(data) < 16 or _check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
+        return None
+    if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # no file is that long, and offsets are signed
         return None
     blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
     starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))

@@ -67,6 +67,10 @@ def unpack(method: str, packed: Bytes, size: int) -> bytes:
     """
     try:
         if method == "zstd":
+            # The decompressor allocates what a frame claims, whatever the limit is.
+            claimed = zstandard.frame_content_size(packed)
+            if claimed > size:
+                raise UnpackingError(f"claims {claimed} bytes instead of {size}")
             block = _decompressor().decompress(packed, max_output_size=size)
         else:
             block = lz4.block.decompress(packed, uncompressed_size=size)

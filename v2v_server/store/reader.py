@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from itertools import pairwise
 from types import TracebackType
 from typing import NoReturn
 
@@ -11,7 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, BlockRecord, Head, block_check, read_head, unpack_record
+from v2v_server.store.format import (
+    BLOCK_COLUMNS,
+    BLOCK_ROWS,
+    LARGEST_BLOCK_BYTES,
+    BlockRecord,
+    Head,
+    block_check,
+    read_head,
+    unpack_record,
+)
 from v2v_server.store.packing import UnpackingError, unpack
 from v2v_server.video.orientation import Window
 
@@ -117,6 +127,10 @@ class StoreFile:
         record = unpack_record(group, self._pread(size, self._table + group * size, group))
         if record is None:
             self._refuse(group, "its record in the table is damaged")
+        # Checked before anything is allocated: whoever wrote the file also wrote its checksums.
+        for number, (start, end) in enumerate(pairwise(record.starts)):
+            if end - start > LARGEST_BLOCK_BYTES:
+                self._refuse(group, f"block {number} has {end - start} bytes, the limit is {LARGEST_BLOCK_BYTES}")
         return record
 
     def _blocks(
@@ -150,5 +164,7 @@ class StoreFile:
 
     def _refuse(self, group: int, why: str) -> NoReturn:
         raise VideoError(
-            self._path, self.head.first + group * self.head.group, f"in the store {why}; have the file made anew"
+            self._path,
+            self.head.first + group * self.head.group,
+            f"the store file is corrupt ({why}): re-create it with v2v-prepare",
         )

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.files import answers, by_parts, corpus_root, printable, video_files
+from v2v_server.catalogue.files import (
+    MOST_PATHS,
+    PSEUDO,
+    answers,
+    by_parts,
+    corpus_root,
+    left_out_note,
+    printable,
+    regular_files,
+    video_files,
+)
 from v2v_server.catalogue.listfile import read_list
 
 STEERING = {
@@ -142,3 +153,51 @@ def test_who_hears_no_more_asks_no_more() -> None:
     heard.close()
     assert len(asked) < 20_000
     assert threading.active_count() == threads
+
+
+def test_folders_linked_to_each_other_are_searched_by_a_bounded_number_of_paths(tmp_path: Path) -> None:
+    names = "abcdefgh"
+    for name in names:
+        (tmp_path / name).mkdir()
+        for other in names.replace(name, ""):
+            (tmp_path / name / other).symlink_to(tmp_path / other)
+    (tmp_path / "a" / "x.mp4").touch()
+    refused: dict[str, str] = {}
+    found = list(video_files(tmp_path, refused))
+    assert {"a/x.mp4", *(f"{name}/a/x.mp4" for name in names[1:])} <= set(found)
+    assert len(found) <= 8 + MOST_PATHS
+    assert len(refused) <= len(names)
+    assert all("remove some links" in why for why in refused.values())
+
+
+def test_a_folder_that_several_links_lead_to_has_its_videos_under_each(tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    (tmp_path / "all" / "x.mp4").touch()
+    for number in range(MOST_PATHS + 10):
+        (tmp_path / f"link{number}").symlink_to("all")
+    refused: dict[str, str] = {}
+    assert len(list(video_files(tmp_path, refused))) == MOST_PATHS + 11
+    assert not refused
+
+
+def test_links_to_files_of_the_kernel_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "proc").symlink_to("/proc")
+    (tmp_path / "x.mp4").symlink_to("/proc/kmsg")
+    refused: dict[str, str] = {}
+    assert not list(video_files(tmp_path, refused))
+    assert refused == {"proc": PSEUDO, "x.mp4": PSEUDO}
+    refused.clear()
+    assert regular_files(tmp_path, ["x.mp4"], refused) == ()
+    assert refused == {"x.mp4": "is no regular file"}
+
+
+def test_other_endings_are_counted_but_for_those_of_no_videos(tmp_path: Path) -> None:
+    for name in ("a.mp4", "b.264", "c.ASF", "d.asf", "readme.txt", "x.jpg", "LICENSE", ".hidden.dv"):
+        (tmp_path / name).touch()
+    left_out: Counter[str] = Counter()
+    assert list(video_files(tmp_path, {}, left_out)) == ["a.mp4"]
+    assert left_out == {".264": 1, ".asf": 2}
+    assert left_out_note(left_out).startswith("3 files have endings that are not looked at and were left out: .264 (1)")
+    listed = tmp_path / "list.txt"
+    listed.write_text("b.264\nc.ASF 5\n")
+    assert [entry.id for entry in read_list(listed)] == ["b.264", "c.ASF"]

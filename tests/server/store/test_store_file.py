@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, is_store_file
+from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, is_store_file, pack_record
 from v2v_server.store.packing import DENSE, FAST, QUICK, Packing, UnpackingError, unpack
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
@@ -132,7 +132,7 @@ def test_a_file_that_shrinks_while_it_is_read(sound: tuple[Path, npt.NDArray[np.
     (tmp_path / "x").write_bytes(sound[0].read_bytes())
     with StoreFile(tmp_path / "x") as stored:
         os.truncate(tmp_path / "x", 3000)
-        with pytest.raises(VideoError, match=r"frame (0|32): in the store .* have the file made anew"):
+        with pytest.raises(VideoError, match=r"frame (0|32): the store file is corrupt .* v2v-prepare"):
             stored.read(0, 1, (0, 0, 40, 70), np.empty((40, 40, 70), np.uint8))
 
 
@@ -153,9 +153,9 @@ def test_only_the_blocks_of_a_crop_are_read(tmp_path: Path) -> None:
     with StoreFile(path) as stored:
         stored.read(32, 1, (32, 32, 32, 32), out)
         np.testing.assert_array_equal(out, luma[32:, 32:64, 32:64])
-        with pytest.raises(VideoError, match="frame 32: in the store block 3 is damaged"):
+        with pytest.raises(VideoError, match=r"frame 32: the store file is corrupt \(block 3 is damaged"):
             stored.read(32, 1, (32, 31, 32, 32), out)
-        with pytest.raises(VideoError, match="frame 0: in the store block 4 is damaged"):
+        with pytest.raises(VideoError, match=r"frame 0: the store file is corrupt \(block 4 is damaged"):
             stored.read(31, 1, (32, 32, 32, 32), out)
 
 
@@ -223,3 +223,24 @@ def test_a_block_is_unpacked_into_the_bytes_that_it_should_have_and_no_more(meth
             unpack(method, packed, size)
     with pytest.raises(UnpackingError):
         unpack(method, b"nonsense", 1000)
+
+
+@pytest.mark.parametrize("sizes", [[(1 << 32) - 1] * 4])
+def test_blocks_that_claim_gigabytes_are_refused_before_they_are_read(
+    sound: tuple[Path, npt.NDArray[np.uint8]], tmp_path: Path, sizes: list[int]
+) -> None:
+    path = tmp_path / "x"
+    content = bytearray(sound[0].read_bytes())
+    with StoreFile(sound[0]) as stored:
+        head, table = stored.head, stored._table
+    blocks = head.down * head.across
+    content[table : table + head.record_bytes] = pack_record(head, 0, 0, (sizes * blocks)[:blocks], [0] * blocks)
+    path.write_bytes(content)
+    with StoreFile(path) as stored, pytest.raises(VideoError, match=r"corrupt .*the limit is"):
+        stored.read(head.first, 1, (head.top, 0, 1, 1), np.empty((1, 1, 1), np.uint8))
+
+
+def test_a_frame_that_claims_gigabytes_is_not_unpacked() -> None:
+    claiming = b"\x28\xb5\x2f\xfd\xa0" + (4_000_000_000).to_bytes(4, "little") + b"\x01\x00\x00"
+    with pytest.raises(UnpackingError, match="claims 4000000000 bytes instead of 32"):
+        unpack("zstd", claiming, 32)
