@@ -34,8 +34,8 @@ def test_no_command_goes_through_a_shell() -> None:
 
 def test_yaml_is_the_safe_kind() -> None:
     loads = [(path, call) for path, call in calls() if ast.unparse(call.func) in ("yaml.load", "yaml.full_load")]
-    assert {(path, ast.unparse(call.args[1])) for path, call in loads} == {("v2v_server/config.py", "_Loader")}
-    assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_server/config.py").read_text(encoding="utf-8")
+    assert {(path, ast.unparse(call.args[1])) for path, call in loads} == {("v2v_protocol/safe_yaml.py", "_Loader")}
+    assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_protocol/safe_yaml.py").read_text(encoding="utf-8")
 
 
 def test_weights_and_arrays_are_loaded_as_such() -> None:

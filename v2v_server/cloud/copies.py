@@ -32,6 +32,8 @@ _SLOTS = 64
 """Videos that a host can fetch at a time; a process that is killed leaves at most that many parts behind."""
 _KEPT_SHARE = 0.9
 """Of the room, after eviction: it looks at every file, so it makes room for more than one."""
+_LOCK_SECONDS = 30.0
+"""How long to wait for another process that makes room. No lease has begun yet, so no video is blamed for it."""
 _ROOM_SECONDS = 2.0
 """Until it is tried again where all copies are being read."""
 
@@ -76,7 +78,7 @@ class Copies:
         """
         try:
             (self.folder / PARTIAL).mkdir(parents=True, exist_ok=True)
-            with locked_use(self.folder):
+            with locked_use(self.folder, _LOCK_SECONDS):
                 pass
         except OSError as error:
             raise CorpusError(f"--copies {self.folder}: cannot be written to: {error.strerror or error}") from error
@@ -169,7 +171,8 @@ class Copies:
         """Fetches a video; returns the held copy."""
         slot = self.folder / PARTIAL / f"{int(hashlib.sha256(id.encode()).hexdigest(), 16) % _SLOTS:02}"
         try:
-            with slot.with_suffix(".lock").open("wb") as lock:
+            lock_file = os.open(slot.with_suffix(".lock"), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            with open(lock_file, "wb") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
                 return held or self._fetch(id, fingerprint, slot)
@@ -211,7 +214,7 @@ class Copies:
         size = slot.stat().st_size
         path.parent.mkdir(exist_ok=True)
         for wait in (_ROOM_SECONDS, _ROOM_SECONDS, 0.0):
-            with locked_use(self.folder) as used:
+            with locked_use(self.folder, _LOCK_SECONDS) as used:
                 if used.bytes + size > self.most_bytes:
                     enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
                     for oldest in _oldest_first(self.folder):

@@ -4,6 +4,7 @@ child      the server's end: listens, starts the process, starts it again, ends 
 __main__   the process: python -m v2v_server.page
 app        what is answered to which path
 guard      who may ask, and what a browser may do with the answer
+silent     closes connections that send no request
 source     the newest state, asked for when somebody wants it
 metrics    the state as Prometheus wants it
 """

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _USED, PARTIAL = "used", "partial"
-_PAUSES_SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
-"""Between attempts to take the lock: other workers hold it for less than a millisecond."""
+_WAIT_SECONDS = 0.06
+"""For the lock, by default: other workers hold it for less than a millisecond."""
 
 
 @dataclass(slots=True)
@@ -42,15 +42,19 @@ def used_bytes(folder: Path) -> int:
 
 
 @contextlib.contextmanager
-def locked_use(folder: Path) -> Iterator[Used]:
+def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Used]:
     """Lend the number of bytes to one process at a time.
+
+    Args:
+        folder: that many processes fill.
+        wait_seconds: how long to try to take the lock.
 
     Raises:
         BlockingIOError: another process keeps the lock for longer than an update takes. Callers go on without.
         OSError: the file cannot be opened or written.
     """
     with open(_open_regular(folder / _USED, os.O_RDWR | os.O_CREAT), "r+b") as file:
-        _lock_briefly(file.fileno())
+        _lock(file.fileno(), wait_seconds)
         text = file.read(64)
         used = Used(int(text) if text.isdigit() else counted(folder))
         yield used
@@ -74,13 +78,18 @@ def _open_regular(path: Path, flags: int) -> int:
     return descriptor
 
 
-def _lock_briefly(descriptor: int) -> None:
-    for pause in _PAUSES_SECONDS:
+def _lock(descriptor: int, wait_seconds: float) -> None:
+    pause, end = 0.001, time.monotonic() + wait_seconds
+    while True:
         try:
             return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            time.sleep(pause)
-    raise BlockingIOError(errno.EAGAIN, "another process keeps its `used` file locked; end that process")
+            if time.monotonic() >= end:
+                raise BlockingIOError(
+                    errno.EAGAIN, "another process keeps its `used` file locked; end that process"
+                ) from None
+        time.sleep(pause)
+        pause = min(2 * pause, 0.1)
 
 
 def counted(folder: Path) -> int:
