@@ -31,7 +31,9 @@ class RawForm:
 
 
 FORMS = {
-    "ijrr": RawForm("IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt", ijrr.recognises, ijrr.read),
+    "ijrr": RawForm(
+        "IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt or .csv", ijrr.recognises, ijrr.read
+    ),
     "evaid": RawForm("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
     "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
     "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),

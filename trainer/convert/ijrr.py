@@ -17,11 +17,12 @@ from v2v_protocol.errors import UsageError
 
 EVENTS = "events.txt"
 IMAGES = "images.txt"
+TEXT_SUFFIXES = (".txt", ".csv")
 
 
 def recognises(path: Path) -> bool:
     """A text file, or an archive with ``events.txt``."""
-    if path.is_file() and path.suffix == ".txt":
+    if path.is_file() and path.suffix in TEXT_SUFFIXES:
         return True
     if not (path.is_dir() or path.suffix == ".zip"):
         return False
@@ -35,7 +36,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     Raises:
         UsageError: a part is missing or not what it should be.
     """
-    if path.is_file() and path.suffix == ".txt":
+    if path.is_file() and path.suffix in TEXT_SUFFIXES:
         total, done = path.stat().st_size, 0
 
         def advance(count: int) -> None:

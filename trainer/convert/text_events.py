@@ -1,7 +1,11 @@
-"""Text files of events: one ``t x y p`` a line, p in {0, 1} or {-1, 1}; a first line ``width height`` is allowed."""
+"""Text files of events: one ``t x y p`` a line, p in {0, 1} or {-1, 1}; a first line ``width height`` is allowed.
+
+Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments. A byte order mark is skipped.
+"""
 
 from __future__ import annotations
 
+import codecs
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,6 +18,8 @@ from trainer.convert.items import EventChunk, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
 
 BLOCK_BYTES = 1 << 22
+COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
+COMMA = re.compile(rb"(?<=[^\s,])[ \t]*,[ \t]*(?=[^\s,])")
 NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
 TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
 """A line whose first number has a point or, without one, a negative exponent (1e-06)."""
@@ -40,22 +46,34 @@ def read_text_events(
     """
     if time_unit is not None and time_unit not in NS_PER_UNIT:
         raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
-    lines_before, rest, started = 0, b"", False
+    lines_before, rest, started, is_head = 0, b"", False, True
     while block := stream.read(BLOCK_BYTES):
         advance(len(block))
+        if is_head:
+            block, is_head = block.removeprefix(codecs.BOM_UTF8), False
         whole, newline, rest = (rest + block).rpartition(b"\n")
-        block = whole + newline
-        if not started and block:
-            first, _, after = block.partition(b"\n")
+        block = _plain(whole + newline)
+        if not started and (begun := block.lstrip()):
+            first, _, after = begun.partition(b"\n")
             started = True
             if len(first.split()) == 2:
                 yield _sensor_size(first, name)
-                block, lines_before = after, 1
+                lines_before += block.count(b"\n") - after.count(b"\n")
+                block = after
         if time_unit is None:
             time_unit = _time_unit(block)
         yield from _chunk(block, name, lines_before, time_unit)
         lines_before += block.count(b"\n")
+    rest = _plain(rest)
     yield from _chunk(rest, name, lines_before, time_unit or _time_unit(rest) or "us")
+
+
+def _plain(block: bytes) -> bytes:
+    """The block with comments blanked and single commas between values as spaces; its lines keep their numbers. A comma
+    beside an empty field stays, so that its line is refused."""
+    if b"#" in block:
+        block = COMMENT.sub(b"", block)
+    return COMMA.sub(b" ", block) if b"," in block else block
 
 
 def _sensor_size(line: bytes, name: str) -> SensorSize:

@@ -75,7 +75,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     yield from _installation(missing)
     if not missing["server"]:
         yield from _libraries()
-    if "torch" not in missing["client"]:
+    if _is_here("torch", None):
         yield _torch()
     yield from _machine()
     yield _port(port)
@@ -126,8 +126,10 @@ def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
             yield Finding(OK, part, "everything that this part needs is installed")
         else:
             level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
-            change = f"pip install '.[{part}]' in a checkout, if this machine shall do that part"
-            yield Finding(level, part, f"not installed or too old: {', '.join(names)}", change)
+            change = f"pip install '.[{part}]' in a checkout, if this machine is to do that part"
+            # A machine that has one part whole need not hear what the other parts would take.
+            text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
+            yield Finding(level, part, text, change)
 
 
 def _libraries() -> Iterator[Finding]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -52,12 +54,17 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         few = "; ".join(map(str, catalogue.refusals[:shown]))
         more = len(catalogue.refusals) - shown
         text = f"{len(catalogue.refusals)} files cannot be used: {few}" + (f"; and {more} more" if more > 0 else "")
-        yield "note", "corpus", text, "they are passed over; repair or remove them if they matter"
+        change = "they are passed over: repair those that matter, or leave them out of --videos"
+        if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
+            change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
+        yield "note", "corpus", text, change
+    for note in catalogue.notes:
+        yield "note", "corpus", note, ""
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
         shortest = min(table.longest_clips, default=0)
-        change = f"--set voxels_per_clip={shortest} admits all that are only too short" if shortest else ""
+        change = _remedy(shortest, spec.recipe.voxels_per_clip)
         why = "; ".join(str(table.refusals[place]) for place in range(min(shown, useless)))
         level = "note" if table.count else "bad"
         yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
@@ -73,3 +80,24 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
+
+
+def _remedy(longest: int, wanted: int) -> str:
+    """What to do about videos that are too short; empty where no clip length admits them.
+
+    Args:
+        longest: ``voxels_per_clip`` that admits all of them; 0: none does.
+        wanted: that of the recipe.
+    """
+    if not longest:
+        return ""
+    least = (wanted + 1) // 2
+    if longest >= least:
+        return (
+            f"leave them out, or --set voxels_per_clip={longest} admits all that are only too short; a recurrent "
+            "network then learns from shorter clips"
+        )
+    return (
+        f"leave the short ones out: clips of {longest} voxel grids, which all are long enough for, are too short to "
+        f"train a recurrent network (the recipe has {wanted}); --set voxels_per_clip={least} admits some"
+    )

@@ -12,7 +12,7 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_server.commands import doctor as command
-from v2v_server.offline import doctor
+from v2v_server.offline import doctor, doctor_corpus
 from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
 
 
@@ -96,6 +96,30 @@ def test_what_is_missing_or_too_old_is_named(
     status, said = told(capsys, "--videos", ".")
     assert status == 1  # neither part is whole
     assert "pip install '.[server]'" in said
+
+
+def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    version = metadata.version
+
+    def without_torch(name: str) -> str:
+        if name == "torch":
+            raise metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(doctor.metadata, "version", without_torch)
+    monkeypatch.setattr(doctor, "_torch", lambda: Finding(BAD, "torch", "was loaded"))
+    status, said = told(capsys, "--port", str(free_port()))
+    assert status == 0
+    assert "torch" not in said
+    assert "nothing is in the way" in said
+
+
+@pytest.mark.parametrize(("longest", "said"), [(0, ""), (1, "leave the short ones out"), (30, "voxels_per_clip=30")])
+def test_short_clips_are_not_advised_without_their_cost(longest: int, said: str) -> None:
+    remedy = doctor_corpus._remedy(longest, 40)
+    assert said in remedy
+    assert "voxels_per_clip=1 " not in remedy
+    assert not remedy or "recurrent network" in remedy
 
 
 def test_a_gpu_that_torch_does_not_see_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:

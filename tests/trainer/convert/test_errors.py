@@ -285,3 +285,29 @@ def test_command_line_refuses(arguments: list[str], message: str, capsys: pytest
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", ",", ", "])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_text_of_other_programs_is_read(separator: str, end: str, mark: bytes) -> None:
+    rows = [
+        "#!events.txt",
+        "# size",
+        "9 8",
+        "# t x y p",
+        *(separator.join(row) for row in (("0.5", "1", "2", "0"), ("1.5", "3", "4", "1"))),
+    ]
+    size, *chunks = read_text_events(io.BytesIO(mark + end.join(rows).encode()), "v2e.txt")
+    assert size == SensorSize(9, 8)
+    events = [each for each in chunks if isinstance(each, EventChunk)]
+    assert np.concatenate([each.t_ns for each in events]).tolist() == [500_000_000, 1_500_000_000]
+    assert np.concatenate([each.x for each in events]).tolist() == [1, 3]
+    assert np.concatenate([each.p for each in events]).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("bad", ["1,,3,1", "1,2,3,", "0,5 1 2 1"])
+def test_a_bad_line_after_comments_keeps_its_number(bad: str) -> None:
+    text = f"# one\n# two\n0.5,1,2,1\n{bad}\n"
+    with pytest.raises(UsageError, match=r"v2e\.txt, line 4"):
+        list(read_text_events(io.BytesIO(text.encode()), "v2e.txt"))

@@ -203,10 +203,10 @@ function workersCount(state) {
 function tiles(state) {
   const totals = state.totals;
   const pairs = [
-    ["batches a second", number(state.batches_per_second), `of ${number(totals.batches)}`],
-    ["samples a second", number(state.samples_per_second), `of ${totals.samples.toLocaleString("en")}`],
-    ["bytes a second", bytes(state.bytes_per_second), `of ${bytes(totals.bytes)}`],
-    ["decodes a second", number(state.decodes_per_second), `of ${totals.decodes.toLocaleString("en")}`],
+    ["batches a second", number(state.batches_per_second), `${number(totals.batches)} in all`],
+    ["samples a second", number(state.samples_per_second), `${totals.samples.toLocaleString("en")} in all`],
+    ["bytes a second", bytes(state.bytes_per_second), `${bytes(totals.bytes)} in all`],
+    ["decodes a second", number(state.decodes_per_second), `${totals.decodes.toLocaleString("en")} in all`],
     ["asked, not begun", String(state.queue), "samples"],
     ["went wrong", String(totals.faults), "and was survived"],
     ["videos", state.video_count.toLocaleString("en"), `${state.unusable_count} cannot be used`],
