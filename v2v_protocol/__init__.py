@@ -5,7 +5,7 @@ Pure data: the standard library, numpy and msgpack only. Nothing here opens a so
 
 __version__ = "0.1.0"
 
-PROTOCOL_VERSION = 7
+PROTOCOL_VERSION = 8
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""
 
 NUMERICS_VERSION = 3

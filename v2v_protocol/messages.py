@@ -49,6 +49,9 @@ class Hello:
             loader workers. It settles a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
         name, host: what people shall read of this consumer, "rank 0 of 2" on "gpu-1" for instance.
         packed: whether it asks for compressed arrays, because a network lies between. It must take both.
+        secret: random bytes that own the session, at most 64. A Hello with the same secret, and the same key if there
+            are keys, takes the session over to its own connection. It is never published. Without one, a consumer
+            that connects again gets a new session.
     """
 
     spec: Mapping[str, Any]
@@ -60,6 +63,7 @@ class Hello:
     name: str = ""
     host: str = ""
     packed: bool = False
+    secret: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -231,8 +231,8 @@ class Server:
             match arrival:
                 case FromWorker(identity, frames):
                     self._carry_out(self._dispatcher.from_worker(identity, frames, now))
-                case FromConsumer(identity, frames):
-                    self._carry_out(self._dispatcher.from_consumer(identity, frames, now))
+                case FromConsumer(identity, frames, user):
+                    self._carry_out(self._dispatcher.from_consumer(identity, frames, now, user))
                 case ConsumerGone(identity):
                     self._dispatcher.consumer_gone(identity, now)
                     self._give_back_at = min(self._give_back_at, now + _GIVE_BACK_SECONDS)

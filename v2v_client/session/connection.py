@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from v2v_client.position.state import StreamIdentity
 from v2v_client.session.conversation import WAITS_TOLD_SECONDS, Arrival, Conversation, Event, State
@@ -59,6 +61,7 @@ class Connection:
         clock: Callable[[], float] = time.monotonic,
         transport: Callable[[str], Transport] = Link,
     ) -> None:
+        hello = replace(hello, secret=secrets.token_bytes(32))
         self._brokers = (address,) if isinstance(address, str) else tuple(address)
         self._moves = 0  # from one broker to the next since the last sample
         self._address = self._brokers[0]
@@ -236,7 +239,7 @@ class Connection:
     def _exchange(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         link, conversation = self._open_link(), self._conversation
         if conversation.tick(self._now()):
-            link.connect(self._largest_frame_bytes, keep_name=True)
+            link.connect(self._largest_frame_bytes, again=True)
         self._send(link)
         seconds = min(conversation.next_due(self._now()), WAITS_TOLD_SECONDS) if wait else 0.0
         due = self._clock() + seconds

@@ -4,8 +4,8 @@ ZeroMQ connects again by itself after a cut, but it tells nobody, and what was u
 every handshake after the first means that messages may have been lost, so :meth:`Link.remade` says when to ask again.
 
 Two faults it does not repair by itself: a peer whose packets vanish without any error, and a stream of bytes that is
-no ZeroMQ stream any more (it then leaves the socket dead). For those a :class:`Link` can be connected afresh; it keeps
-its routing id, so that the server knows it again.
+no ZeroMQ stream any more (it then leaves the socket dead). For those a :class:`Link` can be connected again, under a
+new routing id: the server still holds the old one. It knows the consumer by the secret of its Hello.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
 class Transport(Protocol):
     """What a connection needs of a link: a :class:`Link`, or the queues of a test. Closed, it raises ServerLost."""
 
-    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
+    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
         """See :meth:`Link.connect`."""
 
     def disconnect(self, *, linger_ms: int) -> None:
@@ -69,31 +69,27 @@ class Link:
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
-        self._routing_id = b""
         self._sockets = 0
         self._ipv6 = "[" in address
         self._torn = False
 
-    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
+    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
         """Opens a socket, in place of the one before, which is dropped with whatever it holds.
 
         Args:
             largest_frame_bytes: a peer that sends a larger frame is cut off before it is received.
-            keep_name: take the routing id of the socket before, so that the server goes on with its session. If that
-                socket never connected, another kind of address is tried.
+            again: the socket before gave no answer. If it never connected, another kind of address is tried.
 
         Raises:
             UsageError: the address is not understood.
         """
-        if keep_name and self._monitor is not None and not self._shaken_hands():
+        if again and self._monitor is not None and not self._shaken_hands():
             # Of a name that stands for addresses of both kinds ("localhost", as a rule) ZeroMQ tries the first only.
             self._ipv6 = "[" in self._address or not self._ipv6
         self.disconnect(linger_ms=0)
-        if not keep_name:
-            self._routing_id = b"\x01" + os.urandom(15)  # a first byte of 0 is ZeroMQ's own
         with self._in_one_piece():
             socket = self._context.socket(zmq.DEALER)
-            socket.setsockopt(zmq.ROUTING_ID, self._routing_id)
+            socket.setsockopt(zmq.ROUTING_ID, b"\x01" + os.urandom(15))  # a first byte of 0 is ZeroMQ's own
             socket.setsockopt(zmq.LINGER, 0)
             socket.setsockopt(zmq.RCVHWM, 0)
             socket.setsockopt(zmq.SNDHWM, 0)

@@ -6,6 +6,7 @@ sends, the answer is an action or a counted fault, never an exception: one bad p
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -56,6 +57,7 @@ from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Wor
 from v2v_server.catalogue.catalogue import Catalogue
 
 MOST_SESSIONS = 4096
+_LONGEST_SECRET_BYTES = 64
 MOST_FAULTS = 16
 """Malformed messages after which a consumer is cut off: to answer each costs as much as a sample."""
 
@@ -153,18 +155,27 @@ class Dispatcher:
 
     # --- consumers ---------------------------------------------------------------------------------------------------
 
-    def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float) -> list[Action]:
-        """A message from the consumers' side."""
+    def from_consumer(self, identity: bytes, frames: Sequence[Buffer], now: float, user: str = "") -> list[Action]:
+        """Handle a message from the consumers' side.
+
+        Args:
+            identity: routing id of the connection.
+            frames: the message.
+            now: the time.
+            user: name of the key that the connection has; empty without keys.
+        """
         try:
             message = _only(frames)
         except ProtocolError as error:
             return [self._fault(identity, error)]
         session = self.sessions.get(identity)
+        if session is not None and session.user != user:
+            session = None  # another key cannot act for it
         if session is not None:
             session.heard(now)
         match message:
             case Hello():
-                return [self._hello(identity, message, now)]
+                return [self._hello(identity, message, now, user)]
             case Ping():
                 return [
                     ToConsumer(identity, encode(Pong(self.held_up or self.registry.trouble(self._expected_workers))))
@@ -174,13 +185,16 @@ class Dispatcher:
             case Goodbye():
                 if session is not None:
                     self.counters.waited_seconds += session.waits(message.waited_seconds, now)
-                self.consumer_lost(identity)
+                    self.consumer_lost(identity)
                 return []
             case Want():
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.waits(message.waited_seconds, now)
                 return self._want(session, message) or self._assign(now)
+            case WorkerHello():
+                stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
+                return [self._fault(identity, stray)]
             case _:
                 stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
                 return [self._fault(identity, stray)]
@@ -198,7 +212,15 @@ class Dispatcher:
         self.leases.forget_session(identity)
         self._lone = deque(request for request in self._lone if request.session != identity)
 
-    def _hello(self, identity: bytes, hello: Hello, now: float) -> Action:
+    def _hello(self, identity: bytes, hello: Hello, now: float, user: str) -> Action:
+        if len(hello.secret) > _LONGEST_SECRET_BYTES:
+            text = f"the secret has {len(hello.secret)} bytes; the limit is {_LONGEST_SECRET_BYTES}"
+            return _deny(identity, ErrorCode.MALFORMED, text)
+        owner = _owner(user, hello.secret)
+        present = self.sessions.get(identity)
+        if present is not None and (present.owner, present.user) != (owner, user):
+            text = "this routing id belongs to the session of another consumer: connect with a random one"
+            return _deny(identity, ErrorCode.MALFORMED, text)
         if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
             for silent in self.sessions.dispensable(now):
                 self.consumer_lost(silent)
@@ -207,9 +229,12 @@ class Dispatcher:
         try:
             workers = max(len(self.registry), self._expected_workers)
             session, welcome = self._admission.admit(identity, hello, workers, now)
+            session.user, session.owner = user, owner
         except (UsageError, CorpusError) as error:
             return _deny(identity, ErrorCode.SPEC, str(error))
-        self.consumer_lost(identity)
+        for before in {identity, *self.sessions.owned_by(owner)}:
+            self.leases.forget_session(before)
+            self._lone = deque(request for request in self._lone if request.session != before)
         self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
 
@@ -253,6 +278,11 @@ class Dispatcher:
             return self._worker_hello(identity, message, now)
         if isinstance(message, See):
             return [Show(identity, is_worker_side=True)]
+        if isinstance(message, Hello):
+            text = (
+                "this is the workers' port: connect to the address of --bind"
+            )
+            return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
         if not self.registry.heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
@@ -515,6 +545,11 @@ def _slots(want: Want) -> list[Slot | None]:
         if not least <= number <= most:
             raise ProtocolError(f"want.slots: {number} of arena {arena!r:.80}; it has {least} to {most}")
     return [Slot(arena, number) if arena else None for arena, number in zip(want.arenas, want.slots, strict=True)]
+
+
+def _owner(user: str, secret: bytes) -> bytes:
+    """Name who may take a session over: a key, if there are keys, and a secret."""
+    return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""
 
 
 def _deny(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:

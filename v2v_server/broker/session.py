@@ -59,6 +59,8 @@ class Session:
         epoch: that it last asked for samples of.
         position: index after the highest of that epoch that was answered.
         waited_seconds: for how long it has waited for samples since its Hello, as it says.
+        user: name of the key that its connection has; empty without keys.
+        owner: digest of that and of the secret of its Hello; empty without a secret.
         form: of one of its samples.
     """
 
@@ -83,6 +85,8 @@ class Session:
     epoch: int = 0
     position: int = 0
     waited_seconds: float = 0.0
+    user: str = ""
+    owner: bytes = b""
 
     form: Form = field(init=False)
 
@@ -125,11 +129,17 @@ class Sessions:
         return self._sessions.get(identity)
 
     def open(self, session: Session) -> None:
-        """Adds a session; one of the same consumer is replaced (what it asked is forgotten, its debt is not)."""
-        self.forget(session.identity)
-        session.balance_seconds -= self._debts.pop(session.identity, 0.0)
+        """Add a session. One of the same routing id or owner is replaced: what it asked for is forgotten, its debt is
+        not."""
+        for before in {session.identity, *self.owned_by(session.owner)}:
+            self.forget(before)
+            session.balance_seconds -= self._debts.pop(before, 0.0)
         self._sessions[session.identity] = session
         self._turns.append(session.identity)
+
+    def owned_by(self, owner: bytes) -> list[bytes]:
+        """Return the routing ids of the sessions of an owner; none for an empty one."""
+        return [each.identity for each in self if owner and each.owner == owner]
 
     def forget(self, identity: bytes) -> None:
         """Drops a session, if there is one; what it owes is remembered."""

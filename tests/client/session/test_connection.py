@@ -126,7 +126,7 @@ def test_a_name_is_tried_as_an_ipv4_address_and_then_in_turn(address: str, kinds
     found = []
     with closing(link.Link(address)) as tried:
         for _ in kinds:
-            tried.connect(1 << 20, keep_name=bool(found))
+            tried.connect(1 << 20, again=bool(found))
             assert tried._socket is not None
             found.append(tried._socket.getsockopt(zmq.IPV6))
     assert found == kinds
@@ -137,7 +137,7 @@ def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeSe
         connection.open()
         made_anew = connection._open_link()
         assert isinstance(made_anew, link.Link)
-        made_anew.connect(1 << 20, keep_name=True)
+        made_anew.connect(1 << 20, again=True)
         assert made_anew._socket is not None
         assert made_anew._socket.getsockopt(zmq.IPV6) == 0
 

@@ -212,8 +212,8 @@ class Queues:
         self.answers: list[Frames] = []
         self.left = 0
 
-    def connect(self, largest_frame_bytes: int, *, keep_name: bool = False) -> None:
-        self.connected.append(keep_name)
+    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
+        self.connected.append(again)
         self.answers.clear()
 
     def disconnect(self, *, linger_ms: int) -> None:

@@ -130,23 +130,6 @@ def test_whose_connection_has_ended_is_said(
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
 
 
-def test_a_consumer_that_takes_its_place_over_another_connection_is_not_gone(
-    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
-) -> None:
-    sockets = serve()
-    first, other = consumer(sockets, b"c"), consumer(sockets, b"other")
-    first.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
-    again = consumer(sockets, b"c")
-    again.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
-    first.close()
-    other.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
-    other.close()
-    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"other")
-
-
 def test_who_asks_for_more_than_it_takes_is_cut_off(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
