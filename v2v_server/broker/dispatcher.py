@@ -279,9 +279,7 @@ class Dispatcher:
         if isinstance(message, See):
             return [Show(identity, is_worker_side=True)]
         if isinstance(message, Hello):
-            text = (
-                "this is the workers' port: connect to the address of --bind"
-            )
+            text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
         if not self.registry.heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
