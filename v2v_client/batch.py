@@ -62,6 +62,10 @@ class Batch:
             raise KeyError(f"{name!r}: this batch has {', '.join(self.arrays)}, each by its name")
         return self.arrays[name]
 
+    def __contains__(self, name: object) -> bool:
+        """Return whether the batch has a tensor of that name."""
+        return name in self.arrays
+
     __iter__ = None  # its length counts samples and its keys are tensors: neither can be what a loop over it means
 
     def __repr__(self) -> str:
@@ -104,30 +108,52 @@ class Batch:
         return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + look.img(self._repr_png_())
 
     @property
-    def voxels(self) -> torch.Tensor | None:
-        """[B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``; None when not asked for.
+    def voxels(self) -> torch.Tensor:
+        """[B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
 
         Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
+
+        Raises:
+            UsageError: the dataset did not ask for this array.
         """
-        return self.arrays.get("voxels")
+        return self._array("voxels")
 
     @property
-    def frames(self) -> torch.Tensor | None:
-        """[B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated; None when not asked for."""
-        return self.arrays.get("frames")
+    def frames(self) -> torch.Tensor:
+        """[B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated.
+
+        Raises:
+            UsageError: the dataset did not ask for this array.
+        """
+        return self._array("frames")
 
     @property
-    def flow(self) -> torch.Tensor | None:
-        """[B, T, 2, H, W] float16, px in (x, y); None when not asked for.
+    def flow(self) -> torch.Tensor:
+        """[B, T, 2, H, W] float16, px in (x, y).
 
         flow[:, t] belongs to voxel t of the target sequence and is zero before ``flow_from``.
+
+        Raises:
+            UsageError: the dataset did not ask for this array.
         """
-        return self.arrays.get("flow")
+        return self._array("flow")
 
     @property
-    def flow_valid(self) -> torch.Tensor | None:
-        """[B, T, 1, H, W] uint8, 1 where forward and backward flow agree; None when not asked for."""
-        return self.arrays.get("flow_valid")
+    def flow_valid(self) -> torch.Tensor:
+        """[B, T, 1, H, W] uint8, 1 where forward and backward flow agree.
+
+        Raises:
+            UsageError: the dataset did not ask for this array.
+        """
+        return self._array("flow_valid")
+
+    def _array(self, name: str) -> torch.Tensor:
+        if name not in self.arrays:
+            raise UsageError(
+                f"batch.{name}: this batch has only {', '.join(self.arrays)}; make the dataset with "
+                f"arrays={(*self.arrays, name)!r}, or check `{name!r} in batch` first"
+            )
+        return self.arrays[name]
 
     @property
     def nbytes(self) -> int:

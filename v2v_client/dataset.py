@@ -19,10 +19,16 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
 from v2v_client.delivery import deliver
-from v2v_client.loaders import require_epoch_of_ours, require_in_step_with_lightning, send_before_exit
+from v2v_client.loaders import (
+    end_with_parent,
+    is_evaluated_by_lightning,
+    require_epoch_of_ours,
+    require_in_step_with_lightning,
+    send_before_exit,
+)
 from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory.buffers import BatchBuffers
-from v2v_client.options import Options
+from v2v_client.options import Options, require_arguments
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
@@ -31,7 +37,7 @@ from v2v_client.session.connection import Connection
 from v2v_client.session.link import Link
 from v2v_client.session.liveness import Patience
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
+from v2v_protocol.errors import RepeatedSamplesWarning, ServerLost, StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
@@ -40,6 +46,12 @@ from v2v_protocol.spec import SpecOptions, StreamSpec
 from v2v_protocol.tables import html_table
 
 _log = logging.getLogger(__name__)
+_REPEATED = (
+    "the last pass was left before the end of epoch {epoch}, and this pass delivers the same samples again. To go on "
+    "instead, call dataset.load_state_dict(batch.resume_state), with the last batch trained on, before each pass; for "
+    "other samples, call dataset.set_epoch(n) with another n for each pass. To repeat them on purpose, call "
+    "dataset.set_epoch({epoch}) before each pass"
+)
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
     "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
@@ -58,7 +70,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
     counts those before it in the epoch as delivered.
 
     One iteration is one epoch from its beginning. Finishing it advances the epoch; leaving it early and iterating again
-    repeats it. After :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples
+    repeats it, with a RepeatedSamplesWarning the first time (not after a look at one batch). After
+    :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples
     and equally many batches; what does not fill a global batch at the end of an epoch is dropped.
 
     With loader workers, an epoch counts as finished once every worker has delivered its share, which is a few
@@ -132,6 +145,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         **options: Unpack[SpecOptions],
     ) -> None:
         super().__init__()
+        require_arguments(V2VStreamDataset.__init__, options)
         if (rank is None) != (world_size is None):
             raise UsageError(f"rank = {rank}, world_size = {world_size}: give both or none")
         self._brokers = addresses(address)
@@ -175,6 +189,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             UsageError: what is wrong with the videos or flags; ServerLost: the server does not come up.
         """
+        require_arguments(cls.local, options)
         resolved = recipe if isinstance(recipe, Recipe) else StreamSpec.from_dict({"recipe": recipe}).recipe
         scene = options.get("scene")
         asked = [*recipe_flags(resolved), *(("--scene", scene) if scene else ()), *flags]
@@ -311,7 +326,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         if get_worker_info() is not None:
             send_before_exit()
-        return self._iterate(self._position.begin(self._consumer))
+            end_with_parent()
+        begun = self._position.begin(self._consumer)
+        if begun.repeats and not is_evaluated_by_lightning():
+            warnings.warn(_REPEATED.format(epoch=begun.epoch), RepeatedSamplesWarning, stacklevel=2)
+        return self._iterate(begun)
 
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:
         consumer, epoch, state = self._consumer, begun.epoch, begun.state
@@ -347,6 +366,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
                     consumer.after(stream, epoch, plan, number, seen)
                     if not begun.shared
                     else begun.after(consumer, stream, done, seen),
+                    count=done - begun.done,
                     last=number == batches[-1],
                 )
                 yield batch

@@ -18,6 +18,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client import look
 from v2v_client.batch import Batch
+from v2v_client.options import require_arguments
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
@@ -102,6 +103,7 @@ class V2VDataset(Dataset[Sample]):
         cache_dir: str | None = None,
         **options: Unpack[SpecOptions],
     ) -> None:
+        require_arguments(V2VDataset.__init__, options)
         self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
         self.epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
         self.spec = StreamSpec.from_dict({**options, "recipe": recipe})

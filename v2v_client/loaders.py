@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import atexit
 import functools
+import os
 import sys
 import threading
+import time
 from types import FrameType
 
 from v2v_protocol.errors import UsageError
@@ -29,9 +31,13 @@ _FEEDER = "QueueFeederThread"
 _PATIENCE = 4.0
 """Seconds; a DataLoader kills workers that have not ended after five (torch.utils.data._utils)."""
 
+_PARENT_SECONDS = 1.0
+"""How often a loader worker checks that its parent lives."""
+
 _ACCELERATE = "accelerate."
 _STATEFUL = "torchdata.stateful_dataloader."
 _LIGHTNING = ("lightning.pytorch.loops.fit_loop", "pytorch_lightning.loops.fit_loop")
+_LIGHTNING_EVALUATION = ("lightning.pytorch.loops.evaluation_loop", "pytorch_lightning.loops.evaluation_loop")
 
 
 @functools.cache
@@ -44,6 +50,26 @@ def _wait_for_feeders() -> None:
     for thread in threading.enumerate():
         if thread.name == _FEEDER:
             thread.join(_PATIENCE)
+
+
+@functools.cache
+def end_with_parent() -> None:
+    """End this loader worker within seconds of its parent's death, also while it waits for a server."""
+    threading.Thread(target=_wait_for_orphaned, args=(os.getppid(),), name="v2v-parent", daemon=True).start()
+
+
+def _wait_for_orphaned(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_PARENT_SECONDS)
+    os._exit(1)  # nothing can receive its batches any more
+
+
+def is_evaluated_by_lightning() -> bool:
+    """Return whether a validation loop of Lightning iterates, which takes the same samples on purpose."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and _module(frame) not in _LIGHTNING_EVALUATION:
+        frame = frame.f_back
+    return frame is not None
 
 
 def require_epoch_of_ours() -> None:

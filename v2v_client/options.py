@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from v2v_client.position.state import StreamIdentity
+from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
-from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, StreamSpec
+from v2v_protocol.settings import nearest
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
 
 # What is left to the server may be anything, so that it is no reason to refuse what goes with some of it.
 _ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE)
@@ -57,6 +60,23 @@ class Options:
         ours = dataclasses.replace(pinned, spec=spec.to_dict(), spec_digest=spec.digest)
         ours.require_same(pinned, ours="the options given to this dataset", theirs=side)
         return dict(pinned.spec)
+
+
+def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+    """Check names of keyword arguments.
+
+    Args:
+        function: has the other arguments by name.
+        options: fields of a StreamSpec by name, as the caller gave them.
+
+    Raises:
+        UsageError: a name that is neither.
+    """
+    named = [name for name in inspect.signature(function).parameters if name not in ("self", "options")]
+    known = [*named, *SpecOptions.__annotations__]
+    for name in options:
+        if name not in SpecOptions.__annotations__:
+            raise UsageError(f"no argument {name!r}{nearest(name, known)}; known: {', '.join(known)}")
 
 
 def _plain(recipe: Any) -> Any:

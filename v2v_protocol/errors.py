@@ -27,6 +27,10 @@ from __future__ import annotations
 import re
 
 
+class RepeatedSamplesWarning(UserWarning):
+    """An iteration was left early, and the next one delivers the same samples again."""
+
+
 class V2VError(Exception):
     """Root of the tree: everything the project raises on purpose."""
 

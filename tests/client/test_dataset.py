@@ -1,6 +1,7 @@
 import copy
 import dataclasses
 import gc
+import itertools
 import os
 import pickle
 import resource
@@ -19,6 +20,7 @@ from tests.client.fake_server import SPEC, FakeServer, expected
 from v2v_client import (
     ProtocolError,
     RemoteError,
+    RepeatedSamplesWarning,
     SampleUnavailable,
     ServerLost,
     StateMismatch,
@@ -122,7 +124,10 @@ def test_the_batch_has_the_promised_form(server):
 
 def test_only_the_asked_arrays_come(server):
     batch = next(iter(dataset(server, arrays=("voxels",))))
-    assert batch.frames is None
+    assert "voxels" in batch
+    assert "frames" not in batch
+    with pytest.raises(UsageError, match=r"batch\.frames: .* only voxels; .* arrays=\('voxels', 'frames'\)"):
+        _ = batch.frames
     assert_true_bytes(batch)
     assert server.hellos[-1].arrays == ("voxels",)
 
@@ -786,3 +791,37 @@ def test_a_recipe_that_is_changed_for_the_next_dataset_stays_that_of_the_first(s
     next(iter(stream))
     assert server.hellos[0].spec["recipe"] == {"voxels_per_clip": 1, "gamma": 2.0, "threshold": [0.2, 0.5]}
     next(iter(stream))
+
+
+def steps(stream, count):
+    return [index for batch in itertools.islice(stream, count) for index in batch.indices]
+
+
+def test_repeating_an_iteration_that_was_left_early_warns_once(server):
+    stream = dataset(server)
+    next(iter(stream))  # a first look
+    first = steps(stream, 2)
+    with pytest.warns(RepeatedSamplesWarning, match=r"load_state_dict\(batch.resume_state\).*set_epoch"):
+        assert steps(stream, 2) == first
+    assert steps(stream, 2) == first
+
+
+def test_going_on_and_set_epochs_do_not_warn(server):
+    stream = dataset(server)
+    for epoch in (0, 0, 1):
+        stream.set_epoch(epoch)
+        steps(stream, 2)
+    *_, last = itertools.islice(stream_of(stream), 2)
+    stream.load_state_dict(last.resume_state)
+    assert steps(stream, 1)[0] not in last.indices
+
+
+def stream_of(stream):
+    stream.set_epoch(2)
+    return iter(stream)
+
+
+@pytest.mark.parametrize("make", [V2VStreamDataset, V2VStreamDataset.local])
+def test_a_mistyped_argument_is_named_with_the_nearest(make):
+    with pytest.raises(UsageError, match=r"^no argument 'batchsize' \(did you mean 'batch_size'\?\); known: "):
+        make("tcp://127.0.0.1:1", batchsize=4)

@@ -104,6 +104,31 @@ def test_what_is_wrong_is_the_servers_own_message(tmp_path: Path, servers: set[p
     del servers
 
 
+LOADER_SCRIPT = """
+import sys
+from torch.utils.data import DataLoader
+from v2v_client import V2VStreamDataset
+if __name__ == "__main__":
+    dataset = V2VStreamDataset.local(sys.argv[1], 2, recipe={recipe!r}, workers=1)
+    while True:
+        for batch in DataLoader(dataset, batch_size=None, num_workers=2):
+            print(len(batch), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_loader_workers_end_with_a_program_that_is_terminated(clips: Path, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(LOADER_SCRIPT.format(recipe=RECIPE), encoding="utf-8")
+    with subprocess.Popen([sys.executable, str(script), str(clips)], stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline()
+        started = psutil.Process(program.pid).children(recursive=True)
+        program.terminate()
+    assert program.returncode == -signal.SIGTERM
+    until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "status"),

@@ -80,8 +80,6 @@ class Trainer:
         Raises:
             UsageError: the stream has no voxels or no frames.
         """
-        if batch.voxels is None or batch.frames is None:
-            raise UsageError("the batch lacks voxels or frames: ask the stream for both")
         self._optimiser.zero_grad(set_to_none=True)
         with self._autocast:
             prediction = self._network.forward_sequence(batch.voxels)

@@ -19,6 +19,10 @@ from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 _NO_BATCH_YET = 0
+_USED = 2
+"""Batches of an iteration after which leaving it is no first look any more."""
+_USED_BY_LOADER_WORKER = 4
+"""The same for a loader worker, which prefetches two batches by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +37,7 @@ class Iteration:
         shared: its number among those of loader workers; 0 where none of them iterates.
         worker, workers: which of how many loader workers; 0 of 1 where none iterates.
         done: batches of the loader worker's share that were delivered before.
+        repeats: it is the first that repeats an iteration which was left early.
     """
 
     number: int
@@ -43,6 +48,7 @@ class Iteration:
     worker: int = 0
     workers: int = 1
     done: int = _NO_BATCH_YET
+    repeats: bool = False
 
     def batches(self, plan: EpochPlan) -> range:
         """Numbers of the batches that are still to be delivered here."""
@@ -137,8 +143,9 @@ class Position:
         if worker is None:
             with self._shared.change() as agreed:
                 agreed.stale = False
+                repeats = agreed.repeats()
             self._here = agreed.state or consumer.beginning(agreed.stream, agreed.epoch)
-            return Iteration(self._iterations, agreed.epoch, agreed.state, agreed.beginnings)
+            return Iteration(self._iterations, agreed.epoch, agreed.state, agreed.beginnings, repeats=repeats)
         with self._shared.change() as agreed:
             shared = agreed.start(self._name(worker), worker.id, self._to_start_from)
         self._to_start_from = None
@@ -151,6 +158,7 @@ class Position:
             worker.id,
             worker.num_workers,
             self._already_done(shared.epoch, shared.state),
+            shared.repeats,
         )
         known = None if shared.state is None else shared.state.stream
         if known is not None and not begun.batches(consumer.plan(known, shared.state)) and begun.done > 0:
@@ -182,15 +190,19 @@ class Position:
             first = agreed.stream = agreed.stream or stream
         first.require_same(stream, ours="another loader worker", theirs=address)
 
-    def reached(self, begun: Iteration, state: ResumeState, *, last: bool) -> None:
+    def reached(self, begun: Iteration, state: ResumeState, *, count: int, last: bool) -> None:
         """A batch comes out of an iteration now.
 
         Args:
             state: the one after it.
+            count: batches that came out of this iteration so far, this one included.
             last: whether it is the last one: who counts batches may never ask whether there is another.
         """
         if begun.number == self._iterations:  # an older iterator that is still read says nothing about where we are
             self._here = state
+            if count == (_USED_BY_LOADER_WORKER if begun.shared else _USED):
+                with self._shared.change() as agreed:
+                    agreed.used = begun.beginnings
             if last:
                 self._finish(begun)
 

@@ -55,6 +55,7 @@ class LoaderIteration:
         epoch, state: what it delivers, and from where; None: from the beginning.
         beginnings: see :class:`Agreed`, when it began.
         started, finished: loader workers.
+        repeats: see :meth:`Agreed.repeats`, for the loader worker that began it.
     """
 
     number: int
@@ -63,6 +64,7 @@ class LoaderIteration:
     state: ResumeState | None
     beginnings: int
     started: set[int] = field(default_factory=set)
+    repeats: bool = False
     finished: set[int] = field(default_factory=set)
 
 
@@ -76,6 +78,8 @@ class Agreed:
         stream: what the samples are made of, once known.
         stale: loader workers have begun to iterate since the original last knew where it stood.
         beginnings: how often an epoch was set or begun.
+        used: the value of ``beginnings`` at which an iteration last delivered more than a first look takes.
+        warned: an iteration has repeated one that was left early, and the user was told.
         numbers: iterations of loader workers so far.
         iterations: the last of them, the newest last.
     """
@@ -85,6 +89,8 @@ class Agreed:
     stream: StreamIdentity | None = None
     stale: bool = False
     beginnings: int = 0
+    used: int = -1
+    warned: bool = False
     numbers: int = 0
     iterations: list[LoaderIteration] = field(default_factory=list)
 
@@ -94,6 +100,12 @@ class Agreed:
         self.beginnings += 1
         if state is not None and state.stream is not None:
             self.stream = state.stream
+
+    def repeats(self) -> bool:
+        """Return whether the next iteration is the first to repeat one that was left early; True at most once."""
+        first = self.used == self.beginnings and not self.warned
+        self.warned = self.warned or first
+        return first
 
     def start(self, name: str, worker: int, loaded: ResumeState | None) -> LoaderIteration:
         """A loader worker begins to iterate: with those of that name, if it has not begun with them already.
@@ -108,12 +120,14 @@ class Agreed:
             if iteration.name == name:
                 if worker not in iteration.started:
                     iteration.started.add(worker)
+                    iteration.repeats = False
                     return iteration
                 break
         if loaded is not None:
             self.begin(loaded.epoch, replace(loaded, share=None))
         self.numbers += 1
         iteration = LoaderIteration(self.numbers, name, self.epoch, self.state, self.beginnings, {worker})
+        iteration.repeats = self.repeats()
         self.iterations = [*self.iterations, iteration][-_MOST_ITERATIONS:]
         return iteration
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
-from v2v_protocol.settings import require_known
+from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects import prepare
@@ -80,6 +81,10 @@ def simulate(
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
     known = effect_settings()
+    arguments = [name for name in inspect.signature(simulate).parameters if name != "effects"]
+    for name in effects.keys() - known.keys():
+        if close := nearest(name, [*known, *arguments]):
+            raise UsageError(f"unknown effect or argument {name!r}{close}")
     require_known(effects, known, "effect")
     effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name])) > 0.0}
     if frames_per_second is not None:

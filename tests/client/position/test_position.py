@@ -55,8 +55,8 @@ def test_only_the_newest_iteration_says_where_we_are() -> None:
     position = Position(0)
     older, newer = position.begin(ALONE), position.begin(ALONE)
     first, second = (ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), batch, None) for batch in (0, 1))
-    position.reached(newer, first, last=False)
-    position.reached(older, second, last=True)
+    position.reached(newer, first, count=1, last=False)
+    position.reached(older, second, count=1, last=True)
     position.finish(older, ALONE)
     assert position.state(ALONE) == first
     position.finish(newer, ALONE)
@@ -67,7 +67,7 @@ def test_a_shallow_copy_moves_on_by_itself() -> None:
     position = Position(0)
     begun = position.begin(ALONE)
     here: ResumeState = ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), 2, None)
-    position.reached(begun, here, last=False)
+    position.reached(begun, here, count=1, last=False)
     other = copy.copy(position)
     other.begin(ALONE)
     assert position.state(ALONE) == here

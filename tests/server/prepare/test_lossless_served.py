@@ -146,7 +146,7 @@ def test_a_damaged_file_keeps_its_place(pair: tuple[Path, Path], tmp_path: Path)
             for refusal in remake(damaged, spec, seed=0, epoch=0, index=index).provenance.refusals
         ]
     assert {refusal.video for refusal in refusals} == {"a.mp4"}
-    assert all("in the store" in refusal.reason for refusal in refusals)
+    assert all("the store file is corrupt" in refusal.reason for refusal in refusals)
     (tmp_path / "plain").mkdir()
     shutil.copy(pair[1] / "444.mp4", tmp_path / "plain")
     with pytest.raises(CorpusError, match="is a file of a lossless corpus by itself: serve the whole folder"):
