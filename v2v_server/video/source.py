@@ -66,15 +66,17 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         # To open a named pipe waits for somebody to write into it, and a device may not end.
         if not stat.S_ISREG(os.stat(name).st_mode):
             raise VideoUnreadable(name, None, "is no regular file")
-        # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one.
-        container = av.open(os.path.abspath(name), "r", options=_OPTIONS)
+        # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras
+        # and QuickTime write others.
+        container = av.open(os.path.abspath(name), "r", options=_OPTIONS, metadata_errors="replace")
     except av.ArgumentError as error:
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
         raise VideoError(name, None, why) from error
     except (av.FFmpegError, OSError) as error:
         raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
     except UnicodeError as error:
-        raise VideoError(name, None, f"cannot be opened: its name is not valid text ({error})") from error
+        why = f"cannot be opened: the name of the file is not valid text ({error}); rename it"
+        raise VideoError(name, None, why) from error
     try:
         tracks = [track for track in container.streams.video if not track.disposition & _STILL]
         if not tracks:

@@ -428,6 +428,18 @@ def test_an_index_of_another_version_is_made_anew(corpus: Path, opener: Opener) 
     assert opener.probed == [3, 3, 0]
 
 
+def test_what_version_3_refused_is_probed_again_and_the_rest_is_kept(corpus: Path, opener: Opener) -> None:
+    opener(corpus).close()
+    path = next(opener.cache.glob("*.sqlite3"))
+    database = sqlite3.connect(path)
+    database.execute("UPDATE video SET problem = 'refused' WHERE id = 'a.mp4'")
+    database.execute("PRAGMA user_version = 3")
+    database.commit()
+    database.close()
+    assert len(opener(corpus).videos) == 3
+    assert opener.probed == [3, 1]
+
+
 def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("V2V_CACHE_DIR", raising=False)

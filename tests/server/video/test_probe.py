@@ -147,3 +147,21 @@ def test_a_name_that_looks_like_an_address(tmp_path: Path, monkeypatch: pytest.M
     write_clip(tmp_path / "12:30.mp4", panned_luma(5))
     monkeypatch.chdir(tmp_path)
     assert probe(Path("12:30.mp4")).frames == 5
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "avi", "mov"])
+def test_a_tag_that_is_not_utf_8_costs_no_video(tmp_path: Path, suffix: str) -> None:
+    """Old cameras and QuickTime write Latin-1 and binary data."""
+    plain, tagged = write_clip(tmp_path / f"plain.{suffix}", panned_luma(30)), tmp_path / f"tagged.{suffix}"
+    with av.open(str(plain)) as source, av.open(str(tagged), "w") as target:
+        track = source.streams.video[0]
+        copied = target.add_stream_from_template(track)
+        target.metadata["title"] = "Caf~"
+        for packet in source.demux(track):
+            if packet.size:
+                packet.stream = copied
+                target.mux(packet)
+    content = tagged.read_bytes()
+    assert content.count(b"Caf~") == 1
+    tagged.write_bytes(content.replace(b"Caf~", b"Caf\xe9"))
+    assert probe(tagged).frames == probe(plain).frames == 30

@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SCHEMA_VERSION = 3
-"""Raise it with every change of the table or of what probing finds: an index of another version is made anew."""
+SCHEMA_VERSION = 4
+"""Raise it with every change of the table or of what probing finds: an index of another version is made again."""
+_REFUSED_MORE = 3
+"""The version with the same table that refused videos which are read now: those are probed again, the others kept."""
 
 MARKED_FROM = 10_000
 """Records from which on it is worth knowing that nothing has changed."""
@@ -116,10 +118,15 @@ class Store:
             return
         self._database.execute("BEGIN IMMEDIATE")
         with self._database:
-            if self._version() != SCHEMA_VERSION:  # nobody else made it meanwhile
+            version = self._version()
+            if version == SCHEMA_VERSION:  # another process was faster
+                return
+            if version == _REFUSED_MORE:
+                self._database.execute("DELETE FROM video WHERE problem IS NOT NULL")
+            else:
                 self._database.execute("DROP TABLE IF EXISTS video")
                 self._database.execute(_TABLE)
-                self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
