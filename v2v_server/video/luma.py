@@ -59,8 +59,15 @@ class LumaFormat:
         return cls(name, int(frame.color_range), frame.format.components[0].bits, full_range, has_plane=True)
 
     def describes(self, frame: VideoFrame) -> bool:
-        """Whether that frame, too, is stored like this."""
-        return frame.format.name == self.pixel_format and frame.color_range == self.color_range
+        """Return whether that frame's luma is stored like this, whatever its format and range are called."""
+        if frame.format.name == self.pixel_format and frame.color_range == self.color_range:
+            return True
+        other = LumaFormat.of(frame)
+        are_planes = self.has_plane and other.has_plane
+        return are_planes and (self.bits, self.full_range, self.sample) == (other.bits, other.full_range, other.sample)
+
+    def __str__(self) -> str:
+        return f"{self.pixel_format} ({self.bits} bits, {'full' if self.full_range else 'limited'} range)"
 
     @property
     def sample(self) -> np.dtype[np.unsignedinteger]:

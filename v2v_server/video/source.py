@@ -44,6 +44,7 @@ _OPTIONS = {
     "max_streams": str(MOST_STREAMS),
     "max_pixels": str(LARGEST_PICTURE_PX),
 }
+_JPEG = b"\xff\xd8\xff"
 _STILL = Disposition.attached_pic | Disposition.timed_thumbnails
 
 
@@ -68,7 +69,9 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
             raise VideoUnreadable(name, None, "is no regular file")
         # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras
         # and QuickTime write others.
-        container = av.open(os.path.abspath(name), "r", options=_OPTIONS, metadata_errors="replace")
+        container = av.open(
+            os.path.abspath(name), "r", format=_raw_format(name), options=_OPTIONS, metadata_errors="replace"
+        )
     except av.ArgumentError as error:
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
         raise VideoError(name, None, why) from error
@@ -99,6 +102,12 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         yield container, stream
     finally:
         container.close()
+
+
+def _raw_format(name: str) -> str | None:
+    """Return FFmpeg's name of the container where its own guess is wrong: raw JPEG pictures, for it a still."""
+    with open(name, "rb") as file:
+        return "mjpeg" if file.read(len(_JPEG)) == _JPEG else None
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:

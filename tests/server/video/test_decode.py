@@ -337,3 +337,19 @@ def test_a_damaged_frame_that_the_stride_leaves_out_spoils_what_refers_to_it(tmp
     assert caught.value.frame is not None
     assert caught.value.frame % 3 == 0
     assert 30 <= caught.value.frame <= 33
+
+
+def test_a_range_that_is_stated_only_later_ends_no_clip(tmp_path: Path) -> None:
+    """It is the same all along, because a range that is not stated is the limited one."""
+    parts = [
+        write_clip(tmp_path / f"{stated}.h264", panned_luma(24, full_range=False), full_range=stated)
+        for stated in (None, False, True)
+    ]
+    silent, limited, full = (part.read_bytes() for part in parts)
+    (tmp_path / "later.h264").write_bytes(silent + limited)
+    path = tmp_path / "later.h264"
+    assert decode_luma(path, probe(path).index, 12, 24).frames.shape[0] == 24
+    (tmp_path / "changed.h264").write_bytes(limited + full)
+    path = tmp_path / "changed.h264"
+    with pytest.raises(VideoError, match=r"from yuv420p \(8 bits, limited range\) to yuvj?420p \(8 bits, full range\)"):
+        decode_luma(path, probe(path).index, 12, 24)
