@@ -26,6 +26,7 @@ import h5py
 import numpy as np
 
 from trainer.convert.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
+from trainer.hdf5 import require_self_contained
 from v2v_protocol.errors import UsageError
 
 READ_EVENTS = 1 << 18
@@ -61,6 +62,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
 def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
+            require_self_contained(file, path)
             yield file
     except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's, on files that are cut off or damaged
         raise UsageError(f"{path} cannot be read as HDF5: {error}") from error

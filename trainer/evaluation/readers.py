@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
+from trainer.hdf5 import require_self_contained
 from v2v_protocol.errors import UsageError
 
 BLOCK_EVENTS = 1 << 16
@@ -110,6 +111,7 @@ class Recording:
             raise UsageError(f"{self.path} cannot be read as HDF5: {error}") from error
         try:
             with _reading(self.path):
+                require_self_contained(self._file, self.path)
                 self._columns = self._checked_columns()
                 self.times: Sequence[float] = _Times(self._columns["ts"], self.path)
                 self.repaired_images = 0
