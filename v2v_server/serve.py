@@ -382,8 +382,10 @@ class Server:
         """Says once that the server is ready; after that keeps the status up to date."""
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
-            address = self._transport.address
-            self._say(f"ready: consumers connect to {address}, workers to {self._transport.worker_address}")
+            address, worker_address = self._transport.address, self._transport.worker_address
+            # A private address is of no use to workers elsewhere.
+            workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
+            self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
