@@ -83,8 +83,8 @@ def simulate(
     known = effect_settings()
     arguments = [name for name in inspect.signature(simulate).parameters if name != "effects"]
     for name in effects.keys() - known.keys():
-        if close := nearest(name, [*known, *arguments]):
-            raise UsageError(f"unknown effect or argument {name!r}{close}")
+        if not nearest(name, known) and (close := nearest(name, arguments)):
+            raise UsageError(f"no argument {name!r}{close}")
     require_known(effects, known, "effect")
     effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name])) > 0.0}
     if frames_per_second is not None:

@@ -426,6 +426,7 @@ FRAMES = moving_frames(11, 6, 7)
         ({"photoreceptor_hz": 1e-3}, "photoreceptor_hz = 0.001: give a number from 0.01 to 1e.06 Hz, or 0 for off"),
         ({"dead_pixel_share": 1.1}, "dead_pixel_share = 1.1"),
         ({"dead_pixels": 1.0}, "unknown effect 'dead_pixels' .did you mean 'dead_pixel_share'"),
+        ({"threshold_po": 0.3}, r"no argument 'threshold_po' \(did you mean 'threshold_pos'\?\)"),
     ],
 )
 def test_bad_effects_are_refused_by_name(change: Any, message: Any) -> None:
