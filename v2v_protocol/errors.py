@@ -19,6 +19,8 @@
     |   `-- NoWorkers                it answers, but nobody can make a sample
     `-- WorkerCrashLoop          the workers die without finishing anything
 
+RepeatedSamplesWarning is a warning, for what works and is rarely meant.
+
 A message says what is wrong, the number, the limit and what to do about it.
 """
 
