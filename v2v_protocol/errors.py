@@ -19,7 +19,7 @@
     |   `-- NoWorkers                it answers, but nobody can make a sample
     `-- WorkerCrashLoop          the workers die without finishing anything
 
-RepeatedSamplesWarning is a warning, for what works and is rarely meant.
+RepeatedSamplesWarning is a warning: the call works, but is rarely what the user intends.
 
 A message says what is wrong, the number, the limit and what to do about it.
 """

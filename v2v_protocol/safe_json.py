@@ -10,7 +10,7 @@ def parse_json(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        ValueError: it is not JSON, is nested too deeply, or holds a text that is no Unicode (half of a surrogate pair).
+        ValueError: it is not JSON, is nested too deeply, or holds half of a surrogate pair, which is not Unicode text.
     """
     try:
         value = json.loads(text)
@@ -18,5 +18,5 @@ def parse_json(text: str | bytes) -> Any:
     except RecursionError:
         raise ValueError("is nested too deeply") from None
     except UnicodeEncodeError:
-        raise ValueError("holds half of a surrogate pair, which is no Unicode text") from None
+        raise ValueError("holds half of a surrogate pair, which is not Unicode text") from None
     return value

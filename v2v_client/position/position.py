@@ -20,7 +20,7 @@ from v2v_protocol.errors import UsageError
 
 _NO_BATCH_YET = 0
 _USED = 2
-"""Batches of an iteration after which leaving it is no first look any more."""
+"""Batches of an iteration from which on it counts as training, not as a look at the data."""
 _USED_BY_LOADER_WORKER = 4
 """The same for a loader worker, which prefetches two batches by default."""
 

@@ -126,8 +126,8 @@ def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
             yield Finding(OK, part, "everything that this part needs is installed")
         else:
             level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
-            change = f"pip install '.[{part}]' in a checkout, if this machine is to do that part"
-            # A machine that has one part whole need not hear what the other parts would take.
+            change = f"pip install '.[{part}]' in a checkout, if you need that part on this machine"
+            # Packages of a part that this machine may not need are no news.
             text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
             yield Finding(level, part, text, change)
 

@@ -127,7 +127,7 @@ class StoreFile:
         record = unpack_record(group, self._pread(size, self._table + group * size, group))
         if record is None:
             self._refuse(group, "its record in the table is damaged")
-        # Checked before anything is allocated: whoever wrote the file also wrote its checksums.
+        # Checked before anything is allocated: the author of a file also wrote its checksums.
         for number, (start, end) in enumerate(pairwise(record.starts)):
             if end - start > LARGEST_BLOCK_BYTES:
                 self._refuse(group, f"block {number} has {end - start} bytes, the limit is {LARGEST_BLOCK_BYTES}")
