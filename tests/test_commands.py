@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from v2v_bench.cli import BENCHMARKS
+from bench.cli import BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -151,7 +151,7 @@ def wrong_with(words: list[str]) -> str:
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
     if program == "v2v-bench":
-        return _refused(f"v2v_bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
+        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
     return _refused(MODULES[program], rest) if program in MODULES else "no program"
 
 
@@ -165,7 +165,7 @@ def _wrong_with_launched(words: list[str]) -> str:
         return ""
     if started == "pytest":
         return wrong_with(["pytest", *rest])
-    module = started if started.removeprefix("v2v_bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
+    module = started if started.removeprefix("bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
     return "nothing that can be started" if module is None else _refused(module, rest)
 
 
@@ -195,7 +195,7 @@ def test_what_is_wrong_with_a_line_is_seen() -> None:
     for line in (
         "v2v-serve --videos DIR --workers many", "v2v-serve --video DIR", "v2v-service", "make tests",
         "v2v-bench nothing", "v2v-bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
-        "python -m v2v_bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
+        "python -m bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
         "pytest tests/none.py",
     ):  # fmt: skip
         assert wrong_with(shlex.split(line)), line
@@ -212,7 +212,7 @@ def test_programs_and_flags_that_are_named_alone_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-bench", "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    modules = [*MODULES.values(), *(f"v2v_bench.{module}" for module in BENCHMARKS.values())]
+    modules = [*MODULES.values(), *(f"bench.{module}" for module in BENCHMARKS.values())]
     assert named <= {flag for module in modules for flag in parser_of(module)._option_string_actions}
 
 

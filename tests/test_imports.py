@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer", "v2v_bench", "examples")
+PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer", "bench", "examples")
 
 FORBIDDEN: dict[str, set[str]] = {
-    "v2v_pictures": {"v2v_server", "v2v_client", "trainer", "v2v_bench", "examples", "torch", "zmq", "numba", "cv2"},
-    "v2v_server": {"torch", "v2v_client", "trainer", "v2v_bench", "examples"},
-    "v2v_client": {"v2v_server", "trainer", "v2v_bench", "examples", "av", "numba", "cv2"},
-    "trainer": {"v2v_server", "v2v_bench", "examples"},
+    "v2v_pictures": {"v2v_server", "v2v_client", "trainer", "bench", "examples", "torch", "zmq", "numba", "cv2"},
+    "v2v_server": {"torch", "v2v_client", "trainer", "bench", "examples"},
+    "v2v_client": {"v2v_server", "trainer", "bench", "examples", "av", "numba", "cv2"},
+    "trainer": {"v2v_server", "bench", "examples"},
 }
 PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "v2v_bench"})
+_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "bench"})
 
 Program = Callable[[], int | None]
 """Returns the exit status; None is success."""
@@ -69,4 +69,4 @@ loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client
 train = _program("v2v-train", "trainer.train", "main", "trainer")
 evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")
 convert = _program("v2v-convert", "trainer.convert.cli", "main", "convert")
-bench = _program("v2v-bench", "v2v_bench.cli", "main", "dev")
+bench = _program("v2v-bench", "bench.cli", "main", "dev")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from bench import cache
+from bench.tradeoff import store
 from tests.clips import panned_luma, write_clip
-from v2v_bench import cache
-from v2v_bench.tradeoff import store
 
 
 @pytest.fixture(scope="module")

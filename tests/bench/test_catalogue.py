@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from bench import catalogue
 from tests.clips import panned_luma, write_clip
-from v2v_bench import catalogue
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from v2v_bench import cli, corpus
-from v2v_bench.speed import kernel
+from bench import cli, corpus
+from bench.speed import kernel
 
 
 def test_a_file_that_cannot_be_written_is_one_line_after_what_was_measured(

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from bench import limits
 from tests.bench.small import FLAGS, clips, is_picture, one_line, records
-from v2v_bench import limits
 
 
 def test_work_is_repeated_until_the_time_is_over_and_at_least_once() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2v_bench import step
+from bench import step
 
 
 @pytest.mark.slow

@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from bench.chaos.fleet import abandoned_memory, shared_memory
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
-from v2v_bench.chaos.fleet import abandoned_memory, shared_memory
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import UsageError
 from v2v_server.keys.folder import KeyFolder

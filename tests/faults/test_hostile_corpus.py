@@ -14,10 +14,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from bench.usage import peak_rss_bytes
 from tests.clips import panned_luma, write_clip
 from tests.server.video.test_hostile import PLAYLISTS
 from tests.waiting import until
-from v2v_bench.usage import peak_rss_bytes
 from v2v_client import V2VStreamDataset
 from v2v_server.system.sandbox import can_confine
 

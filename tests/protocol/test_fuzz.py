@@ -1,4 +1,4 @@
-"""A short run of the fuzzer of `v2v_bench/fuzz/fuzz.py`, and the proof that it would notice."""
+"""A short run of the fuzzer of `bench/fuzz/fuzz.py`, and the proof that it would notice."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from bench.fuzz import fuzz
+from bench.fuzz.frames import MESSAGE_TYPES, FrameFuzzer
 from tests.clips import panned_luma, write_clip
-from v2v_bench.fuzz import fuzz
-from v2v_bench.fuzz.frames import MESSAGE_TYPES, FrameFuzzer
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.wire import decode, decode_sample
 

@@ -71,7 +71,7 @@ def test_no_decoder_is_installed_that_does_not_tell_damage() -> None:
 
 
 def test_nobody_is_sent_to_an_index_that_does_not_have_us() -> None:
-    folders = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "v2v_bench", "docs")
+    folders = ("v2v_protocol", "v2v_server", "v2v_client", "trainer", "bench", "docs")
     texts = [path for folder in folders for path in (HOME / folder).rglob("*") if path.suffix in (".py", ".md")]
     assert len(texts) > 100
     assert not [path for path in (HOME / "README.md", *texts) if "install 'v2v-stream" in path.read_text("utf-8")]

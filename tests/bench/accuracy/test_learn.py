@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from bench import cli
+from bench.accuracy import learn
 from tests.clips import panned_luma, write_clip
 from trainer.models import NETWORKS
-from v2v_bench import cli
-from v2v_bench.accuracy import learn
 from v2v_protocol.errors import UsageError
 
 

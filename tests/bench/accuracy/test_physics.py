@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench import cli
+from bench.accuracy import physics
+from bench.accuracy.recorded import Recording, compare, correlation, read_recording, simulated
+from bench.accuracy.scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
+from bench.speed.dense import bin_events, dense_events
 from tests.clips import panned_luma, write_clip
 from tests.server.simulation import oracle
-from v2v_bench import cli
-from v2v_bench.accuracy import physics
-from v2v_bench.accuracy.recorded import Recording, compare, correlation, read_recording, simulated
-from v2v_bench.accuracy.scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
-from v2v_bench.speed.dense import bin_events, dense_events
 from v2v_protocol.errors import UsageError
 
 SHARED = Path(__file__).parents[4] / "shared" / "data"
@@ -220,7 +220,7 @@ def test_the_command(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
 
 def test_the_entry_knows_every_benchmark_that_the_documents_name() -> None:
     root = Path(cli.__file__).parent.parent
-    texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "v2v_bench").rglob("*.py")]
+    texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "bench").rglob("*.py")]
     named = {name for path in texts for name in re.findall(r"v2v-bench ([a-z][a-z_]*)", path.read_text("utf-8"))}
     assert {"training_trade", "gpu_feed", "throughput"} <= set(cli.names())
     assert len(named) > 5

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.accuracy import sensor
+from bench.accuracy.recorded import Recording
 from tests.server.simulation.test_pixel import moving_frames
-from v2v_bench.accuracy import sensor
-from v2v_bench.accuracy.recorded import Recording
 from v2v_server.simulation import simulate
 
 

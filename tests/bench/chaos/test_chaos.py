@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from bench.chaos import chaos
+from bench.chaos.consumer import PROFILES, profile
+from bench.chaos.faults import WEIGHTS, Fault
+from bench.chaos.fleet import Fleet, abandoned_memory, free_ports, shared_memory
+from bench.chaos.hostile import KINDS
 from tests.clips import panned_luma, write_clip
-from v2v_bench.chaos import chaos
-from v2v_bench.chaos.consumer import PROFILES, profile
-from v2v_bench.chaos.faults import WEIGHTS, Fault
-from v2v_bench.chaos.fleet import Fleet, abandoned_memory, free_ports, shared_memory
-from v2v_bench.chaos.hostile import KINDS
 
 DEMANDED = (
     "kills",

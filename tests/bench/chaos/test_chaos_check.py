@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.chaos.check import StreamOracle, Verdict, check, main
+from bench.chaos.consumer import PROFILES, Profile, log_path
+from bench.chaos.log import BatchLine, LifeLine, Line, LogWriter, Sighting, read_log, sighting
 from tests.clips import panned_luma, write_clip
-from v2v_bench.chaos.check import StreamOracle, Verdict, check, main
-from v2v_bench.chaos.consumer import PROFILES, Profile, log_path
-from v2v_bench.chaos.log import BatchLine, LifeLine, Line, LogWriter, Sighting, read_log, sighting
 from v2v_protocol.refusal import Refusal
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake

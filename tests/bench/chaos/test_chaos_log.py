@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_bench.chaos.log import (
+from bench.chaos.log import (
     BatchLine,
     Kill,
     LifeLine,

@@ -9,11 +9,11 @@ from pathlib import Path
 import psutil
 import pytest
 
+from bench.chaos.fleet import Fleet
+from bench.chaos.hostile import KINDS, REFUSED
+from bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
-from v2v_bench.chaos.fleet import Fleet
-from v2v_bench.chaos.hostile import KINDS, REFUSED
-from v2v_bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
 

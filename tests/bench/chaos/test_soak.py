@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from bench.chaos import soak
+from bench.speed.memory import fit
 from tests.clips import panned_luma, write_clip
-from v2v_bench.chaos import soak
-from v2v_bench.speed.memory import fit
 
 
 @pytest.mark.parametrize(("slope", "verdict"), [(0.0, False), (0.2, False), (0.3, True), (-1.0, False)])

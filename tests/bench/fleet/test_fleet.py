@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_bench.fleet import fleet
-from v2v_bench.fleet.model import Costs, Fleet, Outcome, Run
+from bench.fleet import fleet
+from bench.fleet.model import Costs, Fleet, Outcome, Run
 
 PLAIN = Costs(worker_seconds=0.25, crowded_seconds=0.25)
 ONE = Fleet(batch_size=1, step_seconds=0.0, workers=1, cores=1, workers_per_host=1)

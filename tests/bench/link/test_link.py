@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from bench.chaos.chaos import FAILING
+from bench.link import across, curve, slow
 from tests.bench.small import FLAGS, clips, records
-from v2v_bench.chaos.chaos import FAILING
-from v2v_bench.link import across, curve, slow
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from bench.speed import gpu_feed
 from tests.bench.small import FLAGS, clips, is_picture, one_line, records
-from v2v_bench.speed import gpu_feed
 from v2v_client import Batch
 
 CPU = torch.device("cpu")

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from v2v_bench.speed.memory import fit, rss_mib
+from bench.speed.memory import fit, rss_mib
 from v2v_protocol.errors import UsageError
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.speed.null_service import null_service
+from bench.speed.null_worker import answer
+from bench.usage import consume, peak_rss_bytes
 from tests.bench.small import FLAGS, RECIPE
 from tests.server.corpus import SMALL_SPEC, corpus, video
-from v2v_bench.speed.null_service import null_service
-from v2v_bench.speed.null_worker import answer
-from v2v_bench.usage import consume, peak_rss_bytes
 from v2v_client import V2VStreamDataset
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode_map, decode_sample

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from bench.speed import scaling
 from tests.bench.small import FLAGS, RECIPE, clips, is_picture, one_line, records
-from v2v_bench.speed import scaling
 
 MB = 1_000_000
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from bench.speed import throughput
+from bench.speed.contenders import Contender, Corpus, Measured, Setting, line_up
 from tests.clips import panned_luma, write_clip
-from v2v_bench.speed import throughput
-from v2v_bench.speed.contenders import Contender, Corpus, Measured, Setting, line_up
 
 SOURCE, MADE = Corpus("source", Path("a"), "full"), Corpus("h264", Path("b"), "full")
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.speed import transport
+from bench.speed.route_process import CODECS
+from bench.speed.routes import Route, missing, travel
 from tests.bench.small import FLAGS, RECIPE, clips, is_picture, one_line, records
-from v2v_bench.speed import transport
-from v2v_bench.speed.route_process import CODECS
-from v2v_bench.speed.routes import Route, missing, travel
 from v2v_protocol.errors import UsageError
 
 HERE = [codec for codec in CODECS if missing(codec) is None]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from bench.speed.watched import main
 from tests.bench.small import FLAGS, clips, one_line, records
-from v2v_bench.speed.watched import main
 
 
 @pytest.mark.slow

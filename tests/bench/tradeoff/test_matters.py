@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from bench.tradeoff import matters
 from tests.clips import panned_luma, write_clip
 from tests.trainer.conftest import WEIGHTS
 from trainer.config import TrainConfig
 from trainer.config_file import load_config
-from v2v_bench.tradeoff import matters
 
 
 @pytest.mark.parametrize(

@@ -14,20 +14,20 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.records import recipe_of
+from bench.speed.kernel import textured_frames
+from bench.tradeoff import tradeoff
+from bench.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, at_threshold, spurious
+from bench.tradeoff.diversity import diversity, effective_samples, overlap
+from bench.tradeoff.errors import Tally, common_bins, compare, correlation
+from bench.tradeoff.forms import ENCODINGS, SOURCE
+from bench.tradeoff.front import best, dominates, dominators
+from bench.tradeoff.knobs import EXACT, Setting, settings, write_preset
+from bench.tradeoff.noise import cheap_kernel, run_kernel
+from bench.tradeoff.other import compressors
+from bench.tradeoff.speed import Speed, Work, leases_of, measure
 from tests.bench.small import FLAGS, clips, is_picture, one_line, records
 from tests.clips import panned_luma, write_clip
-from v2v_bench.records import recipe_of
-from v2v_bench.speed.kernel import textured_frames
-from v2v_bench.tradeoff import tradeoff
-from v2v_bench.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, at_threshold, spurious
-from v2v_bench.tradeoff.diversity import diversity, effective_samples, overlap
-from v2v_bench.tradeoff.errors import Tally, common_bins, compare, correlation
-from v2v_bench.tradeoff.forms import ENCODINGS, SOURCE
-from v2v_bench.tradeoff.front import best, dominates, dominators
-from v2v_bench.tradeoff.knobs import EXACT, Setting, settings, write_preset
-from v2v_bench.tradeoff.noise import cheap_kernel, run_kernel
-from v2v_bench.tradeoff.other import compressors
-from v2v_bench.tradeoff.speed import Speed, Work, leases_of, measure
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import preset
 from v2v_protocol.sample import SampleParams

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from bench.tradeoff import training_trade
 from tests.clips import panned_luma, write_clip
-from v2v_bench.tradeoff import training_trade
 
 
 class Sees(torch.nn.Module):

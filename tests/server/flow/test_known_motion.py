@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from v2v_bench.accuracy import flow as benchmark
-from v2v_bench.accuracy.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
+from bench.accuracy import flow as benchmark
+from bench.accuracy.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
 from v2v_server.flow.clip import consistent
 
 TEXTURES = {name: photograph(name) for name in ("coffee", "camera", "chelsea")}

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.leases import open_leases, whole_sample
 from tests.clips import panned_luma, write_clip
 from tests.server.prepare.test_prepare import run
 from tests.server.video.test_real_videos import FOLDER, FRAMES, SOUND
-from v2v_bench.leases import open_leases, whole_sample
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.accuracy import extremes
+from bench.accuracy.extreme_rows import Finding, Row, refused, rows, texture
+from bench.speed.balance import Camera, arithmetic, balance, imbalance, trace_of
 from tests.server.simulation import oracle, reference
-from v2v_bench.accuracy import extremes
-from v2v_bench.accuracy.extreme_rows import Finding, Row, refused, rows, texture
-from v2v_bench.speed.balance import Camera, arithmetic, balance, imbalance, trace_of
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
 from v2v_protocol.sample import SampleParams

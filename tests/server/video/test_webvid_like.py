@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.corpus import main, webvid_like
 from tests.clips import panned_luma, write_clip
-from v2v_bench.corpus import main, webvid_like
 from v2v_protocol.errors import UsageError
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe

@@ -1,0 +1,217 @@
+"""What the chaos test does to its processes: the kinds of faults, how often each comes, and who is hit.
+
+    worker-kill, -term, -segv     one of the server's own workers ends by that signal
+    worker-hang                   it is stopped for good: the server's watchdog has to end it
+    worker-pause                  it is stopped and goes on a little later
+    further-add                   one more worker joins by `v2v-worker --connect`
+    further-kill, -term           it is removed
+    further-pause                 it is stopped, perhaps until its leases are given to others, then goes on
+    server-kill                   kill -9; it is started again on the same address
+    consumer-kill                 kill -9; it goes on from the state it saved last
+    consumer-pause                it is stopped for a few seconds: it must hold up nobody else
+    peers-parts, -headers, ...    eight hostile consumers for some seconds, see :mod:`bench.chaos.hostile`
+    peers-slow                    an honest one whose samples take long
+    cache-delete                  with a cache: its folder is deleted
+    cache-flip, -cut              one byte of a piece of it is another, or its end is missing
+
+A SEGV is blamed on the sequence in work, by design, and two of them take that video out of the corpus for good. There
+are fewer than videos, for a long clip may be a video's only sequence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+from dataclasses import dataclass, field
+
+from bench.chaos.fleet import Fleet
+from bench.chaos.hostile import KINDS
+
+WEIGHTS = {
+    "worker-kill": 5.0,
+    "worker-term": 4.0,
+    "worker-segv": 3.0,
+    "worker-hang": 1.5,
+    "worker-pause": 1.5,
+    "further-add": 3.0,
+    "further-kill": 2.0,
+    "further-term": 2.0,
+    "further-pause": 0.5,
+    "server-kill": 1.5,
+    "consumer-kill": 5.0,
+    "consumer-pause": 1.0,
+    **{f"peers-{kind}": 0.5 for kind in KINDS},
+    "cache-delete": 0.5,
+    "cache-flip": 2.0,
+    "cache-cut": 2.0,
+}
+"""How often each kind is chosen, relative to the others."""
+_SIGNALS = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "segv": signal.SIGSEGV, "hang": signal.SIGSTOP}
+_MOST_FURTHER_WORKERS = 2
+_LONGEST_TRUCE_SECONDS = 20.0
+_LONGEST_SIEGE_SECONDS = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that was done to a process.
+
+    Attributes:
+        kind: see the module.
+        at: when, on the monotonic clock.
+        consumer: the number of the consumer it was done to, if it was one.
+    """
+
+    kind: str
+    at: float
+    consumer: int | None = None
+
+    @property
+    def is_kill(self) -> bool:
+        """Whether it ended the process, at once or by the watchdog."""
+        return self.kind.partition("-")[2] in _SIGNALS
+
+
+@dataclass(slots=True)
+class Chaos:
+    """Chooses and commits faults.
+
+    Args:
+        fleet: the processes.
+        mean_seconds: between two faults; the gaps are exponentially distributed, and longer where nobody got a batch
+            since the last fault.
+        seed: of all choices.
+        most_segv: most faults of that kind.
+        kinds: to choose from.
+
+    Attributes:
+        done: all faults so far.
+    """
+
+    fleet: Fleet
+    mean_seconds: float
+    seed: int
+    most_segv: int
+    kinds: tuple[str, ...] = tuple(WEIGHTS)
+    done: list[Fault] = field(default_factory=list)
+    _random: random.Random = field(init=False)
+    _next: float | None = field(init=False, default=None)
+    _last: float = field(init=False, default=0.0)
+    _logged: int = field(init=False, default=0)
+    _paused: list[tuple[float, int]] = field(init=False, default_factory=list)
+    _peers: list[tuple[float, subprocess.Popen[bytes]]] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._random = random.Random(self.seed)
+
+    def act(self, now: float) -> None:
+        """Does what is due. To be called often."""
+        self._continue([pid for until, pid in self._paused if until <= now])
+        self._paused = [(until, pid) for until, pid in self._paused if until > now]
+        self._dismiss([peers for until, peers in self._peers if until <= now])
+        self._peers = [(until, peers) for until, peers in self._peers if until > now]
+        if self._next is not None and now >= self._next and self._progressed(now):
+            possible = [kind for kind in self.kinds if self._possible(kind)]
+            if possible:
+                kind = self._random.choices(possible, [WEIGHTS[kind] for kind in possible])[0]
+                self._commit(kind, now)
+            self._next = None
+        if self._next is None:
+            self._next = now + self._random.expovariate(1.0 / self.mean_seconds)
+            self._last, self._logged = now, self.fleet.logged_bytes()
+
+    def _progressed(self, now: float) -> bool:
+        """Whether anybody got a batch since the last fault: on a busy host, workers that are killed while they still
+        start would otherwise never make a sample, and nothing would be tested."""
+        return self.fleet.logged_bytes() != self._logged or now - self._last > _LONGEST_TRUCE_SECONDS
+
+    def end(self) -> None:
+        """No more faults; whoever is paused goes on, and hostile peers go."""
+        self._continue([pid for _, pid in self._paused])
+        self._dismiss([peers for _, peers in self._peers])
+        self._paused, self._peers = [], []
+
+    def _possible(self, kind: str) -> bool:
+        who, _, how = kind.partition("-")
+        if how == "segv" and sum(fault.kind == kind for fault in self.done) >= self.most_segv:
+            return False
+        if who == "worker":
+            return bool(self.fleet.server_workers())
+        if who == "server":
+            # One that is not up yet may be killed as well, but a corpus on a busy host would never be served.
+            return self.fleet.server.pid is not None and self.fleet.port_file.exists()
+        if who == "peers":
+            return not self._peers
+        if who == "cache":
+            return bool(self.fleet.cached_pieces())
+        if how == "add":
+            return len(self.fleet.further_workers) < _MOST_FURTHER_WORKERS
+        places = self.fleet.further_workers if who == "further" else self.fleet.crowd
+        return any(place.pid is not None for place in places)
+
+    def _commit(self, kind: str, now: float) -> None:
+        who, _, how = kind.partition("-")
+        consumer = None
+        if how == "add":
+            self.fleet.add_worker()
+        elif who == "peers":
+            until = now + self._random.uniform(0.3, 1.0) * _LONGEST_SIEGE_SECONDS
+            self._peers.append((until, self.fleet.peers(how)))
+        elif who == "cache":
+            self._spoil(how)
+        elif who == "worker":
+            pids = self.fleet.server_workers()
+            if not pids:
+                return  # the last one died since we looked
+            self._signal(self._random.choice(pids), how, now)
+        else:
+            crowd = self.fleet.crowd
+            places = {"server": [self.fleet.server], "further": self.fleet.further_workers, "consumer": crowd}
+            alive = [(place, place.pid) for place in places[who]]
+            place, pid = self._random.choice([(place, pid) for place, pid in alive if pid is not None])
+            place.expected = how != "pause"
+            consumer = crowd.index(place) if who == "consumer" else None
+            self._signal(pid, how, now)
+        self.done.append(Fault(kind, now, consumer))
+
+    def _spoil(self, how: str) -> None:
+        folder, pieces = self.fleet.clip_cache, self.fleet.cached_pieces()
+        if folder is None or not pieces:
+            return  # a worker removed the last one since we looked
+        if how == "delete":
+            shutil.rmtree(folder, ignore_errors=True)
+            return
+        with contextlib.suppress(OSError), self._random.choice(pieces).open("r+b") as piece:
+            at = self._random.randrange(max(1, os.fstat(piece.fileno()).st_size))
+            if how == "cut":
+                piece.truncate(at)
+                return
+            piece.seek(at)
+            old = piece.read(1)
+            piece.seek(at)
+            piece.write(bytes([old[0] ^ (1 << self._random.randrange(8))]) if old else b"")
+
+    def _signal(self, pid: int, how: str, now: float) -> None:
+        if how == "pause":
+            longest = 2.0 * self.fleet.lease_deadline_seconds if pid in self._further() else 4.0
+            self._paused.append((now + self._random.uniform(0.2, longest), pid))
+        with contextlib.suppress(ProcessLookupError):  # it was dying already
+            os.kill(pid, _SIGNALS.get(how, signal.SIGSTOP))
+
+    def _further(self) -> set[int]:
+        return {place.pid for place in self.fleet.further_workers if place.pid is not None}
+
+    def _continue(self, pids: list[int]) -> None:
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError):  # somebody killed it meanwhile
+                os.kill(pid, signal.SIGCONT)
+
+    @staticmethod
+    def _dismiss(all_peers: list[subprocess.Popen[bytes]]) -> None:
+        for peers in all_peers:
+            peers.kill()
+            peers.wait()
