@@ -28,7 +28,7 @@ from v2v_server.simulation.view import Frames
 
 
 @dataclass(slots=True)
-class Making:
+class SampleContext:
     """A sample that is being made.
 
     Attributes:
@@ -56,53 +56,53 @@ class Making:
         return self.spec.recipe
 
 
-Maker = Callable[[Making, npt.NDArray[Any]], None]
-MAKERS: dict[str, Maker] = {}
+ArrayBuilder = Callable[[SampleContext, npt.NDArray[Any]], None]
+ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
 """What fills each array, by name."""
 
 
-def makes(name: str) -> Callable[[Maker], Maker]:
+def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     """Decorator of the function that fills the array of that name, which it is given C-contiguous."""
 
-    def register(maker: Maker) -> Maker:
-        MAKERS[name] = maker
-        return maker
+    def register(builder: ArrayBuilder) -> ArrayBuilder:
+        ARRAY_BUILDERS[name] = builder
+        return builder
 
     return register
 
 
 @makes("voxels")
-def voxels(making: Making, out: npt.NDArray[Any]) -> None:
+def voxels(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Signed event counts.
 
     Raises:
         VideoError: what the corpus states of the video (thresholds, time stamps) is beyond what can be simulated.
     """
-    recipe, dtype = making.recipe, making.spec.voxel_dtype
+    recipe, dtype = context.recipe, context.spec.voxel_dtype
     try:
-        made = simulate_clip(making.view, making.params, recipe, dtype, making.step_seconds, out)
+        made = simulate_clip(context.view, context.params, recipe, dtype, context.step_seconds, out)
     except UsageError as error:
         # The recipe was checked; what is left is what the corpus says of the video.
-        raise VideoError(making.video, None, f"cannot be simulated: {error}") from error
-    making.saturated_bins = made.saturated_bins
+        raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
+    context.saturated_bins = made.saturated_bins
 
 
 @makes("frames")
-def frames(making: Making, out: npt.NDArray[Any]) -> None:
+def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """The frame at the end of each voxel, and the lead frame."""
     # These indices are those of frames that are there; checking them once more would cost a copy.
-    np.take(making.view, making.source[list(making.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+    np.take(context.view, context.source[list(context.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
 
 
 @makes("flow")
-def flow(making: Making, out: npt.NDArray[Any]) -> None:
+def flow(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Flow over each voxel."""
-    if making.flow is not None:
-        out[...] = making.flow.flow
+    if context.flow is not None:
+        out[...] = context.flow.flow
 
 
 @makes("flow_valid")
-def flow_valid(making: Making, out: npt.NDArray[Any]) -> None:
+def flow_valid(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Where the flow can be believed."""
-    if making.flow is not None and making.flow.valid is not None:
-        out[...] = making.flow.valid
+    if context.flow is not None and context.flow.valid is not None:
+        out[...] = context.flow.valid

@@ -51,8 +51,8 @@ from v2v_server.worker.conversation import (
     WorkerConversation,
 )
 from v2v_server.worker.decode_cache import Clips
-from v2v_server.worker.handover import room_for, sample_message
 from v2v_server.worker.logbook import IDLE, note
+from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
@@ -251,7 +251,7 @@ class Worker:
             error, self._unfetched = self._unfetched[1], None
             raise error
         began = time.monotonic()
-        room = room_for(lease, sample_layout(lease))
+        buffer = open_output_buffer(lease, sample_layout(lease))
         has_room = time.monotonic()
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
@@ -261,11 +261,11 @@ class Worker:
             # Python's collector, which waits for many, but each holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sample = make_sample(lease, clip, room.arrays)
+        sample = make_sample(lease, clip, buffer.arrays)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
-            room,
+            buffer,
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=time.process_time() - started,

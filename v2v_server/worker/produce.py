@@ -35,12 +35,12 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import MAKERS, Making
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
 @dataclass(frozen=True, slots=True)
-class Draft:
+class SamplePlan:
     """What one sample needs of its clip.
 
     Attributes:
@@ -49,7 +49,7 @@ class Draft:
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
         flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
-        plan: what the statistics of the scene say about flow; None where the spec does not ask them.
+        flow_plan: what the statistics of the scene say about flow; None where the spec does not ask them.
     """
 
     spec: StreamSpec
@@ -57,18 +57,18 @@ class Draft:
     source: npt.NDArray[np.int64]
     cut: Cut
     flow: FlowSettings | None
-    plan: FlowPlan | None
+    flow_plan: FlowPlan | None
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
     """The decoded part of a sample."""
 
-    draft: Draft
+    plan: SamplePlan
     clip: DecodedClip
 
 
-def draft_of(lease: Lease, index: int) -> Draft:
+def plan_sample(lease: Lease, index: int) -> SamplePlan:
     """Draws the camera of one of a lease's indices.
 
     Raises:
@@ -88,13 +88,13 @@ def draft_of(lease: Lease, index: int) -> Draft:
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
-    plan = _plan(lease, spec, params, bottom - top)
+    flow_plan = _flow_plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
-        if plan is not None and plan.still:
+        if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
+    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), flow, flow_plan)
 
 
 def decode_for(
@@ -112,11 +112,11 @@ def decode_for(
         VideoError: the file is not what was catalogued, or cannot give the frames it promised.
         ProtocolError: the lease does not fit its form.
     """
-    drafts = [draft_of(lease, index) for index in indices]
-    spec = drafts[0].spec
+    plans = [plan_sample(lease, index) for index in indices]
+    spec = plans[0].spec
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [draft.cut for draft in drafts]
+        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
         with lent(root, lease.video, lease.fingerprint) as path:
@@ -128,7 +128,7 @@ def decode_for(
     except VideoError as error:
         # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return tuple(Decoded(draft, clip) for draft, clip in zip(drafts, clips, strict=True))
+    return tuple(Decoded(plan, clip) for plan, clip in zip(plans, clips, strict=True))
 
 
 def sample_layout(lease: Lease) -> Layout:
@@ -156,13 +156,13 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             are beyond what can be simulated.
         ProtocolError: the lease does not fit its form.
     """
-    draft, index = decoded.draft, lease.indices[0]
-    params, recipe, source = draft.params, draft.spec.recipe, draft.source
+    plan, index = decoded.plan, lease.indices[0]
+    params, recipe, source = plan.params, plan.spec.recipe, plan.source
     frames, flow = decoded.clip.frames, None
-    if draft.flow is not None:
-        plan = () if draft.plan is None else draft.plan.methods
-        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays, plan=plan)
-        frames = view_part(frames, params, recipe, draft.flow.margin_px)
+    if plan.flow is not None:
+        methods = () if plan.flow_plan is None else plan.flow_plan.methods
+        flow = flow_for(frames, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        frames = view_part(frames, params, recipe, plan.flow.margin_px)
     view = apply_view(frames, params, recipe)
     seconds, irregular = None, 0
     if recipe.needs_seconds:
@@ -171,9 +171,9 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     if into is None:
         into = new_arrays(sample_layout(lease))
-    making = Making(lease.video, draft.spec, params, source, view, seconds, flow)
+    context = SampleContext(lease.video, plan.spec, params, source, view, seconds, flow)
     for name, array in into.items():
-        MAKERS[name](making, array)
+        ARRAY_BUILDERS[name](context, array)
     return Sample(
         arrays=into,
         provenance=Provenance(
@@ -184,11 +184,11 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             candidate=lease.candidate,
             refusals=_refusals(lease),
             params=params,
-            saturated_bins=making.saturated_bins,
+            saturated_bins=context.saturated_bins,
             irregular_timestamps=irregular,
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
-            scene="" if draft.plan is None else draft.plan.reason,
+            scene="" if plan.flow_plan is None else plan.flow_plan.reason,
         ),
     )
 
@@ -224,7 +224,7 @@ def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
     return array_layout(spec.recipe, spec.voxel_dtype, arrays)
 
 
-def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
+def _flow_plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
     if spec.scene == "off":
         return None
     scene = Scene.from_bytes(lease.scene)

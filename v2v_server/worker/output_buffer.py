@@ -26,7 +26,7 @@ from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class OutputBuffer:
     """Where a sample is made.
 
     Attributes:
@@ -38,7 +38,7 @@ class Room:
     in_slot: bool
 
 
-def room_for(lease: Lease, layout: Layout) -> Room:
+def open_output_buffer(lease: Lease, layout: Layout) -> OutputBuffer:
     """The lease's slot, where it names one that can be reached; fresh memory otherwise.
 
     Args:
@@ -48,13 +48,13 @@ def room_for(lease: Lease, layout: Layout) -> Room:
     if lease.slot != NO_SLOT:
         there = slot_arrays(Slot(lease.arena, lease.slot), layout)
         if there is not None:
-            return Room(there, in_slot=True)
-    return Room(new_arrays(layout), in_slot=False)
+            return OutputBuffer(there, in_slot=True)
+    return OutputBuffer(new_arrays(layout), in_slot=False)
 
 
 def sample_message(
     lease: Lease,
-    room: Room,
+    buffer: OutputBuffer,
     *,
     provenance: Mapping[str, Any],
     worker: str,
@@ -74,14 +74,14 @@ def sample_message(
     return encode_sample(
         epoch=lease.epoch,
         index=lease.indices[0],
-        arrays=room.arrays,
+        arrays=buffer.arrays,
         provenance=provenance,
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
         cache=cache,
         slot=lease.slot,
-        in_slot=room.in_slot,
+        in_slot=buffer.in_slot,
         quarantine=lease.quarantine,
         pack=pack if packed or lease.packed else None,
     )
