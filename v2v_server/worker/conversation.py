@@ -98,7 +98,7 @@ Action: TypeAlias = Send | Say | Listen | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class Timings:
     """What a sample took, as its :class:`v2v_protocol.messages.Result` says it."""
 
     decode_seconds: float = 0.0
@@ -108,7 +108,7 @@ class Spent:
 
 
 @dataclass(frozen=True, slots=True)
-class Tools:
+class Callbacks:
     """What the conversation asks about its process. An answer changes nothing.
 
     Attributes:
@@ -132,10 +132,10 @@ class WorkerConversation:
         is_watched: the server sees in the worker's logbook which lease it is at.
     """
 
-    def __init__(self, hello: WorkerHello, address: str, tools: Tools, *, is_watched: bool) -> None:
+    def __init__(self, hello: WorkerHello, address: str, callbacks: Callbacks, *, is_watched: bool) -> None:
         self._hello = hello
         self._address = address
-        self._tools = tools
+        self._callbacks = callbacks
         self._is_watched = is_watched
         self._leases: deque[Lease] = deque()
         self._at: Lease | None = None  # made now
@@ -143,9 +143,9 @@ class WorkerConversation:
         self._unheard = False  # nothing says yet that the server took in our last hello
         self._away = False  # we said goodbye to compile
         self._silence = Liveness(0.0)
-        self._told = False
+        self._silence_reported = False
         # Leases that are done, what is to be said of their samples, and what these took.
-        self._unsent: list[tuple[int, Frames, Spent]] = []
+        self._unsent: list[tuple[int, Frames, Timings]] = []
         self._unsent_since = 0.0
         self._stopping = False
 
@@ -157,10 +157,10 @@ class WorkerConversation:
 
     def start(self, now: float) -> list[Action]:
         """The worker can work."""
-        self._listens_from(now)
-        return [self._say_hello(), *self._go_on(now)]
+        self._restart_silence(now)
+        return [self._say_hello(), *self._next_actions(now)]
 
-    def heard(self, messages: Sequence[Any], now: float) -> list[Action]:
+    def on_messages(self, messages: Sequence[Any], now: float) -> list[Action]:
         """The first frames of the messages that came, oldest first; none after the wait.
 
         Raises:
@@ -169,23 +169,23 @@ class WorkerConversation:
         """
         actions: list[Action] = []
         if messages:
-            self._listens_from(now)
+            self._restart_silence(now)
             for frame in messages:
-                actions += self._take_in(frame)
+                actions += self._handle(frame)
         else:
-            actions += self._nothing_heard(now)
+            actions += self._handle_silence(now)
         if self._away:
             self._away = False
             self._leases.clear()  # which were on their way when the server heard of our goodbye
             actions.append(self._say_hello())
-        return actions + self._go_on(now)
+        return actions + self._next_actions(now)
 
-    def loaded(self, now: float) -> list[Action]:
+    def on_kernels_loaded(self, now: float) -> list[Action]:
         """The kernels of the lease that was to be begun are there."""
-        self._listens_from(now)
-        return [Listen(0.0)] if self._away else self._go_on(now)
+        self._restart_silence(now)
+        return [Listen(0.0)] if self._away else self._next_actions(now)
 
-    def made(self, frames: Frames, now: float, spent: Spent = Spent()) -> list[Action]:
+    def on_sample(self, frames: Frames, now: float, timings: Timings = Timings()) -> list[Action]:
         """The sample is made.
 
         Args:
@@ -194,12 +194,12 @@ class WorkerConversation:
             spent: what it took.
         """
         lease = self._done(now)
-        self._unsent.append((lease.lease, frames, spent))
+        self._unsent.append((lease.lease, frames, timings))
         may_wait = (
             len(frames) == 1  # arrays that travel with it had better be on their way
             and self._is_watched  # elsewhere the server blames what was begun to its knowledge
             and bool(self._leases)
-            and self._tools.is_decoded(self._leases[0])
+            and self._callbacks.is_decoded(self._leases[0])
             and now - self._unsent_since < _TOGETHER_SECONDS
         )
         if may_wait and not self._stopping:
@@ -207,7 +207,7 @@ class WorkerConversation:
             return [self._make(now)]
         return [Listen(0.0)]
 
-    def failed(self, error: VideoError, now: float) -> list[Action]:
+    def on_failure(self, error: VideoError, now: float) -> list[Action]:
         """The video could not give what it promised. This is said at once."""
         lease = self._done(now)
         here = isinstance(error, VideoChanged | VideoUnreadable)
@@ -215,7 +215,7 @@ class WorkerConversation:
 
     # --- what the server says -----------------------------------------------------------------------------------------
 
-    def _take_in(self, frame: Any) -> list[Action]:
+    def _handle(self, frame: Any) -> list[Action]:
         try:
             message: Message = decode(frame)
         except VersionMismatch:
@@ -244,21 +244,21 @@ class WorkerConversation:
                 pass
         return []
 
-    def _nothing_heard(self, now: float) -> list[Action]:
+    def _handle_silence(self, now: float) -> list[Action]:
         actions: list[Action] = []
         if self._silence.ping_due(now):
             self._unheard = False  # it may be lost
             actions.append(Send(encode(Ping())))
-        if self._silence.silence(now) >= _TOLD_SECONDS and not self._told:
-            self._told = True
+        if self._silence.silence(now) >= _TOLD_SECONDS and not self._silence_reported:
+            self._silence_reported = True
             if not self._is_watched:  # of its own workers a server knows
                 actions.append(Say(f"{self._address} has not answered for {_TOLD_SECONDS:g} s; waiting"))
         return actions
 
-    def _listens_from(self, now: float) -> None:
+    def _restart_silence(self, now: float) -> None:
         """Silence is counted from here: while a sample is made nobody listens."""
         self._silence = Liveness(now, ping_seconds=_PING_SECONDS, longest_ping_seconds=_LONGEST_PING_SECONDS)
-        self._told = False
+        self._silence_reported = False
 
     # --- what the worker does -----------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class WorkerConversation:
         self._unheard = True
         return Send(encode(self._hello))
 
-    def _go_on(self, now: float) -> list[Action]:
+    def _next_actions(self, now: float) -> list[Action]:
         """What is done is said; then the next step."""
         actions = self._results()
         if self._stopping:
@@ -276,10 +276,10 @@ class WorkerConversation:
             return [*actions, Listen(min(_PING_SECONDS, self._silence.next_due(now)))]
         lease = self._leases[0]
         if self._begun != lease.lease:
-            if not self._tools.is_ready(lease):
+            if not self._callbacks.is_ready(lease):
                 # While they are compiled its leases are for others: that takes seconds, many where cores are few, and
                 # a video is not to be blamed for them, nor a worker.
-                self._away = not self._tools.is_compiled(lease)
+                self._away = not self._callbacks.is_compiled(lease)
                 return [*actions, *([Send(encode(Goodbye()))] if self._away else []), Load(lease)]
             self._begun = lease.lease
             actions.append(Send(encode(Begun(lease.lease))))
@@ -295,25 +295,25 @@ class WorkerConversation:
         lease, self._at = self._at, None
         if lease is None:
             raise ValueError("nothing was to be made")
-        self._listens_from(now)
+        self._restart_silence(now)
         return lease
 
     def _results(self) -> list[Action]:
         """Says what is done, and along with it what is begun next."""
         if not self._unsent:
             return []
-        may_go_on = self._leases and not self._stopping and self._tools.is_ready(self._leases[0])
+        may_go_on = self._leases and not self._stopping and self._callbacks.is_ready(self._leases[0])
         self._begun = self._leases[0].lease if may_go_on else 0
         begun = [*(number for number, *_ in self._unsent[1:]), self._begun]
         results = [
-            Send([*encode(_result(number, next_one, spent)), *frames])
-            for (number, frames, spent), next_one in zip(self._unsent, begun, strict=True)
+            Send([*encode(_result(number, next_one, timings)), *frames])
+            for (number, frames, timings), next_one in zip(self._unsent, begun, strict=True)
         ]
         self._unsent.clear()
         return list(results)
 
 
-def _result(lease: int, begins: int, spent: Spent) -> Result:
+def _result(lease: int, begins: int, timings: Timings) -> Result:
     return Result(
-        lease, begins, spent.decode_seconds, spent.simulate_seconds, spent.handover_seconds, spent.memory_bytes
+        lease, begins, timings.decode_seconds, timings.simulate_seconds, timings.handover_seconds, timings.memory_bytes
     )

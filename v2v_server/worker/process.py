@@ -41,13 +41,13 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
+    Callbacks,
     Listen,
     Load,
     Make,
     Say,
     Send,
-    Spent,
-    Tools,
+    Timings,
     WorkerConversation,
 )
 from v2v_server.worker.decode_cache import Clips
@@ -114,7 +114,7 @@ class Worker:
         self._conversation = WorkerConversation(
             WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
             address,
-            Tools(
+            Callbacks(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
                 is_compiled=lambda lease: (
                     all(map(is_compiled, kernels_of(lease) - self._kernels))
@@ -185,28 +185,28 @@ class Worker:
         match step:
             case Listen(seconds):
                 messages = self._messages(seconds)
-                return conversation.heard(messages, time.monotonic())
+                return conversation.on_messages(messages, time.monotonic())
             case Load(lease):
                 for variant in kernels_of(lease) - self._kernels:
                     load_in_turn(variant)
                     self._kernels.add(variant)
                 self._fetch(lease)
-                return conversation.loaded(time.monotonic())
+                return conversation.on_kernels_loaded(time.monotonic())
             case Make(lease):
                 if not self._clips.has(lease):
                     give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
                 limit_processor_time(LONGEST_LEASE_SECONDS)
                 note(self._logbook, lease.lease, decodes=True)
                 try:
-                    made: tuple[Frames, Spent] | VideoError = self._made(lease)
+                    made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
                 except VideoError as error:
                     made = error
                 note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
                 now = time.monotonic()
                 if isinstance(made, VideoError):
-                    return conversation.failed(made, now)
-                frames, spent = made
-                return conversation.made(frames, now, spent)
+                    return conversation.on_failure(made, now)
+                frames, timings = made
+                return conversation.on_sample(frames, now, timings)
             case _:
                 return []  # Leave
 
@@ -241,7 +241,7 @@ class Worker:
             messages.append(first)
         return messages
 
-    def _made(self, lease: Lease) -> tuple[Frames, Spent]:
+    def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
         """The message of a lease's sample, and what it took.
 
         Raises:
@@ -273,14 +273,14 @@ class Worker:
             cache=self._clips.said_of_cache(clip) if decoded else "",
             packed=self._is_remote,
         )
-        spent = Spent(
+        timings = Timings(
             decode_seconds=has_clip - has_room,
             simulate_seconds=has_sample - has_clip,
             handover_seconds=self._handover_seconds + has_room - began,
             memory_bytes=self._memory(has_sample),
         )
         self._handover_seconds = time.monotonic() - has_sample
-        return frames, spent
+        return frames, timings
 
     def _memory(self, now: float) -> int:
         """Bytes of this process in memory, looked at once a second."""
