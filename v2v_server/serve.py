@@ -20,12 +20,22 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, Show, ToConsumer, ToWorker
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    CutOff,
+    GiveUp,
+    ReportRefusal,
+    Show,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
@@ -117,8 +127,8 @@ def serve(config: ServeConfig) -> None:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
     quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
     quarantine = read_quarantine(quarantine_file)
-    for verdict in quarantine.verdicts(quarantine.latest):
-        log.say(f"in quarantine: {verdict}")
+    for entry in quarantine.entries(quarantine.latest):
+        log.say(f"in quarantine: {entry}")
     dispatcher = Dispatcher(
         catalogue,
         config.spec,
@@ -215,7 +225,7 @@ class Server:
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
-        self._held_up_due: float | None = None
+        self._blocked_due: float | None = None
         self._give_back_at = math.inf
 
     def turn(self, longest_wait_seconds: float) -> None:
@@ -240,8 +250,8 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, withheld in self._supervisor.withheld(now).items():
-                self._dispatcher.worker_withheld(identity, withheld)
+            for identity, stalled in self._supervisor.stalled(now).items():
+                self._dispatcher.worker_stalled(identity, stalled)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
@@ -251,7 +261,7 @@ class Server:
                 give_back_freed_memory()
             for line in [*self._supervisor.news(), *(self._page.watch(now) if self._page is not None else [])]:
                 self._say(line)
-            self._look_what_holds_up(now)
+            self._warn_if_blocked(now)
             self._scale(now)
             self._carry_out([*self._watch.tick(now)])
             self._show(now)
@@ -291,12 +301,12 @@ class Server:
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
-                case Condemn() as record:
+                case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record), now())))
-                case LookFor() as missing:
-                    todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
-                case PassOver(refusal, request):
+                    todo.extendleft(reversed(dispatcher.quarantine_recorded(record, self._record(record), now())))
+                case CheckVideo() as missing:
+                    todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
+                case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case Show() as show:
                     todo.extend(self._watch.ask(show))
@@ -310,29 +320,29 @@ class Server:
         self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
         return loss
 
-    def _record(self, record: Condemn) -> list[Verdict]:
+    def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
         """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
 
         Returns:
             the lines that the quarantine has more now.
         """
-        verdict = record.verdict
+        entry = record.entry
         try:
-            written = write_verdict(self._quarantine_file, verdict, self._quarantine)
+            written = write_entry(self._quarantine_file, entry, self._quarantine)
         except (OSError, CorpusError) as error:
             self._say(
-                f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; it is passed over this once and comes "
                 f"again, because the quarantine cannot be written: {error}",
                 "error",
                 record.request,
-                video=verdict.path,
+                video=entry.path,
             )
             return []
         for line in written:
             self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
         return written
 
-    def _look_for(self, missing: LookFor) -> bool:
+    def _check_video(self, missing: CheckVideo) -> bool:
         """Whether the video is here as it was catalogued. If so, the operator is told of the host that has it not,
         once in a while: all workers of a host fail alike."""
         try:
@@ -358,15 +368,15 @@ class Server:
             )
         return True
 
-    def _look_what_holds_up(self, now: float) -> None:
+    def _warn_if_blocked(self, now: float) -> None:
         """Another server that writes holds the index for moments; what lasts is said, once."""
-        if not self._dispatcher.held_up:
-            self._held_up_due = None
-        elif self._held_up_due is None:
-            self._held_up_due = now + _SOON_SECONDS
-        elif now >= self._held_up_due:
-            self._held_up_due = math.inf
-            self._say(f"no sample is begun: {self._dispatcher.held_up}", "warning")
+        if not self._dispatcher.blocked_reason:
+            self._blocked_due = None
+        elif self._blocked_due is None:
+            self._blocked_due = now + _SOON_SECONDS
+        elif now >= self._blocked_due:
+            self._blocked_due = math.inf
+            self._say(f"no sample is begun: {self._dispatcher.blocked_reason}", "warning")
 
     def _scale(self, now: float) -> None:
         """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""

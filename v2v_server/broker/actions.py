@@ -11,7 +11,7 @@ from v2v_protocol.messages import Denied, ErrorCode
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Verdict
+from v2v_server.broker.quarantine import QuarantineEntry
 
 _LONGEST_TEXT = 2000
 """Characters of a denial: it quotes what the peer sent, which may be long, and must itself fit a header."""
@@ -49,7 +49,7 @@ class GiveUp:
 
 
 @dataclass(frozen=True, slots=True)
-class Condemn:
+class AddToQuarantine:
     """Write this verdict down before anything that follows is sent, and report what came of it.
 
     Attributes:
@@ -57,12 +57,12 @@ class Condemn:
         request: whose candidate it refuses.
     """
 
-    verdict: Verdict
+    entry: QuarantineEntry
     request: Request
 
 
 @dataclass(frozen=True, slots=True)
-class LookFor:
+class CheckVideo:
     """A worker cannot have a video on its host: see whether it is on this one as it was catalogued, and report.
 
     Attributes:
@@ -81,7 +81,7 @@ class LookFor:
 
 
 @dataclass(frozen=True, slots=True)
-class PassOver:
+class ReportRefusal:
     """Tell the operator that a video was passed over.
 
     Attributes:
@@ -106,7 +106,7 @@ class Show:
     is_worker_side: bool = False
 
 
-Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | Condemn | LookFor | PassOver | Show
+Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | Show
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

@@ -53,7 +53,7 @@ def runs_alone(request: Request) -> bool:
     return request.deaths >= ALONE_AFTER
 
 
-def judged(request: Request, loss: Loss) -> Request | str:
+def judge(request: Request, loss: Loss) -> Request | str:
     """The verdict on a request that was begun when its worker was lost.
 
     Returns:

@@ -13,10 +13,10 @@ from dataclasses import replace
 from v2v_protocol.messages import Unavailable
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.wire import encode
-from v2v_server.broker.actions import Action, Condemn, PassOver, ToConsumer
+from v2v_server.broker.actions import Action, AddToQuarantine, ReportRefusal, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import Sequence
@@ -72,7 +72,7 @@ class Candidates:
             snapshot, video.id, video.fingerprint, sequence.start_frame, session.spec.digest
         )
 
-    def condemn(self, request: Request, reason: str, *, for_all: bool = True) -> list[Action]:
+    def quarantine_candidate(self, request: Request, reason: str, *, for_all: bool = True) -> list[Action]:
         """The request's candidate brought its worker down: a verdict, unless there is one already.
 
         Args:
@@ -84,13 +84,17 @@ class Candidates:
         if session is None:
             return []
         if self.quarantined(session, request, self._quarantine.latest) is not None:
-            return self.refuse_condemned(request, reason)
+            return self.refuse_quarantined(request, reason)
         sequence = self.sequence(session, request)
         video, text = sequence.video, reason[:LONGEST_REASON]
         spec, time = "" if for_all else session.spec.digest, self._wall_clock()
-        return [Condemn(Verdict(0, video.id, video.fingerprint, sequence.start_frame, text, time, spec), request)]
+        return [
+            AddToQuarantine(
+                QuarantineEntry(0, video.id, video.fingerprint, sequence.start_frame, text, time, spec), request
+            )
+        ]
 
-    def refuse_condemned(self, request: Request, reason: str) -> list[Action]:
+    def refuse_quarantined(self, request: Request, reason: str) -> list[Action]:
         """On to the next candidate: by the quarantine if the request's snapshot has the verdict, which says the same to
         whoever makes the sample again; else by what happened."""
         session = self._sessions.get(request.session)
@@ -113,7 +117,9 @@ class Candidates:
         passed_over = next_candidate(request, refusal)
         self.latest.append((self._wall_clock(), passed_over.refusals[-1]))
         # What the quarantine refuses is no news to the operator.
-        actions: list[Action] = [PassOver(passed_over.refusals[-1], request)] if kind != RefusalKind.QUARANTINED else []
+        actions: list[Action] = (
+            [ReportRefusal(passed_over.refusals[-1], request)] if kind != RefusalKind.QUARANTINED else []
+        )
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions

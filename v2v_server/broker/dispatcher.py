@@ -44,15 +44,25 @@ from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, Show, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    CutOff,
+    GiveUp,
+    Show,
+    ToConsumer,
+    ToWorker,
+    denial,
+)
 from v2v_server.broker.admission import Admission
-from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
+from v2v_server.broker.blame import Cause, Loss, judge, runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
-from v2v_server.broker.leases import LeaseBook, Request, Withheld
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.leases import LeaseBook, Request, Stall
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
-from v2v_server.broker.terms import inspected, lease_for, work_seconds
+from v2v_server.broker.terms import check_result, lease_for, work_seconds
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
 from v2v_server.catalogue.catalogue import Catalogue
 
@@ -80,7 +90,7 @@ class Dispatcher:
     Attributes:
         counters: what happened so far.
         sessions: the consumers.
-        held_up: why no lease can be made just now, whoever asks; empty where they can.
+        blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         registry: the workers.
         leases: who makes what.
         candidates: what was refused.
@@ -108,7 +118,7 @@ class Dispatcher:
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self.registry = Workers(self.leases)
         self._lone: deque[Request] = deque()
-        self.held_up = ""
+        self.blocked_reason = ""
         self._faults: dict[bytes, int] = {}  # of consumers that are connected
 
     @property
@@ -178,19 +188,21 @@ class Dispatcher:
                 return [self._hello(identity, message, now, user)]
             case Ping():
                 return [
-                    ToConsumer(identity, encode(Pong(self.held_up or self.registry.trouble(self._expected_workers))))
+                    ToConsumer(
+                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self._expected_workers)))
+                    )
                 ]
             case See():
                 return [Show(identity)]
             case Goodbye():
                 if session is not None:
-                    self.counters.waited_seconds += session.waits(message.waited_seconds, now)
+                    self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                     self.consumer_lost(identity)
                 return []
             case Want():
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
-                self.counters.waited_seconds += session.waits(message.waited_seconds, now)
+                self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                 return self._want(session, message) or self._assign(now)
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
@@ -304,9 +316,9 @@ class Dispatcher:
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
-    def worker_withheld(self, identity: bytes, withheld: Withheld) -> None:
+    def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
         """A worker was kept from working for so long; no deadline runs meanwhile."""
-        self.leases.put_off(identity, withheld)
+        self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
         """Something sent to a worker did not go out, and nobody will say what became of its process."""
@@ -314,8 +326,10 @@ class Dispatcher:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
-    def recorded(self, record: Condemn, written: Sequence[Verdict], now: float) -> list[Action]:
-        """What came of a :class:`Condemn`.
+    def quarantine_recorded(
+        self, record: AddToQuarantine, written: Sequence[QuarantineEntry], now: float
+    ) -> list[Action]:
+        """What came of a :class:`AddToQuarantine`.
 
         Args:
             record: the action.
@@ -329,10 +343,10 @@ class Dispatcher:
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self.candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
+        return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._assign(now)]
 
-    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
-        """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
+    def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
+        """What came of a :class:`CheckVideo`: the video's fault, or that of the worker's host.
 
         Args:
             missing: the action.
@@ -351,7 +365,7 @@ class Dispatcher:
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
-        self.held_up = ""  # to try again
+        self.blocked_reason = ""  # to try again
         self.registry.wake(now)
         for identity in self.registry.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
@@ -391,7 +405,7 @@ class Dispatcher:
             self._charge(result.lease, identity, now)
         else:
             try:
-                header = inspected(payload, request, session.form)
+                header = check_result(payload, request, session.form)
             except ProtocolError as error:
                 # No worker of ours does this, and one that did it once would do it again.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
@@ -417,7 +431,7 @@ class Dispatcher:
             return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
         # The catalogue is of this host's files: if the video is here, other workers can have it too.
         video = self.candidates.sequence(session, request).video
-        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
+        return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
         """Who asked for it and waits no more pays for it all the same."""
@@ -444,11 +458,11 @@ class Dispatcher:
         returned = self.leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
-            verdict = judged(request, loss) if begun else request
+            verdict = judge(request, loss) if begun else request
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                actions += self.candidates.condemn(request, verdict, for_all=loss.for_all)
+                actions += self.candidates.quarantine_candidate(request, verdict, for_all=loss.for_all)
         return actions + self._assign(now)
 
     # --- requests ----------------------------------------------------------------------------------------------------
@@ -456,7 +470,7 @@ class Dispatcher:
     def _assign(self, now: float) -> list[Action]:
         """Gives waiting requests to workers, until there is no request or no room."""
         actions: list[Action] = []
-        while not self.held_up:
+        while not self.blocked_reason:
             if self._lone:
                 empty = self.registry.for_lone_request()
                 if empty is not None:
@@ -511,7 +525,7 @@ class Dispatcher:
             )
             return [ToWorker(worker, encode(lease))]
         except IndexUnreadable as error:
-            self.held_up = f"{error}; it is tried again ten times a second"
+            self.blocked_reason = f"{error}; it is tried again ten times a second"
             returned = self.leases.finished(number, worker, now)
             if returned is not None:
                 self.sessions.put_back(returned)

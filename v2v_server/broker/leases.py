@@ -75,7 +75,7 @@ class _Grant:
 
 
 @dataclass(frozen=True, slots=True)
-class Withheld:
+class Stall:
     """Time in which a worker could not work, and not for anything that it is at.
 
     Attributes:
@@ -187,7 +187,7 @@ class LeaseBook:
             other.since, other.stopped_seconds, other.queued_seconds = now, 0.0, 0.0
             other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
 
-    def put_off(self, worker: bytes, withheld: Withheld) -> None:
+    def extend_deadlines(self, worker: bytes, stalled: Stall) -> None:
         """The worker was kept from working for so long, which counts as no time.
 
         One that stays stopped is overdue all the same, after twice its time: somebody waits for its samples. One that
@@ -196,10 +196,10 @@ class LeaseBook:
         """
         for number in self._held.get(worker, ()):
             lease = self._leases[number]
-            lease.stopped_seconds = min(lease.stopped_seconds + withheld.stopped_seconds, lease.limit_seconds)
-            lease.queued_seconds += withheld.queued_seconds
+            lease.stopped_seconds = min(lease.stopped_seconds + stalled.stopped_seconds, lease.limit_seconds)
+            lease.queued_seconds += stalled.queued_seconds
             if lease.begun_at is not None:
-                lease.begun_at += withheld.stopped_seconds
+                lease.begun_at += stalled.stopped_seconds
 
     def limit_seconds(self, worker: bytes) -> float:
         """How long the worker may be silent over what it holds."""

@@ -35,7 +35,7 @@ _LONGEST_LOCK_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class QuarantineEntry:
     """One line of the quarantine.
 
     Attributes:
@@ -63,9 +63,9 @@ class Verdict:
         return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}{only}"
 
 
-def clearing(time: str) -> Verdict:
+def clearing(time: str) -> QuarantineEntry:
     """The line that makes the next snapshot an empty one; the old ones can still be asked for."""
-    return Verdict(0, "", "", 0, "cleared", time)
+    return QuarantineEntry(0, "", "", 0, "cleared", time)
 
 
 class Quarantine:
@@ -78,29 +78,29 @@ class Quarantine:
         CorpusError: their numbers are not 1, 2, 3 ...
     """
 
-    def __init__(self, verdicts: Iterable[Verdict] = ()) -> None:
-        self._verdicts: list[Verdict] = []
-        self._of_file: dict[tuple[str, str], list[Verdict]] = {}
+    def __init__(self, entries: Iterable[QuarantineEntry] = ()) -> None:
+        self._entries: list[QuarantineEntry] = []
+        self._of_file: dict[tuple[str, str], list[QuarantineEntry]] = {}
         self._clearings: list[int] = []
-        self.extend(verdicts)
+        self.extend(entries)
 
     @property
     def latest(self) -> int:
         """Number of the newest snapshot."""
-        return len(self._verdicts)
+        return len(self._entries)
 
     @property
-    def lines(self) -> tuple[Verdict, ...]:
+    def lines(self) -> tuple[QuarantineEntry, ...]:
         """Every verdict and clearing there ever was, oldest first."""
-        return tuple(self._verdicts)
+        return tuple(self._entries)
 
-    def verdicts(self, snapshot: int) -> list[Verdict]:
+    def entries(self, snapshot: int) -> list[QuarantineEntry]:
         """What snapshot number ``snapshot`` holds, oldest first.
 
         Raises:
             CorpusError: there is no such snapshot.
         """
-        return self._verdicts[self._cleared(snapshot) : snapshot]
+        return self._entries[self._cleared(snapshot) : snapshot]
 
     def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int, spec: str = "") -> str | None:
         """Why a sequence is refused under a snapshot; None when it is not.
@@ -119,25 +119,25 @@ class Quarantine:
         against = [v for v in of_file if cleared < v.snapshot <= snapshot]
         if len(against) >= VERDICTS_PER_VIDEO:
             return f"video in quarantine snapshot {snapshot} ({len(against)} verdicts): {against[-1].reason}"
-        for verdict in against:
-            if verdict.frame == frame:
-                return f"sequence in quarantine snapshot {snapshot}: {verdict.reason}"
+        for entry in against:
+            if entry.frame == frame:
+                return f"sequence in quarantine snapshot {snapshot}: {entry.reason}"
         return None
 
-    def extend(self, verdicts: Iterable[Verdict]) -> None:
+    def extend(self, entries: Iterable[QuarantineEntry]) -> None:
         """Takes up what was written down since.
 
         Raises:
             CorpusError: their numbers do not go on where ours end.
         """
-        for verdict in verdicts:
-            if verdict.snapshot != self.latest + 1:
-                raise CorpusError(f"quarantine: line {self.latest + 1} has snapshot number {verdict.snapshot}")
-            self._verdicts.append(verdict)
-            if verdict.path:
-                self._of_file.setdefault((verdict.path, verdict.fingerprint), []).append(verdict)
+        for entry in entries:
+            if entry.snapshot != self.latest + 1:
+                raise CorpusError(f"quarantine: line {self.latest + 1} has snapshot number {entry.snapshot}")
+            self._entries.append(entry)
+            if entry.path:
+                self._of_file.setdefault((entry.path, entry.fingerprint), []).append(entry)
             else:
-                self._clearings.append(verdict.snapshot)
+                self._clearings.append(entry.snapshot)
 
     def _cleared(self, snapshot: int) -> int:
         """Number of the last empty snapshot up to this one."""
@@ -168,7 +168,7 @@ def read_quarantine(file: Path) -> Quarantine:
         raise CorpusError(f"quarantine file {file} cannot be read: {error.strerror}; give read access") from error
 
 
-def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdict]:
+def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[QuarantineEntry]:
     """Gives a verdict the next number and has it on disk before anybody is served under the new snapshot.
 
     Args:
@@ -194,7 +194,7 @@ def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdi
                 f"quarantine file {file} is not the one that was read: it has {len(lines)} lines, and not the "
                 f"{known.latest} known here at its beginning; start again whatever uses it"
             )
-        numbered = replace(verdict, snapshot=len(lines) + 1)
+        numbered = replace(entry, snapshot=len(lines) + 1)
         line = json.dumps(asdict(numbered)).encode() + b"\n"
         kept = whole.rfind(b"\n") + 1
         out.truncate(kept)
@@ -237,7 +237,7 @@ def _parse(file: Path, whole: bytes) -> Quarantine:
     quarantine = Quarantine()
     for number, line in enumerate(whole.split(b"\n")[:-1], 1):
         try:
-            quarantine.extend([_verdict(parse_json(line))])
+            quarantine.extend([_entry(parse_json(line))])
         except (ValueError, TypeError, CorpusError) as error:
             raise CorpusError(
                 f"quarantine file {file}, line {number} is damaged ({error}); mend or delete it"
@@ -245,10 +245,10 @@ def _parse(file: Path, whole: bytes) -> Quarantine:
     return quarantine
 
 
-def _verdict(fields: dict[str, object]) -> Verdict:
-    verdict = Verdict(**fields)  # type: ignore[arg-type]
-    for name, value in asdict(verdict).items():
+def _entry(fields: dict[str, object]) -> QuarantineEntry:
+    entry = QuarantineEntry(**fields)  # type: ignore[arg-type]
+    for name, value in asdict(entry).items():
         expected = int if name in ("snapshot", "frame") else str
         if type(value) is not expected:
             raise TypeError(f"{name} = {value!r}: expected {expected.__name__}")
-    return verdict
+    return entry

@@ -98,7 +98,7 @@ class Session:
         self.liveness.heard(now)
         self.left_at = None
 
-    def waits(self, seconds: float, now: float) -> float:
+    def add_wait(self, seconds: float, now: float) -> float:
         """Its consumer says how long it has waited in all; returns how much more than before that is, within reason."""
         more = min(seconds, now - self.since) - self.waited_seconds
         self.waited_seconds += max(0.0, more)

@@ -109,7 +109,7 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     return float(math.floor(seconds * spec.samples_per_decode))
 
 
-def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
+def check_result(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
     """The header of a sample that its consumer will be able to read.
 
     Args:

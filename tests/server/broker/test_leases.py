@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 
-from v2v_server.broker.leases import LeaseBook, Request, Withheld
+from v2v_server.broker.leases import LeaseBook, Request, Stall
 
 DEADLINE = 60.0
 A, B = b"worker a", b"worker b"
@@ -67,7 +67,7 @@ def test_time_stopped_is_not_time_worked() -> None:
     book = LeaseBook(DEADLINE)
     book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
     book.grant(numbered(1), B, 0.0)
-    book.put_off(A, Withheld(stopped_seconds=DEADLINE / 2))
+    book.extend_deadlines(A, Stall(stopped_seconds=DEADLINE / 2))
     assert overdue_workers(book, 1.5 * DEADLINE) == [B]
     assert overdue_workers(book, 1.5 * DEADLINE + 0.5) == [A, B]
 
@@ -86,13 +86,13 @@ def where_others_are_quick() -> LeaseBook:
 def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_and_slow_before() -> None:
     book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
-        book.put_off(A, Withheld(queued_seconds=0.75))
+        book.extend_deadlines(A, Stall(queued_seconds=0.75))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 4 * DEADLINE)
         assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
     book = LeaseBook(DEADLINE)
     first, second = (book.grant(numbered(index), A, 0.0) for index in range(2))
     book.begun(first, A, 0.0)
-    book.put_off(A, Withheld(queued_seconds=100.0))
+    book.extend_deadlines(A, Stall(queued_seconds=100.0))
     book.begun(second, A, 50.0)  # what it waited over the first is no time of the second
     assert overdue_workers(book, 50.5 + DEADLINE) == [A]
 
@@ -100,7 +100,7 @@ def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_an
 def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_before() -> None:
     book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
-        book.put_off(A, Withheld(stopped_seconds=1.0))
+        book.extend_deadlines(A, Stall(stopped_seconds=1.0))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 2 * DEADLINE)
         assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
 
