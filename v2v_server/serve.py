@@ -122,7 +122,7 @@ def serve(config: ServeConfig) -> None:
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
     for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
         log.say(line)
-    catalogue.wait_no_more()
+    catalogue.fail_fast()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
     quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
@@ -348,7 +348,7 @@ class Server:
         try:
             self._catalogue.check(missing.video, missing.fingerprint)
         except VideoChanged:
-            self._catalogue.doubt(missing.video)
+            self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False

@@ -22,7 +22,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
-from v2v_server.cloud.copies import Copies, lent
+from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.variants import Variant, variants
@@ -119,7 +119,7 @@ def decode_for(
         index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
-        with lent(root, lease.video, lease.fingerprint) as path:
+        with open_local(root, lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
