@@ -31,11 +31,11 @@ from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
 from v2v_protocol.settings import (
     Setting,
     check_settings,
+    format_value,
     nearest,
     number,
     require_known,
     settings_of,
-    shown,
     span,
     switch,
     whole,
@@ -299,5 +299,5 @@ def preset(name: object) -> Recipe:
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)
-        raise RecipeError(f"unknown recipe preset {shown(name)}{near}; known: {known}")
+        raise RecipeError(f"unknown recipe preset {format_value(name)}{near}; known: {known}")
     return PRESETS[name]

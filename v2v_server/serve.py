@@ -41,8 +41,8 @@ from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
-from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
+from v2v_server.console.shutdown_summary import format_shutdown_summary
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
@@ -271,7 +271,7 @@ class Server:
         self._status.close()
         if self._announced:
             state = self._watch.state(self._clock())
-            for line in farewell(state):
+            for line in format_shutdown_summary(state):
                 self._log.say(line)
             if self._log.is_json:
                 self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)

@@ -182,7 +182,7 @@ class Dispatcher:
         if session is not None and session.user != user:
             session = None  # another key cannot act for it
         if session is not None:
-            session.heard(now)
+            session.mark_heard(now)
         match message:
             case Hello():
                 return [self._hello(identity, message, now, user)]
@@ -293,11 +293,11 @@ class Dispatcher:
         if isinstance(message, Hello):
             text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
-        if not self.registry.heard(identity, now):
+        if not self.registry.mark_heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
             case Begun(lease):
-                self.leases.begun(lease, identity, now)
+                self.leases.mark_begun(lease, identity, now)
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
@@ -417,7 +417,7 @@ class Dispatcher:
                 actions.append(ToConsumer(request.session, payload))
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
-        self.leases.begun(result.begins, identity, now)
+        self.leases.mark_begun(result.begins, identity, now)
         return actions + self._assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
@@ -441,7 +441,7 @@ class Dispatcher:
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""
-        if not self.sessions.answered(request, bounded_seconds(header.cpu_seconds)):
+        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
         self.counters.samples += 1

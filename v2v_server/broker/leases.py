@@ -174,7 +174,7 @@ class LeaseBook:
         self._changed.add(worker)
         return number
 
-    def begun(self, number: int, worker: bytes, now: float) -> None:
+    def mark_begun(self, number: int, worker: bytes, now: float) -> None:
         """The worker started on it. The clock of those queued behind it starts again: they wait through no fault.
 
         A lease begins once: said again it would put off the deadline for ever.

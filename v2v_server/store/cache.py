@@ -32,7 +32,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.used import PARTIAL, counted, locked_use, used_bytes
+from v2v_server.store.used import PARTIAL, count_bytes, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
@@ -278,7 +278,7 @@ def make_cache(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(BlockingIOError), locked_use(folder) as used:
-            used.bytes = counted(folder)
+            used.bytes = count_bytes(folder)
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
 
