@@ -195,7 +195,7 @@ class Recipe:
 
     @property
     def smallest_and_largest_threshold(self) -> tuple[float, float]:
-        """Ends of what the recipe itself can draw for either polarity, log units."""
+        """End of what the recipe itself can draw for either polarity, log units."""
         (low, high), (ratio_low, ratio_high) = self.threshold, self.threshold_ratio
         return low * min(1.0, ratio_low), high * max(1.0, ratio_high)
 
@@ -266,7 +266,7 @@ def effect_settings() -> dict[str, Setting]:
 
 
 def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """Ends of what any pixel's threshold can be, for nominal ones between two values."""
+    """End of what any pixel's threshold can be, for nominal ones between two values."""
     spread = LARGEST_NORMAL * mismatch_sigma
     return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
 

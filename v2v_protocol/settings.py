@@ -207,7 +207,7 @@ def settings_of(cls: Any) -> Mapping[str, Setting]:
 
 
 def check_settings(item: Any, name: Callable[[str], str], error: type[UsageError] = UsageError) -> None:
-    """Checks and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
+    """Check and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
 
     Args:
         name: what messages call a field.

@@ -380,7 +380,7 @@ class Dispatcher:
         return actions + self._assign(now)
 
     def stop_workers(self) -> list[ToWorker]:
-        """Tells every worker to finish and leave."""
+        """Tell every worker to finish and leave."""
         return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
@@ -468,7 +468,7 @@ class Dispatcher:
     # --- requests ----------------------------------------------------------------------------------------------------
 
     def _assign(self, now: float) -> list[Action]:
-        """Gives waiting requests to workers, until there is no request or no room."""
+        """Give waiting requests to workers, until there is no request or no room."""
         actions: list[Action] = []
         while not self.blocked_reason:
             if self._lone:
@@ -487,7 +487,7 @@ class Dispatcher:
         return actions
 
     def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
-        """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
+        """Give a worker the requests of one clip, except those whose candidate is in quarantine."""
         session = self.sessions.get(requests[0].session)
         if session is None:
             return []

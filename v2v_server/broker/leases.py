@@ -152,7 +152,7 @@ class LeaseBook:
         return None if lease is None or lease.worker != worker else lease.request
 
     def grant(self, request: Request, worker: bytes, now: float, work_seconds: float = 0.0) -> int:
-        """Gives the request to a worker.
+        """Give the request to a worker.
 
         Args:
             request, worker: who makes what.

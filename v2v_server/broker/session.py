@@ -142,7 +142,7 @@ class Sessions:
         return [each.identity for each in self if owner and each.owner == owner]
 
     def forget(self, identity: bytes) -> None:
-        """Drops a session, if there is one; what it owes is remembered."""
+        """Drop a session, if there is one; what it owes is remembered."""
         session = self._sessions.pop(identity, None)
         if session is not None:
             self._turns.remove(identity)

@@ -203,7 +203,7 @@ class Cache:
         index: FrameIndex,
         missing: Sequence[_Piece],
     ) -> None:
-        """Decodes the missing pieces in one pass, and keeps each.
+        """Decode the missing pieces in one pass, and keeps each.
 
         Raises:
             VideoError: they do not decode.
@@ -227,7 +227,7 @@ class Cache:
                 self._keep(piece.path, head, chain((picture,), more))
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
-        """Writes a piece, and gives it its name if there is room."""
+        """Write a piece, and gives it its name if there is room."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
@@ -247,7 +247,7 @@ class Cache:
                 partial.unlink()
 
     def _remove(self, path: Path, why: str) -> None:
-        """Removes a piece that cannot be read, so that it is made anew."""
+        """Remove a piece that cannot be read, so that it is made anew."""
         self.trouble = f"a damaged piece was removed: {why}"
         with contextlib.suppress(OSError), locked_use(self.folder) as used:
             size = path.stat().st_size
@@ -269,7 +269,7 @@ class _Piece:
 
 
 def make_cache(folder: Path) -> None:
-    """Makes the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
+    """Make the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
     it did not keep.
 
     Raises:
@@ -284,7 +284,7 @@ def make_cache(folder: Path) -> None:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what workers that are gone have left half-written: those that live hold locks."""
+    """Remove what workers that are gone have left half-written: those that live hold locks."""
     for path in (folder / PARTIAL).iterdir():
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -27,7 +27,7 @@ class Used:
     bytes: int
 
     def add(self, more: int) -> None:
-        """Counts so many more."""
+        """Count so many more."""
         self.bytes = max(0, self.bytes + more)
 
 
