@@ -42,6 +42,7 @@ class Scripted:
         self.after_record = after_record
         self.told: list[tuple[Any, ...]] = []
         self.times: list[float] = []
+        self.blocked_reason = ""
         self.counters = Counters()
         self._there = peers().dispatcher
 
