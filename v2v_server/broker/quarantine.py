@@ -192,8 +192,8 @@ def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[Q
         lines = _parse(file, whole).lines
         if lines[: known.latest] != known.lines:
             raise CorpusError(
-                f"quarantine file {file} is not the one that was read: it has {len(lines)} lines, and not the "
-                f"{known.latest} known here at its beginning; start again whatever uses it"
+                f"quarantine file {file} was replaced: it has {len(lines)} lines, which do not start with the "
+                f"{known.latest} lines read before; restart the programs that use it"
             )
         numbered = replace(entry, snapshot=len(lines) + 1)
         line = json.dumps(asdict(numbered)).encode() + b"\n"
