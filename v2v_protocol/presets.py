@@ -1,6 +1,6 @@
-"""Named recipes: each as what it changes of the fields' own defaults, which are those of the paper.
+"""Named recipes, each stated as its changes to the fields' defaults, which are those of the paper.
 
-:data:`v2v_protocol.recipe.PRESETS` has them as recipes.
+:data:`v2v_protocol.recipe.PRESETS` holds them as recipes.
 """
 
 from __future__ import annotations

@@ -151,19 +151,19 @@ class Recipe:
 
     @property
     def has_effects(self) -> bool:
-        """True where a draw may switch on an effect beyond the paper's model."""
+        """Whether a draw may switch on an effect beyond the paper's model."""
         return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
 
     @property
     def timed_effects(self) -> bool:
-        """True where a draw may switch on an effect that is stated in Hz or seconds."""
+        """Whether a draw may switch on an effect that is stated in Hz or seconds."""
         return any(
             getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )
 
     @property
     def needs_seconds(self) -> bool:
-        """True where a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
+        """Whether a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
         return self.noise_unit == "second" or self.timed_effects
 
     @property
@@ -195,22 +195,24 @@ class Recipe:
 
     @property
     def smallest_and_largest_threshold(self) -> tuple[float, float]:
-        """End of what the recipe itself can draw for either polarity, log units."""
+        """Limits of the thresholds that the recipe itself can draw for either polarity, log units."""
         (low, high), (ratio_low, ratio_high) = self.threshold, self.threshold_ratio
         return low * min(1.0, ratio_low), high * max(1.0, ratio_high)
 
     @property
     def most_events(self) -> float:
-        """:func:`most_events` of the worst draw; what is stated per second, at one frame a second."""
+        """Upper bound from :func:`most_events` for the worst draw; quantities per second are taken at one frame per
+        second.
+        """
         return self.worst_events(1.0)
 
     def worst_events(self, step_seconds: float, thresholds: tuple[float, float] | None = None) -> float:
-        """:func:`most_events` of the worst draw.
+        """Return the upper bound of :func:`most_events` for the worst draw.
 
         Args:
-            step_seconds: from one frame to the next, all along the clip.
-            thresholds: those that are stated for the video, which hold where ``threshold_source`` is "video"; None
-                where none are.
+            step_seconds: time from one frame to the next, constant over the clip.
+            thresholds: thresholds stated for the video, used if ``threshold_source`` is "video"; None if there are
+                none.
         """
         low, high = self.smallest_and_largest_threshold
         if thresholds is not None and self.threshold_source == "video":
@@ -227,7 +229,7 @@ class Recipe:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values (ranges as lists), in a stable order."""
+        """Return all fields as plain values (ranges as lists), in a stable order."""
         values = {
             field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
             for field in dataclasses.fields(self)
@@ -238,7 +240,7 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """A recipe from plain values.
+        """Build a recipe from plain values.
 
         Args:
             values: fields by name; missing ones take the value of ``values["preset"]``, by default ``paper``.
@@ -251,7 +253,7 @@ class Recipe:
         return base.replace(**{str(key): value for key, value in rest.items()})  # from YAML, say: {1: 2}
 
     def replace(self, /, **changes: Any) -> Recipe:
-        """This recipe with some fields changed.
+        """Return this recipe with some fields changed.
 
         Raises:
             RecipeError: an unknown key or a bad value.
@@ -261,18 +263,19 @@ class Recipe:
 
 
 def effect_settings() -> dict[str, Setting]:
-    """The fields of a recipe that switch on an effect beyond the paper's model."""
+    """Return the fields of a recipe that switch on an effect beyond the paper's model."""
     return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
 
 
 def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """End of what any pixel's threshold can be, for nominal ones between two values."""
+    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
     spread = LARGEST_NORMAL * mismatch_sigma
     return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
 
 
 def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
-    """An upper bound of the events that one pixel can fire in a clip, and the measure of the arithmetic it needs.
+    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
+    needed.
 
     ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
     the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
@@ -292,10 +295,10 @@ PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_
 
 
 def preset(name: object) -> Recipe:
-    """The preset of that name.
+    """Return the preset with this name.
 
     Raises:
-        RecipeError: no such preset; the message lists them.
+        RecipeError: there is no such preset; the message lists them.
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)

@@ -1,7 +1,7 @@
-"""The one reader of YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
+"""Read YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
 
-An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values, so the
-bound is on the values after aliases are replaced, and it is checked before any of them is built.
+An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values. So the
+bound applies to the values after aliases are replaced, and it is checked before any of them is built.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ def format_yaml(value: Any) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuse what expands beyond the limits, and a key that is there twice (SafeLoader takes the last silently)."""
+    """Loader that refuses texts that expand beyond the limits, and duplicate keys (SafeLoader silently takes the
+    last).
+    """
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -115,7 +117,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
-    """8:32 is text, not 512 as a number of base 60 in YAML 1.1."""
+    """Construct a whole number, or text. 8:32 is text here, not 512 as a number of base 60 in YAML 1.1."""
     return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
 
 

@@ -1,4 +1,4 @@
-"""The stream specification: everything a consumer may ask for that changes the bytes of its samples."""
+"""The stream specification: everything a consumer may request that changes the bytes of its samples."""
 
 from __future__ import annotations
 
@@ -30,17 +30,16 @@ MOST_SAMPLES_PER_DECODE = 32
 
 @dataclass(frozen=True, slots=True)
 class StreamSpec:
-    """What a stream is made of, apart from the videos and the seed.
+    """Definition of a stream, apart from the videos and the seed.
 
-    Two streams of equal digest over equal catalogues, seeds and numerics versions are equal byte for byte. What does
-    not change a draw (asked arrays, batch size, compression) is deliberately not here.
+    Two streams of equal digest over equal catalogues, seeds and numerics versions are equal byte for byte. Settings
+    that do not change a draw (requested arrays, batch size, compression) are deliberately not here.
 
     Attributes:
         recipe: the virtual cameras and views to draw from.
 
-    The K samples of one decode (``samples_per_decode``) are no more alike in their cameras than any others, but they
-    show the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart
-    (``v2v_server.schedule.epoch``).
+    The K samples of one decode (``samples_per_decode``) have independent cameras like any other samples, but they show
+    the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart (``v2v_server.schedule.epoch``).
 
     Raises:
         UsageError: a value outside its choices or limits.
@@ -104,7 +103,7 @@ class StreamSpec:
             )
 
     def spaced(self, stride: int) -> StreamSpec:
-        """This spec with its ``sibling_spacing`` settled.
+        """Return this spec with its ``sibling_spacing`` set.
 
         Args:
             stride: samples from the beginning of one batch of the consumer to that of its next.
@@ -114,19 +113,19 @@ class StreamSpec:
         return dataclasses.replace(self, sibling_spacing=stride)
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values."""
+        """Return all fields as plain values."""
         plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return plain | {"recipe": self.recipe.to_dict()}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], default: StreamSpec | None = None) -> StreamSpec:
-        """A spec from what somebody asked for.
+        """Build a spec from requested values.
 
         Args:
             values: fields by name; ``recipe`` is a preset's name or a mapping of recipe fields (see
                 :meth:`Recipe.from_dict`); a missing or None field takes the value of ``default``. ``preset`` names one
                 of :data:`SPEED_PRESETS`, which the other fields may change.
-            default: the server's own spec; the paper's when None.
+            default: the server's own spec; the paper's if None.
 
         Raises:
             RecipeError, UsageError: an unknown key or a bad value.
@@ -143,7 +142,7 @@ class StreamSpec:
         return dataclasses.replace(base, **changes)
 
     def canonical(self) -> bytes:
-        """The one encoding of this spec that its digest is taken of: JSON, keys sorted, no spaces."""
+        """Return the canonical encoding that the digest is computed from: JSON, keys sorted, no spaces."""
         return _canonical(self)
 
     @property
@@ -153,8 +152,9 @@ class StreamSpec:
 
 
 class SpecOptions(TypedDict, total=False):
-    """What a consumer may ask for besides its recipe, as keyword arguments, for editors and type checkers; None takes
-    the server's value. A test holds it to the fields of :class:`StreamSpec`, which say what each is."""
+    """What a consumer may request besides its recipe, as keyword arguments, for editors and type checkers; None takes
+    the server's value. A test keeps it equal to the fields of :class:`StreamSpec`, which explain each one.
+    """
 
     preset: SpeedPreset | None
     voxel_dtype: VoxelDtype | None
@@ -194,10 +194,10 @@ SPEED_PRESETS: dict[str, dict[str, Any]] = {
 
 
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
-    """``base`` with the settings of a speed preset.
+    """Return ``base`` with the settings of a speed preset.
 
     Raises:
-        UsageError: no such preset.
+        UsageError: there is no such preset.
     """
     if not isinstance(name, str) or name not in SPEED_PRESETS:
         near, known = nearest(name, SPEED_PRESETS), ", ".join(SPEED_PRESETS)
