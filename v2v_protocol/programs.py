@@ -13,7 +13,7 @@ from pathlib import Path
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "bench"})
 
 Program = Callable[[], int | None]
-"""Returns the exit status; None is success."""
+"""A function that returns the exit status; None is success."""
 
 
 def _program(name: str, module: str, function: str, extra: str) -> Program:
@@ -51,7 +51,7 @@ def environment() -> dict[str, str]:
     """
     try:
         is_home = Path(__file__).parents[1].samefile(os.curdir)
-    except OSError:  # the folder is gone
+    except OSError:  # the current folder was deleted
         is_home = False
     return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 

@@ -57,7 +57,7 @@ SMALLEST_THRESHOLD_SHARE = 0.25
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
 LARGEST_EVENTS = 2.0**49
-"""Most events a pixel may fire in a clip: beyond, float64 does not resolve a threshold any more."""
+"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +70,26 @@ class Recipe:
 
     voxels_per_clip: int = whole(40, 1, 1_000_000, "T, voxel grids of a clip", group="Clip")
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
-    frames_per_bin: int = whole(1, 1, 1024, "steps between video frames that fall into one bin")
-    lead_frames: int = whole(0, 0, 1, "1 puts the frame before the first target frame in front (flow networks)")
-    lead_voxels: int = whole(0, 0, 1, "1 puts one more voxel grid in front (ERAFT)")
-    frame_stride: int = whole(1, 1, 1000, "n uses every n-th frame, as if the video's rate were 1/n of what it is")
+    frames_per_bin: int = whole(1, 1, 1024, "steps between video frames in one bin")
+    lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
+    lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
+    frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
     resize_scale: Range = span(
         (1.0, 1.0), 0.01, LARGEST_SCALE,
-        "scale of the picture before the crop; raised, as far as the upper end allows, where the crop would not fit",
+        "scale of the picture before the crop; raised, up to the upper end, if the crop would not fit",
     )  # fmt: skip
-    flip_probability: float = number(0.5, 0.0, 1.0, "chance of a horizontal flip")
+    flip_probability: float = number(0.5, 0.0, 1.0, "probability of a horizontal flip")
     pause_probability: float = number(
-        0.0102, 0.0, 1.0, "chance, per frame, that a running camera stops (the frame repeats)"
+        0.0102, 0.0, 1.0, "probability per frame that a running camera stops (the frame repeats)"
     )
-    pause_stay_probability: float = number(0.9791, 0.0, 1.0, "chance, per frame, that a stopped camera stays so")
+    pause_stay_probability: float = number(
+        0.9791, 0.0, 1.0, "probability per frame that a stopped camera stays stopped"
+    )
     contrast_probability: float = number(
-        0.0, 0.0, 1.0, "chance that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up"
+        0.0, 0.0, 1.0, "probability that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up"
     )
     contrast_scale: Range = span((1.0, 3.0), 0.0, 100.0, "range of s in contrast_probability")
 
@@ -100,12 +102,12 @@ class Recipe:
         (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
     )
     threshold_ratio: Range = span(
-        (1.0, 1.5), 1e-6, 1e6, "the other threshold, as a multiple; a coin says which of the two is the positive one"
+        (1.0, 1.5), 1e-6, 1e6, "the larger threshold as a multiple of the smaller; which of them is positive is random"
     )
     threshold_source: str = word(
         "sample", ("sample", "video"),
-        "sample draws thresholds afresh for every sample; video once per video for ever (those of the list file, if it "
-        "states any)",
+        "sample: new thresholds for every sample; video: the same for all samples of a video (those of the list file, "
+        "if it states any)",
     )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
@@ -124,13 +126,16 @@ class Recipe:
         group=EFFECTS,
     )  # fmt: skip
     shot_noise_hz: Range = span(
-        (0.0, 0.0), 0.0, 1e4, "noise events of a black pixel, both polarities together; a white one has a quarter",
+        (0.0, 0.0), 0.0, 1e4,
+        "rate of noise events of a black pixel, both polarities together; a white pixel has a quarter",
         unit="Hz",
     )  # fmt: skip
-    leak_hz: Range = span((0.0, 0.0), 0.0, 1e4, "positive events that every pixel fires by itself", unit="Hz")
-    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "how long a pixel is blind after an event", unit="s")
+    leak_hz: Range = span(
+        (0.0, 0.0), 0.0, 1e4, "rate of positive events that every pixel fires without a change of brightness", unit="Hz"
+    )
+    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "time after an event in which a pixel fires none", unit="s")
     photoreceptor_hz: Range = span(
-        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass", unit="Hz", off=True
+        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass filter", unit="Hz", off=True
     )
     dead_pixel_share: Range = span((0.0, 0.0), 0.0, 1.0, "share of the crop's pixels that never fire")
 
@@ -234,7 +239,7 @@ class Recipe:
             field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
             for field in dataclasses.fields(self)
         }
-        # It was a number before it could be a range, and the digest of a stream shall not change.
+        # A fixed value is written as a number: older digests depend on this form.
         low, high = self.log_eps
         return values | {"log_eps": low} if low == high else values
 
@@ -250,7 +255,7 @@ class Recipe:
         """
         rest = dict(values)
         base = preset(rest.pop("preset", DEFAULT_PRESET))
-        return base.replace(**{str(key): value for key, value in rest.items()})  # from YAML, say: {1: 2}
+        return base.replace(**{str(key): value for key, value in rest.items()})  # YAML keys may be numbers: {1: 2}
 
     def replace(self, /, **changes: Any) -> Recipe:
         """Return this recipe with some fields changed.

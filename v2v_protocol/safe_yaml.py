@@ -14,7 +14,7 @@ import yaml
 
 LARGEST_BYTES = 1 << 20
 MOST_VALUES = 100_000
-"""Scalars, lists and mappings of a text, each alias counted as all that it stands for."""
+"""Scalars, lists and mappings of a text; an alias counts as all the values that it repeats."""
 MOST_LEVELS = 32
 
 
@@ -32,7 +32,7 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise YamlError(" ".join(str(error).split())[:200]) from error
-    # Of values that do not fit their tag: a date that does not exist, `!!int ""`, `!!bool 3`, `!!timestamp x`.
+    # Raised for values that do not fit their tag: an invalid date, `!!int ""`, `!!bool 3`, `!!timestamp x`.
     except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:
         raise YamlError(f"a value does not fit its type: {' '.join(str(error).split())[:160]}") from error
 
@@ -84,7 +84,7 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         if is_alias:
             if id(node) not in self._extents:
-                raise yaml.composer.ComposerError(None, None, "an alias refers to what it is part of", mark)
+                raise yaml.composer.ComposerError(None, None, "an alias refers to a node that contains it", mark)
             values, levels = self._extents[id(node)]
         else:
             values, levels = self._values - before + 1, self._deepest - self._level + 1
@@ -97,7 +97,7 @@ class _Loader(yaml.SafeLoader):
 
     def _check_limits(self, mark: yaml.Mark | None) -> None:
         for count, limit, unit in (
-            (self._values, MOST_VALUES, "values (aliases count as what they stand for)"),
+            (self._values, MOST_VALUES, "values (aliases count as the values that they repeat)"),
             (self._deepest, MOST_LEVELS, "levels"),
         ):
             if count > limit:
@@ -111,7 +111,7 @@ class _Loader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 continue  # no key of ours
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} appears twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 

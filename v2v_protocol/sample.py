@@ -29,7 +29,7 @@ ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
 }  # fmt: skip
-"""Arrays a consumer may ask for: dtype and shape of one sample's (no batch dimension), by the recipe and the spec's
+"""Arrays a consumer may request: dtype and shape for one sample (no batch dimension), by the recipe and the spec's
 ``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
 1 where forward and backward flow agree."""
 DEFAULT_ARRAYS = ("voxels", "frames")
@@ -280,7 +280,7 @@ class Sample:
             UsageError: the sample has no voxels, or the duration is out of range.
         """
         if "voxels" not in self.arrays:
-            raise UsageError("events are made of voxels: ask for that array")
+            raise UsageError("the sample has no voxels, which events are made from: request that array")
         return to_events(self.arrays["voxels"], bin_us)
 
     def _repr_html_(self) -> str:

@@ -140,7 +140,7 @@ class Setting:
         return (self.low <= number <= self.high and math.isfinite(number)) or (self.off and number == 0)
 
     def _hint(self, value: object) -> str:
-        # scene: off, say, of which the message would show nothing that was written.
+        # For instance scene: off; the message would not show what the user wrote.
         if self.kind in ("word", "text") and isinstance(value, bool):
             return " (YAML reads off, on, no and yes as truth values: put it in quotes)"
         return ""

@@ -52,40 +52,42 @@ class StreamSpec:
         "float32 is exact up to 2**24 events a bin",
         group="Stream",
     )  # fmt: skip
-    shuffle: bool = switch(True, "another order in every epoch; false is the catalogue's order")
-    max_sequences_per_video: int = whole(10, 1, 1_000_000, "most sequences that one video contributes to an epoch")
+    shuffle: bool = switch(True, "use another random order in every epoch; false keeps the catalogue's order")
+    max_sequences_per_video: int = whole(10, 1, 1_000_000, "largest number of sequences from one video in an epoch")
     on_bad_video: OnBadVideo = word(
         "substitute", OnBadVideo,
-        "what becomes of a sample whose video fails: substitute makes it from the next candidate and says so in the "
-        "provenance; raise makes the consumer raise SampleUnavailable",
+        "if the video of a sample fails: substitute makes the sample from the next candidate and notes it in the "
+        "provenance; raise raises SampleUnavailable in the consumer",
     )  # fmt: skip
     samples_per_decode: int = whole(
         1, 1, MOST_SAMPLES_PER_DECODE,
-        "K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its own",
+        "K, number of samples from each decoded clip, each with its own camera, crop, flip and pauses",
     )  # fmt: skip
     sibling_spacing: int = whole(
         0,
         0,
         2**40,
-        "how far apart in the epoch those K samples are; 0: a batch of the consumer, so that none holds two",
+        "distance of these K samples in the epoch; 0: one batch of the consumer, so no batch holds two",
     )
     flow_method: FlowMethod = word(
         "auto", FlowMethod,
-        "how flow is estimated where it is asked for; auto chooses for each step by how much moves",
+        "method that estimates flow, if flow is requested; auto chooses for each step by the amount of motion",
         group="Flow",
     )  # fmt: skip
     flow_direction: FlowDirection = word(
-        "forward", FlowDirection, "on the grid of a step's earlier frame (forward) or of its later one (backward)"
+        "forward", FlowDirection, "flow on the pixel grid of a step's earlier frame (forward) or later frame (backward)"
     )
-    flow_from: int = whole(0, 0, 1_000_000, "flow of the voxels before this one is not computed but zero")
+    flow_from: int = whole(
+        0, 0, 1_000_000, "index of the first voxel with computed flow; flow of earlier voxels is zero"
+    )
     flow_margin_px: int = whole(
-        64, -1, LARGEST_SIDE_PX, "flow is estimated on the crop and this much of the picture around it; -1: on all",
+        64, -1, LARGEST_SIDE_PX, "margin around the crop in which flow is also estimated; -1: the whole picture",
         unit="px",
     )  # fmt: skip
     scene: SceneChoice = word(
         "off", SceneChoice,
-        "auto decodes all videos once, leaves out sequences with a cut or with nothing to see, and spares flow where "
-        "nothing moves (if flow_method is auto)",
+        "auto decodes all videos once, leaves out sequences with a shot boundary or with nothing to see, and skips "
+        "flow where nothing moves (if flow_method is auto)",
         group="Scene",
     )  # fmt: skip
 
@@ -98,8 +100,8 @@ class StreamSpec:
             )
         if self.samples_per_decode == 1 and self.sibling_spacing:
             raise UsageError(
-                f"spec sibling_spacing = {self.sibling_spacing} says how far apart the samples of one decode are, and "
-                "samples_per_decode is 1: leave it 0, or ask for more samples_per_decode"
+                f"spec sibling_spacing = {self.sibling_spacing} applies only to samples_per_decode above 1, which is "
+                "1: set sibling_spacing = 0, or raise samples_per_decode"
             )
 
     def spaced(self, stride: int) -> StreamSpec:
@@ -174,7 +176,7 @@ SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))
 """What :meth:`StreamSpec.from_dict` takes."""
 
 
-# Asked for with every lease, and a spec never changes.
+# Cached: every lease uses it, and a spec never changes.
 @lru_cache(maxsize=64)
 def _canonical(spec: StreamSpec) -> bytes:
     return json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
@@ -190,7 +192,7 @@ SPEED_PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {"samples_per_decode": 2},
     "fast": {"samples_per_decode": 4},
 }
-"""What speed is bought with: the fields of the spec that each preset sets. `docs/accuracy.md` says why these."""
+"""Spec fields that each speed preset sets, trading accuracy for speed. `docs/accuracy.md` gives the reasons."""
 
 
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:

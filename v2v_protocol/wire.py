@@ -46,15 +46,15 @@ from v2v_protocol.messages import (
 LARGEST_HEADER_BYTES = 1 << 20
 """Frame 0. The largest in use is a Lease: a frame index of a few thousand frames is a few kilobytes."""
 LARGEST_REQUEST_BYTES = 1 << 16
-"""What a consumer says. The largest in use is a Want of all its credit, with the name of an arena for each index."""
+"""A consumer's message. The largest in use is a Want of all its credit, with the name of an arena for each index."""
 MOST_CONTAINERS = 4096
-"""Lists and maps of a header. They cost a hundred times their bytes; the most in use, in a Lease, are some dozens."""
+"""Lists and maps in a header. They cost a hundred times their bytes; a Lease, the largest in use, has some dozens."""
 LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
-"""CURVE adds 33 to a frame."""
+"""Bytes added to a frame by encryption; CURVE adds 33."""
 _MOST_ARRAYS = 8
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
@@ -241,7 +241,7 @@ def decode_sample(
             f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
         )
     if header.packed and unpack is None:
-        raise ProtocolError("sample: its arrays are compressed, which was not asked for")
+        raise ProtocolError("sample: its arrays are compressed, but compression was not requested")
     arrays: dict[str, npt.NDArray[Any]] = {}
     for (name, (dtype, shape)), raw in zip(layout_of(header).items(), payload, strict=True):
         size = math.prod(shape) * np.dtype(dtype).itemsize
@@ -305,7 +305,7 @@ def _unpacked(packed: Buffer, what: str) -> Any:
 
 
 # --- field checks -----------------------------------------------------------------------------------------------------
-# A server decodes two headers a sample: what a check would only need for an error is made up when there is one.
+# A server decodes two headers per sample, so texts for errors are built only when there is one.
 
 Check: TypeAlias = Callable[[Any], Any]
 

@@ -49,7 +49,7 @@ def test_plain_values_come_back(value: object) -> None:
         ("- &a0 [x]\n" + "".join(f"- &a{at} [*a{at - 1}]\n" for at in range(1, 40)), f"more than {MOST_LEVELS} levels"),
         ("&a [*a]", "part of"),
         ("a: &a {b: *a}", "part of"),
-        ("a: 1\na: 2", "'a' is there twice"),
+        ("a: 1\na: 2", "'a' appears twice"),
         ("a: *b", "undefined alias"),
         ('!!int ""', "does not fit"),
         ("!!bool 3", "does not fit"),

@@ -76,10 +76,10 @@ def test_a_package_that_is_missing_is_said_with_its_extra(monkeypatch: pytest.Mo
 
 
 def test_a_page_that_others_can_reach_is_typed_out() -> None:
-    with pytest.raises(UsageError, match="the page asks nobody for a key"):
+    with pytest.raises(UsageError, match="the page requires no key"):
         ServeConfig(videos="a", page=5580, page_host="0.0.0.0")
     # Keys are for consumers and workers; a browser has none.
-    with pytest.raises(UsageError, match="the page asks nobody for a key"):
+    with pytest.raises(UsageError, match="the page requires no key"):
         ServeConfig(videos="a", page=5580, page_host="0.0.0.0", keys="keys/")
     assert ServeConfig(videos="a", page=5580, page_host="0.0.0.0", insecure=True).page == 5580
     assert ServeConfig(videos="a", page_host="0.0.0.0").page == 0
