@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer.pictures import EVENTS, Video, contact_sheet, draw_events, draw_grey, headed, side_by_side, write_png
+from trainer.pictures import EVENTS, Video, add_header, contact_sheet, draw_events, draw_grey, side_by_side, write_png
 from trainer.weights import SHIPPED, load_network
 from v2v_client import V2VDataset
 
@@ -39,8 +39,8 @@ def reconstruct(clip: Path, picture: Path) -> None:
     target = sample["frames"][:, 0].astype(np.float32) / 255.0
     film = side_by_side([draw_events(sample["voxels"]), draw_grey(target), draw_grey(seen)])
     title = "Reconstructed from events by the shipped network"
-    write_png(picture, headed(contact_sheet(film, _ROWS), _PANELS, title, time_runs_down=True))
+    write_png(picture, add_header(contact_sheet(film, _ROWS), _PANELS, title, time_runs_down=True))
     with Video(picture.with_suffix(".mp4"), _FILM_HZ) as video:
         for image in film:
-            video.add(headed(image, _PANELS))
+            video.add(add_header(image, _PANELS))
     print(f"picture: {picture} (events, camera, what the shipped network made of the events; time runs down)")

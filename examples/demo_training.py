@@ -9,7 +9,7 @@ import torch
 
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
-from trainer.pictures import headed, write_png
+from trainer.pictures import add_header, write_png
 from trainer.run.checkpoint import LAST
 from trainer.tasks import Reconstruction
 from trainer.weights import load_into
@@ -61,6 +61,6 @@ def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
     shown = [film for batch in batches[:_COLUMNS] for film in task.judge(network, batch, _COLUMNS)[1]][:_COLUMNS]
     picks = np.linspace(_FIRST_SHOWN, len(shown[0]) - 1, _ROWS).round().astype(int)
     sheet = np.concatenate([np.concatenate(list(film[picks]), axis=0) for film in shown], axis=1)
-    write_png(picture, headed(sheet, task.panels * len(shown), "After a minute of training", time_runs_down=True))
+    write_png(picture, add_header(sheet, task.panels * len(shown), "After a minute of training", time_runs_down=True))
     print(f"picture: {picture} (events, target, reconstruction; time runs down)")
     return loss < constant

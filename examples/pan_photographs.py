@@ -38,7 +38,7 @@ def motion(random: np.random.Generator, speed: float) -> np.ndarray:
     return steps
 
 
-def reduced(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def downscale(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """A photograph (H, W, 3) uint8 at a random scale, the smallest of which fills the frame half as large again."""
     fill = 1.5 * max(WIDTH / photograph.shape[1], HEIGHT / photograph.shape[0])
     scale = min(fill * random.uniform(1, 2.5), 1.0)
@@ -48,7 +48,7 @@ def reduced(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
     """A patch (HEIGHT, WIDTH, 4) uint8: an ellipse of a photograph somewhere in the frame, transparent around it."""
-    picture = reduced(photographs[random.integers(len(photographs))], random)
+    picture = downscale(photographs[random.integers(len(photographs))], random)
     if picture.shape[0] < HEIGHT or picture.shape[1] < WIDTH:
         picture = cv2.resize(picture, (WIDTH, HEIGHT))
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -70,7 +70,7 @@ def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarra
 def clip(photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
     """Frames (FRAMES, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
     frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    background = reduced(photographs[random.integers(len(photographs))], random)
+    background = downscale(photographs[random.integers(len(photographs))], random)
     start = np.eye(3)
     start[:2, 2] = -random.integers(0, np.maximum(np.array(background.shape[1::-1]) - (WIDTH, HEIGHT), 1))
     for t, step in enumerate(motion(random, pace(random))):

@@ -26,7 +26,7 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
         for name in group:
             link = group.get(name, getlink=True)
             if isinstance(link, h5py.ExternalLink):
-                raise _names_another(path, f"{group.name}/{name}", f"links to {link.filename}")
+                raise _external_error(path, f"{group.name}/{name}", f"links to {link.filename}")
             if isinstance(link, h5py.SoftLink):  # of this file: what it leads to is checked in its own place
                 continue
             item = group[name]
@@ -37,10 +37,10 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
                     groups.append(item)
             elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
                 kind = "a virtual dataset" if item.is_virtual else "a dataset with external storage"
-                raise _names_another(path, f"{group.name}/{name}", f"is {kind}")
+                raise _external_error(path, f"{group.name}/{name}", f"is {kind}")
 
 
-def _names_another(path: Path, name: str, what: str) -> UsageError:
+def _external_error(path: Path, name: str, what: str) -> UsageError:
     return UsageError(
         f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make a file of its own with "
         "h5repack or h5copy -f ext"

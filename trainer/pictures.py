@@ -69,7 +69,7 @@ def contact_sheet(film: Image, steps: int = 5) -> Image:
     return np.concatenate(list(film[picks]), axis=0)
 
 
-def headed(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_down: bool = False) -> Image:
+def add_header(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_down: bool = False) -> Image:
     """A picture of equally wide columns, with the name of each above it; red and blue are said in red and blue.
 
     Args:

@@ -55,7 +55,7 @@ class WeightFile:
                 raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
         return names
 
-    def recognised(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:
+    def recognise(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:
         """Name and arguments of the network that the weights are of; None where nothing tells.
 
         Args:
@@ -91,7 +91,7 @@ class KeyReport:
         path: the file.
         used: names in the network of the tensors that fit.
         renamed: name in the network by name in the file, where they differ.
-        cut: tensors of which only a part was taken (E2VID+ also predicts flow; the image is channel 0).
+        sliced: tensors of which only a part was taken (E2VID+ also predicts flow; the image is channel 0).
         unused: tensors of the file that the network has no place for.
         missing: tensors of the network that the file does not give.
         misshaped: tensors of both, of different shapes.
@@ -100,7 +100,7 @@ class KeyReport:
     path: str
     used: tuple[str, ...]
     renamed: Mapping[str, str]
-    cut: tuple[str, ...]
+    sliced: tuple[str, ...]
     unused: tuple[str, ...]
     missing: tuple[str, ...]
     misshaped: tuple[str, ...]
@@ -115,7 +115,7 @@ class KeyReport:
         for word in ("used", "unused", "missing", "misshaped"):
             for name in getattr(self, word):
                 was = f"  (in the file {original[name]})" if name in original else ""
-                lines.append(f"  {word:9} {name}{was}{', channel 0 only' if name in self.cut else ''}")
+                lines.append(f"  {word:9} {name}{was}{', channel 0 only' if name in self.sliced else ''}")
         return "\n".join(lines)
 
 
@@ -163,7 +163,7 @@ def load_into(model: nn.Module, path: str | Path, *, ema: bool = False) -> KeyRe
         path=str(path),
         used=tuple(name for name in state if name in wanted and state[name].shape == wanted[name].shape),
         renamed={old: new for old, new in names.items() if old != new},
-        cut=tuple(new for old, new in names.items() if state[new].shape != file.state[old].shape),
+        sliced=tuple(new for old, new in names.items() if state[new].shape != file.state[old].shape),
         unused=tuple(name for name in state if name not in wanted),
         missing=tuple(name for name in wanted if name not in state),
         misshaped=tuple(name for name in state if name in wanted and state[name].shape != wanted[name].shape),
@@ -181,7 +181,7 @@ def load_network(
 
     Args:
         weights: see :func:`read_weights`.
-        name: key of NETWORKS; None: see :meth:`WeightFile.recognised`.
+        name: key of NETWORKS; None: see :meth:`WeightFile.recognise`.
         options: arguments of the network; they override what file and tensors tell.
         ema: take the averaged weights of an own checkpoint.
 
@@ -191,7 +191,7 @@ def load_network(
     Raises:
         UsageError: the file is not of this network, or an option is unknown.
     """
-    found = read_weights(weights, ema=ema).recognised(name)
+    found = read_weights(weights, ema=ema).recognise(name)
     if found is None:
         raise UsageError(f"{weights}: of none of {', '.join(NETWORKS)}; --model says what it is")
     name, told = found

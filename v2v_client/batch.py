@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client import look
+from v2v_client import notebook
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
@@ -88,7 +88,7 @@ class Batch:
         Raises:
             UsageError: voxels or frames were not asked for, or pillow or av is not installed.
         """
-        return look.shown(self._picture(), path)
+        return notebook.to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
         spec = self.resume_state.get("spec")
@@ -98,14 +98,14 @@ class Batch:
             ({name: tensor[place].cpu().numpy() for name, tensor in self.arrays.items()}, self.provenance[place])
             for place in range(count)
         ]
-        return look.picture(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
+        return notebook.draw_samples(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
     def _repr_png_(self) -> bytes | None:
-        return look.png_or_none(self._picture)
+        return notebook.try_png(self._picture)
 
     def _repr_html_(self) -> str:
         rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
-        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + look.img(self._repr_png_())
+        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + notebook.html_image(self._repr_png_())
 
     @property
     def voxels(self) -> torch.Tensor:
@@ -172,12 +172,12 @@ class Batch:
                 A copy from other memory is waited for: once this batch is dropped, samples are put there again.
         """
 
-        def moved(item: torch.Tensor) -> torch.Tensor:
+        def move(item: torch.Tensor) -> torch.Tensor:
             # PyTorch keeps page-locked memory until the copy is done; of ours it knows nothing.
             safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
             return item.to(device, non_blocking=safe)
 
-        return dataclasses.replace(self, arrays={name: moved(item) for name, item in self.arrays.items()})
+        return dataclasses.replace(self, arrays={name: move(item) for name, item in self.arrays.items()})
 
 
 def _collate(batches: Any, *, collate_fn_map: Any) -> Any:

@@ -22,8 +22,8 @@ from v2v_client.delivery import deliver
 from v2v_client.loaders import (
     end_with_parent,
     is_evaluated_by_lightning,
-    require_epoch_of_ours,
-    require_in_step_with_lightning,
+    refuse_epoch_of_accelerate,
+    require_lightning_epoch,
     send_before_exit,
 )
 from v2v_client.local_server import LocalServer, recipe_flags
@@ -288,7 +288,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         Raises:
             UsageError: no such epoch; or it is accelerate that sets it.
         """
-        require_epoch_of_ours()
+        refuse_epoch_of_accelerate()
         self._position.set_epoch(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
@@ -335,7 +335,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:
         consumer, epoch, state = self._consumer, begun.epoch, begun.state
         if state is None:
-            require_in_step_with_lightning(epoch)
+            require_lightning_epoch(epoch)
         pinned = self.stream
         with closing(self._connection(epoch, state, begun.workers)) as connection:
             connection.open()

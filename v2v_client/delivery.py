@@ -19,7 +19,7 @@ from v2v_protocol.messages import SampleHeader
 
 
 @dataclass(slots=True)
-class _Draft:
+class _PartialBatch:
     """A batch being filled: its memory, and what was said of each sample that came."""
 
     memory: BatchMemory
@@ -52,19 +52,19 @@ def deliver(
         see :meth:`Connection.receive`.
     """
     window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
-    most_drafts = -(-connection.credit // plan.batch_size) + 2
+    most_partial = -(-connection.credit // plan.batch_size) + 2
     # And the one that the trainer has: all of them are free when an epoch ends.
-    buffers.shape(connection.layout, plan.batch_size, spare=most_drafts + 1)
-    drafts: dict[int, _Draft] = {}
+    buffers.shape(connection.layout, plan.batch_size, spare=most_partial + 1)
+    partial: dict[int, _PartialBatch] = {}
     quarantine, lend = 0, shared_memory
 
     def ask() -> None:
         asked, slots = window.ask(), {}
         for index in asked:
             place = window.place(index)
-            if place.batch not in drafts:
-                drafts[place.batch] = _Draft(buffers.take(shared=lend))
-            slot = drafts[place.batch].memory.slot(place.row)
+            if place.batch not in partial:
+                partial[place.batch] = _PartialBatch(buffers.take(shared=lend))
+            slot = partial[place.batch].memory.slot(place.row)
             if slot is not None:
                 slots[index] = slot
         connection.want(asked, slots)
@@ -72,9 +72,9 @@ def deliver(
     def accept(sample: Arrival) -> None:
         place = window.receive(sample.header.index)
         if place is not None:
-            draft = drafts[place.batch]
-            draft.memory.fill(place.row, sample.arrays, slot_is_free=sample.slot_is_free)
-            draft.headers[place.row] = sample.header
+            batch = partial[place.batch]
+            batch.memory.fill(place.row, sample.arrays, slot_is_free=sample.slot_is_free)
+            batch.headers[place.row] = sample.header
 
     while not window.finished:
         began = clock()
@@ -89,13 +89,13 @@ def deliver(
                 ask()
         ask()
         sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
-        draft = drafts.pop(number)
+        batch = partial.pop(number)
         # Workers elsewhere have no use for it, and a message is cheaper without.
-        lend = lend and (draft.memory.in_place > 0 or not draft.memory.lent)
-        headers = [draft.headers[row] for row in range(plan.batch_size)]
+        lend = lend and (batch.memory.in_place > 0 or not batch.memory.has_slots)
+        headers = [batch.headers[row] for row in range(plan.batch_size)]
         provenance = tuple(connection.provenance(header) for header in headers)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
-        tensors = {name: torch.from_numpy(array) for name, array in draft.memory.whole().items()}
+        tensors = {name: torch.from_numpy(array) for name, array in batch.memory.finish().items()}
         yield Batch(
             arrays=tensors,
             indices=plan.indices(number),
@@ -106,4 +106,4 @@ def deliver(
             cpu_seconds=sum(header.cpu_seconds for header in headers),
             decodes=sum(header.decoded for header in headers),
         )
-        del draft, tensors
+        del batch, tensors

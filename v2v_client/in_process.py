@@ -16,7 +16,7 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client import look
+from v2v_client import notebook
 from v2v_client.batch import Batch
 from v2v_client.options import require_arguments
 from v2v_protocol.errors import UsageError
@@ -52,16 +52,16 @@ class ShownSample(Sample):
             UsageError: voxels or frames were not asked for, the file cannot be written, or pillow or av is not
                 installed.
         """
-        return look.shown(self._picture(), path)
+        return notebook.to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
-        return look.picture([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
+        return notebook.draw_samples([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
 
     def _repr_png_(self) -> bytes | None:
-        return look.png_or_none(self._picture)
+        return notebook.try_png(self._picture)
 
     def _repr_html_(self) -> str:
-        return Sample._repr_html_(self) + look.img(self._repr_png_())
+        return Sample._repr_html_(self) + notebook.html_image(self._repr_png_())
 
 
 class V2VDataset(Dataset[Sample]):
@@ -111,7 +111,7 @@ class V2VDataset(Dataset[Sample]):
         self._source = (os.fspath(videos), rows, list_file, cache_dir)
         self._maker: Any = None
         self._process = 0
-        self._length = int(self._opened().count)
+        self._length = int(self._open().count)
 
     def __len__(self) -> int:
         return self._length
@@ -126,7 +126,7 @@ class V2VDataset(Dataset[Sample]):
         place = index + self._length if index < 0 else index
         if not 0 <= place < self._length:
             raise IndexError(f"index {index}: the epoch has {self._length} samples")
-        sample: Sample = self._opened().sample(self.seed, self.epoch, place)
+        sample: Sample = self._open().sample(self.seed, self.epoch, place)
         title = f"Sample {place} of {self._length}"
         return ShownSample(sample.arrays, sample.provenance, self.spec.recipe.frames_per_bin, title)
 
@@ -150,14 +150,14 @@ class V2VDataset(Dataset[Sample]):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}
 
-    def _opened(self) -> Any:
+    def _open(self) -> Any:
         """The maker of samples, of this process's own: an index file that was open before a fork must not be read."""
         if self._maker is None or self._process != os.getpid():
-            self._maker, self._process = _maker(*self._source, self.spec, self._arrays), os.getpid()
+            self._maker, self._process = _open_remaker(*self._source, self.spec, self._arrays), os.getpid()
         return self._maker
 
 
-def _maker(
+def _open_remaker(
     videos: str, rows: str, list_file: str | None, cache_dir: str | None, spec: StreamSpec, arrays: tuple[str, ...]
 ) -> Any:
     try:

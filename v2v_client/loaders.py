@@ -72,7 +72,7 @@ def is_evaluated_by_lightning() -> bool:
     return frame is not None
 
 
-def require_epoch_of_ours() -> None:
+def refuse_epoch_of_accelerate() -> None:
     """To be called where an epoch is set.
 
     Raises:
@@ -86,7 +86,7 @@ def require_epoch_of_ours() -> None:
         )
 
 
-def require_in_step_with_lightning(epoch: int) -> None:
+def require_lightning_epoch(epoch: int) -> None:
     """To be called before the first batch of an epoch, in a loader worker too; not before, because Lightning makes an
     iterator to see whether it can, and loads the state after that.
 

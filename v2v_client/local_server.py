@@ -101,7 +101,7 @@ class LocalServer:
         return self._process.pid
 
     def _wait_for(self, port_file: Path, process: subprocess.Popen[bytes]) -> str:
-        said, deadline = 0, time.monotonic() + self._start_seconds
+        seen, deadline = 0, time.monotonic() + self._start_seconds
         while True:
             if port_file.exists() and (address := port_file.read_text(encoding="utf-8").strip()):
                 return address
@@ -110,8 +110,8 @@ class LocalServer:
                 raise (UsageError if status == 2 else ServerLost)(
                     f"the local server ended with status {status} before it listened: {self.last_lines()}"
                 )
-            if self._said_bytes() > said:
-                said, deadline = self._said_bytes(), time.monotonic() + self._start_seconds
+            if self._stderr_bytes() > seen:
+                seen, deadline = self._stderr_bytes(), time.monotonic() + self._start_seconds
             if time.monotonic() >= deadline:
                 raise ServerLost(
                     f"the local server does not listen after {self._start_seconds:g} s of silence: "
@@ -120,7 +120,7 @@ class LocalServer:
                 )
             time.sleep(_POLL_SECONDS)
 
-    def _said_bytes(self) -> int:
+    def _stderr_bytes(self) -> int:
         return 0 if self._errors is None else os.fstat(self._errors.fileno()).st_size
 
     def last_lines(self) -> str:
@@ -128,7 +128,7 @@ class LocalServer:
         if self._errors is None:
             return "(it was not started)"
         # The server writes where the file stands, and the two of us share that place: it must not be moved.
-        lines = os.pread(self._errors.fileno(), self._said_bytes(), 0).decode(errors="replace").strip().splitlines()
+        lines = os.pread(self._errors.fileno(), self._stderr_bytes(), 0).decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-_LAST_LINES:]) or "(it wrote nothing)"
 
     def stop(self) -> None:
@@ -144,7 +144,7 @@ class LocalServer:
                     process.kill()
                     process.wait()
                 for survivor in tree:
-                    with _gone_is_fine():
+                    with _ignore_ended_process():
                         survivor.kill()
                 psutil.wait_procs(tree, self._stop_seconds)
         finally:
@@ -155,7 +155,7 @@ class LocalServer:
     def cpu_seconds(self) -> dict[int, float]:
         """User and system time of each process of the tree, by process id; the ones seen before and gone included."""
         for process in _tree(self.pid):
-            with _gone_is_fine():
+            with _ignore_ended_process():
                 times = process.cpu_times()
                 self._cpu_seconds[process.pid, process.create_time()] = times.user + times.system
         found: dict[int, float] = {}
@@ -167,7 +167,7 @@ class LocalServer:
         """Resident bytes of each living process of the tree, by process id; pages they share count for each."""
         found: dict[int, int] = {}
         for process in _tree(self.pid):
-            with _gone_is_fine():
+            with _ignore_ended_process():
                 found[process.pid] = process.memory_info().rss
         return found
 
@@ -178,14 +178,14 @@ def recipe_flags(recipe: Recipe) -> list[str]:
 
 
 def _tree(pid: int) -> Iterator[psutil.Process]:
-    with _gone_is_fine():
+    with _ignore_ended_process():
         root = psutil.Process(pid)
         yield root
         yield from root.children(recursive=True)
 
 
 @contextmanager
-def _gone_is_fine() -> Iterator[None]:
+def _ignore_ended_process() -> Iterator[None]:
     """A process may end between being listed and being asked."""
     try:
         yield

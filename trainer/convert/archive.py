@@ -32,13 +32,13 @@ class Archive:
         self._zip: zipfile.ZipFile | None = None
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
-            self.bytes_of = _recorded({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
+            self.bytes_of = _without_hidden({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
             return
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
             raise UsageError(f"{path} is neither a folder nor a whole zip file: {error}") from error
-        self.bytes_of = _recorded(
+        self.bytes_of = _without_hidden(
             {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         )
 
@@ -74,12 +74,12 @@ class Archive:
         if member not in self.bytes_of:
             raise UsageError(f"{self.path} has no {member}")
         try:
-            with self._opened(member) as stream:
+            with self._open(member) as stream:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise UsageError(f"{self.path}: {member} cannot be read: {error}") from error
 
-    def _opened(self, member: str) -> IO[bytes]:
+    def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
             return (self.path / member).open("rb")
         try:
@@ -103,6 +103,6 @@ class Archive:
         return np.asarray(pixels, np.uint8)
 
 
-def _recorded(bytes_of: dict[str, int]) -> dict[str, int]:
+def _without_hidden(bytes_of: dict[str, int]) -> dict[str, int]:
     """Without the ``._name`` that macOS puts beside each file, in zips (under ``__MACOSX``) and on foreign disks."""
     return {member: size for member, size in bytes_of.items() if not posixpath.basename(member).startswith("._")}

@@ -132,14 +132,14 @@ def _progress(name: str) -> Iterator[items.Progress]:
         TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     if not sys.stderr.isatty():
-        yield lines_of_progress(name, sys.stderr)
+        yield log_progress(name, sys.stderr)
         return
     with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def lines_of_progress(
+def log_progress(
     name: str, out: TextIO, *, clock: Callable[[], float] = time.monotonic, every_seconds: float = 30.0
 ) -> items.Progress:
     """For a log: a line now and then, with the share that is done and the time left; none where the size of the whole

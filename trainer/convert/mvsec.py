@@ -40,7 +40,7 @@ def recognises(path: Path) -> bool:
     """
     if path.suffix not in (".hdf5", ".h5") or not h5py.is_hdf5(path):
         return False
-    with _opened(path) as file:
+    with _open(path) as file:
         return "davis" in file
 
 
@@ -50,16 +50,16 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     Raises:
         UsageError: a part is missing, damaged or of another shape.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         yield from _read(file, path, options.camera, progress)
     truth = path.with_name(path.name.replace("_data", "_gt"))
     if truth != path and truth.is_file():
-        with _opened(truth) as file:
+        with _open(truth) as file:
             yield from _flow(file, truth, options.camera)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
+def _open(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             require_self_contained(file, path)

@@ -178,7 +178,9 @@ def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run,
         found = find_recordings(data, data_set)
         with _progress() as advance:
             scores = {
-                sequence: evaluate_flow(flow_run, path, data_set.cuts[sequence] if run.use_cuts else None, advance)
+                sequence: evaluate_flow(
+                    flow_run, path, data_set.time_ranges[sequence] if run.use_time_ranges else None, advance
+                )
                 for sequence, path in found.items()
             }
         console.print(flow_table(data_set.name, scores, config.paper))
@@ -222,7 +224,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         metrics=make_metrics(names, lpips_files, device),
         device=device,
         as_published=arguments.as_published,
-        use_cuts=arguments.cuts == "paper",
+        use_time_ranges=arguments.cuts == "paper",
         fps=arguments.fps,
         window_pictures=arguments.window_pictures,
         window_seconds=arguments.window_seconds,
@@ -257,7 +259,7 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
         console = Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         if data_set.name not in scores:
-            console.print(f"{data_set.name}: none of its {len(data_set.cuts)} sequences is there", markup=False)
+            console.print(f"{data_set.name}: none of its {len(data_set.time_ranges)} sequences is there", markup=False)
             continue
         console.print(table(data_set, scores[data_set.name], config.paper))
         for score in scores[data_set.name]:

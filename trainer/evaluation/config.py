@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.evaluation import paper
-from trainer.evaluation.cuts import DATA_SETS, Cut, DataSet
+from trainer.evaluation.data_sets import DATA_SETS, DataSet, TimeRange
 from trainer.evaluation.layout import SUFFIXES
 from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.voxelise import VoxelSettings
@@ -123,18 +123,18 @@ def _data_set(entry: Any, where: str) -> DataSet:
         sequences = dict.fromkeys(map(str, sequences))
     if not isinstance(sequences, Mapping):
         raise UsageError(f"{where}: sequences are a list, or first and last second by name")
-    cuts = {str(name): _cut(cut, f"{where}: {name}") for name, cut in sequences.items()}
-    return DataSet(str(given["name"]), str(given.get("folder", given["name"])), cuts)
+    time_ranges = {str(name): _time_range(span, f"{where}: {name}") for name, span in sequences.items()}
+    return DataSet(str(given["name"]), str(given.get("folder", given["name"])), time_ranges)
 
 
-def _cut(value: Any, where: str) -> Cut | None:
+def _time_range(value: Any, where: str) -> TimeRange | None:
     if value is None:
         return None
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(edge, (int, float)) for edge in value)):
         raise UsageError(f"{where}: {value!r} is not [first second, last second]")
     start, end = float(value[0]), float(value[1])
     if not 0 <= start < end:
-        raise UsageError(f"{where}: a cut from {start:g} to {end:g} s")
+        raise UsageError(f"{where}: [{start:g}, {end:g}] s is not a time range: give 0 <= first < last")
     return start, end
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from trainer import pictures
 from trainer.evaluation import layout
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.metrics import Metric
-from trainer.evaluation.pictures import chosen_steps, draw_step
+from trainer.evaluation.pictures import choose_steps, draw_step
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
@@ -58,7 +58,7 @@ class Run:
         metrics: by name.
         device: of PyTorch.
         as_published: see :mod:`trainer.evaluation.readers`.
-        use_cuts: False scores all of each recording.
+        use_time_ranges: False scores all of each recording.
         fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
         window_pictures: windows from a picture to the one that is so many on.
         window_seconds, window_events: windows of so long, or of so many events, in place of those between pictures.
@@ -72,7 +72,7 @@ class Run:
     metrics: Mapping[str, Metric]
     device: str = "cpu"
     as_published: bool = False
-    use_cuts: bool = True
+    use_time_ranges: bool = True
     fps: float | None = None
     window_pictures: int = 1
     window_seconds: float | None = None
@@ -86,7 +86,7 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     """Files of the sequences of a data set that are there, by sequence, in the data set's order."""
     folder = data if data.is_dir() else data.parent
     found = {}
-    for sequence in data_set.cuts:
+    for sequence in data_set.time_ranges:
         candidates = [folder / data_set.folder / f"{sequence}{suffix}" for suffix in layout.SUFFIXES]
         if data.is_file() and (data_set.folder, sequence) == (".", data.stem):
             candidates = [data]  # whatever its ending, and whatever lies beside it
@@ -110,13 +110,13 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
 def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
     if run.fps is not None:
         return regular_windows(recording, run.fps)
-    cut = data_set.cuts[recording.name] if run.use_cuts else None
+    time_range = data_set.time_ranges[recording.name] if run.use_time_ranges else None
     if run.window_seconds is not None:
-        return windows_of_seconds(recording, run.window_seconds, cut)
+        return windows_of_seconds(recording, run.window_seconds, time_range)
     if run.window_events is not None:
-        return windows_of_events(recording, run.window_events, cut)
-    later = data_set.published_later if run.as_published else 0
-    return picture_windows(recording, cut, pictures=run.window_pictures, later=later)
+        return windows_of_events(recording, run.window_events, time_range)
+    later = data_set.published_shift if run.as_published else 0
+    return picture_windows(recording, time_range, pictures=run.window_pictures, later=later)
 
 
 def evaluate_data_set(
@@ -139,7 +139,7 @@ def evaluate_sequence(
         windows = _windows(run, recording, data_set)
         scorer = SequenceScorer(run.metrics)
         rows = []
-        shown = chosen_steps(len(windows), run.drawing.rows)
+        shown = choose_steps(len(windows), run.drawing.rows)
         with _video(run.drawing, data_set.name, recording.name, windows) as video:
             steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device, stretch=run.stretch)
             for number, step in enumerate(steps):

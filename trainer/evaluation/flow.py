@@ -30,6 +30,7 @@ from rich.table import Table
 
 from trainer import pictures
 from trainer.evaluation import paper
+from trainer.evaluation.data_sets import TimeRange
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import flow_windows
@@ -102,7 +103,7 @@ class FlowRun:
 def evaluate_flow(
     run: FlowRun,
     path: Path,
-    cut: tuple[float, float] | None,
+    time_range: TimeRange | None,
     advance: Callable[[str, int, int], None] = lambda _name, _done, _total: None,
 ) -> dict[str, FlowScore]:
     """Scores of the network, and of "zeros", on one recording.
@@ -112,7 +113,7 @@ def evaluate_flow(
     """
     scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
     with Recording(path, as_published=run.as_published) as recording, ieee_products():
-        windows = flow_windows(recording, cut, one_later=run.as_published)
+        windows = flow_windows(recording, time_range, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]
         late = run.as_published and run.network.lead_voxels > 0
@@ -153,7 +154,7 @@ def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, predictio
     scale = pictures.flow_scale(known)
     panels = [pictures.draw_events(grid), *(pictures.draw_flow(flow, scale) for flow in (known, prediction))]
     drawn = pictures.side_by_side([panel[None] for panel in panels])[0]
-    pictures.write_png(path, pictures.headed(drawn, (pictures.EVENTS, "true flow", "flow found")))
+    pictures.write_png(path, pictures.add_header(drawn, (pictures.EVENTS, "true flow", "flow found")))
 
 
 def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:

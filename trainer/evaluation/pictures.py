@@ -42,7 +42,7 @@ def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) ->
     return np.hstack(tiles)
 
 
-def chosen_steps(count: int, rows: int) -> frozenset[int]:
+def choose_steps(count: int, rows: int) -> frozenset[int]:
     """``rows`` of ``count`` steps, evenly spaced; the last one among them, the first (the network starts blind) not."""
     rows = min(rows, count)
     return frozenset(int(step) for step in np.linspace(count / rows, count, rows).round() - 1)

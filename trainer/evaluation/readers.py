@@ -112,10 +112,10 @@ class Recording:
         try:
             with _reading(self.path):
                 require_self_contained(self._file, self.path)
-                self._columns = self._checked_columns()
+                self._columns = self._check_columns()
                 self.times: Sequence[float] = _Times(self._columns["ts"], self.path)
                 self.repaired_images = 0
-                self.images = self._listed_images(as_published)
+                self.images = self._list_images(as_published)
                 self.size = self._sensor_size()
         except BaseException:
             self._file.close()
@@ -136,7 +136,7 @@ class Recording:
         """Times of the first and the last event, seconds."""
         return self.times[0], self.times[len(self.times) - 1]
 
-    def _checked_columns(self) -> dict[str, h5py.Dataset]:
+    def _check_columns(self) -> dict[str, h5py.Dataset]:
         columns = {name: self._file.get(f"events/{name}") for name in layout.EVENT_COLUMNS}
         missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
         if missing:
@@ -155,7 +155,7 @@ class Recording:
             raise UsageError(f"{self.path}: columns of events have {sorted(lengths)} entries")
         return columns
 
-    def _listed_images(self, as_published: bool) -> tuple[Image, ...]:
+    def _list_images(self, as_published: bool) -> tuple[Image, ...]:
         group = self._file.get("images", {})
         keys = sorted(group)
         if not keys:
@@ -173,23 +173,23 @@ class Recording:
         stored = [int(index) for index in indices]
         if any(stamp is None for stamp in stamps):
             times = [self.times[min(index, len(self) - 1)] for index in stored]
-            return self._paired(keys, times, stored)
+            return self._make_images(keys, times, stored)
         times = [float(stamp) for stamp in stamps]
         if as_published:
-            return self._paired(keys, times, stored)
+            return self._make_images(keys, times, stored)
         first, last = self.span
         if times[-1] < first - CLOCK_SLACK_SECONDS or times[0] > last + CLOCK_SLACK_SECONDS:
-            raise self._two_clocks(times)
-        times = self._increasing(times)
+            raise self._clock_error(times)
+        times = self._repair_times(times)
         for time, index in zip(times, stored, strict=True):
             # Beyond the events, and yet with events on either side, as where one clock counts microseconds.
             if (time < first - CLOCK_SLACK_SECONDS and index > 1) or (
                 time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
             ):
-                raise self._two_clocks(times)
-        return self._paired(keys, times, [bisect.bisect_left(self.times, time) for time in times])
+                raise self._clock_error(times)
+        return self._make_images(keys, times, [bisect.bisect_left(self.times, time) for time in times])
 
-    def _two_clocks(self, times: Sequence[float]) -> UsageError:
+    def _clock_error(self, times: Sequence[float]) -> UsageError:
         first, last = self.span
         return UsageError(
             f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
@@ -197,10 +197,10 @@ class Recording:
             "--as-published"
         )
 
-    def _paired(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
+    def _make_images(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
         return tuple(Image(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True))
 
-    def _increasing(self, times: Sequence[float]) -> list[float]:
+    def _repair_times(self, times: Sequence[float]) -> list[float]:
         """Each time that is not later than the one before becomes the mean of its neighbours."""
         mended = list(times)
         for index in range(1, len(mended)):

@@ -85,7 +85,7 @@ def reconstruct(
                 f"{recording.path}: the network gives values that are not finite in windows {first} to "
                 f"{first + len(piece) - 1}; are these its weights, and is its input normalised as in training?"
             )
-        for window, count, grid, prediction in zip(piece, counts, grids, _stretched(predictions, stretch), strict=True):
+        for window, count, grid, prediction in zip(piece, counts, grids, _stretch(predictions, stretch), strict=True):
             shown = window.target or _latest(recording.images, window.end)
             yield Step(
                 window,
@@ -97,7 +97,7 @@ def reconstruct(
             )
 
 
-def _stretched(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
+def _stretch(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
     """[N, H, W], each stretched by itself, then clamped to 0 .. 1."""
     if stretch == "equalized":
         equal = [equalize_hist(picture.clip(0, 1)) for picture in pictures]  # type: ignore[no-untyped-call]

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from trainer.evaluation import paper
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError
 
@@ -46,7 +46,7 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     if not names:
         return made
     made.add_section()
-    whole = "" if len(scores) == len(data_set.cuts) else f" of {len(scores)} of {len(data_set.cuts)}"
+    whole = "" if len(scores) == len(data_set.time_ranges) else f" of {len(scores)} of {len(data_set.time_ranges)}"
     made.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
     made.add_row("constant grey", "", *(_number(mean_over_sequences(scores, blank=True), name) for name in names))
     for method in compared:

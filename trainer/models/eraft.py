@@ -84,7 +84,7 @@ class ERAFT(VoxelNetwork):
             refined = list(self.raft.refine(pyramid, hidden[step], context[step], UPDATES, start))
             if self.warm_start:
                 start = forward_splat(refined[-1][0].detach())
-            outputs.append([self.raft.upsampled(*each) for each in (refined if self.training else refined[-1:])])
+            outputs.append([self.raft.upsample(*each) for each in (refined if self.training else refined[-1:])])
         flow = torch.stack([torch.cat(of_update) for of_update in zip(*outputs, strict=True)])
         return flow if self.training else flow[0], ERAFTState(voxels[-batch:], start)
 

@@ -146,12 +146,12 @@ class ETNet(VoxelNetwork):
             x, memory = encoder(x, None if state is None else state[number], steps)
             skips.append(x)
             after.append(memory)
-        x = self._attended(skips)
+        x = self._attend(skips)
         for decoder in self.UpsampleConv:
             x = decoder(x + skips.pop())
         return predict(self.pred, x + head).sigmoid(), tuple(after)
 
-    def _attended(self, skips: list[Tensor]) -> Tensor:
+    def _attend(self, skips: list[Tensor]) -> Tensor:
         """[N, C, H / 8, W / 8] of what the encoders gave."""
         fine, middle, coarse = skips
         shape = coarse.shape[2:]

@@ -218,7 +218,7 @@ class RAFT(Loop, nn.Module):
         """
         features = self.features(torch.cat([first, second])).chunk(2)
         *_, (flow, hidden) = self.refine(correlation_pyramid(*features), *self.context(first), updates)
-        return self.upsampled(flow, hidden)
+        return self.upsample(flow, hidden)
 
     def features(self, pictures: Tensor) -> Tensor:
         """What is compared: [N, inputs, H, W] -> [N, C, H / 8, W / 8], float32 or wider."""
@@ -257,7 +257,7 @@ class RAFT(Loop, nn.Module):
         hidden, correction = self.update_block(hidden, context, correlation, flow)
         return flow + correction.to(flow.dtype), hidden
 
-    def upsampled(self, flow: Tensor, hidden: Tensor) -> Tensor:
+    def upsample(self, flow: Tensor, hidden: Tensor) -> Tensor:
         """Flow of :meth:`refine` at full size."""
         if self.mask_predictor is None:
             shape = [DOWNSCALE * side for side in flow.shape[2:]]

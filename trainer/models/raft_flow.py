@@ -91,10 +91,10 @@ class RaftFlow:
     def _estimate(self, first: Tensor, second: Tensor) -> Tensor:
         height, width = first.shape[2:]
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bfloat16):
-            flow: Tensor = self._network(self._prepared(first), self._prepared(second))
+            flow: Tensor = self._network(self._prepare(first), self._prepare(second))
         return flow[:, :, :height, :width]
 
-    def _prepared(self, frames: Tensor) -> Tensor:
+    def _prepare(self, frames: Tensor) -> Tensor:
         frames = frames.to(self._device)
         scaled = frames.float() / 255.0 if frames.dtype == torch.uint8 else frames.float()
         height, width = frames.shape[2:]

@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from trainer.config import TrainConfig
 from trainer.config_file import show_config
-from trainer.pictures import Image, Video, contact_sheet, headed, write_png
+from trainer.pictures import Image, Video, add_header, contact_sheet, write_png
 from trainer.run.checkpoint import replacing
 from trainer.run.distributed import Ranks
 from v2v_client import V2VStreamDataset
@@ -196,11 +196,11 @@ class Reporter:
             return
         name = f"step-{step:07d}"
         for number, film in enumerate(films):
-            sheet = headed(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
+            sheet = add_header(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
             write_png(self._out / "previews" / f"{name}-{number}.png", sheet)
             with Video(self._out / "previews" / f"{name}-{number}.mp4", FRAMES_PER_SECOND) as video:
                 for image in film:
-                    video.add(headed(image, panels))
+                    video.add(add_header(image, panels))
             self._board.add_image(f"preview/{number}", sheet, step, dataformats="HWC")
         self._board.flush()
 

@@ -144,7 +144,7 @@ class Arena:
         """
         memory, self._memory = self._memory, None
         if memory is None or not _is_unwritten(memory):
-            memory = self._mapped()
+            memory = self._map()
 
         def back(memory: Bytes) -> None:
             self._memory = memory
@@ -152,7 +152,7 @@ class Arena:
 
         return batch_arrays(lend(memory, back), self._layout, self._slots)
 
-    def _mapped(self) -> Bytes:
+    def _map(self) -> Bytes:
         """All of it, privately, with all its pages."""
         mapping = mmap.mmap(self._descriptor, self._bytes, mmap.MAP_PRIVATE)
         with suppress(OSError):  # an older kernel maps each page as it is read

@@ -43,7 +43,7 @@ class BatchMemory:
         self._own = buffers.arrays() if arena is None else {}
         self._left: Arena | None = None
         self._filled: list[int] = []
-        self.lent = arena is not None
+        self.has_slots = arena is not None
         self.in_place = 0
 
     def slot(self, row: int) -> Slot | None:
@@ -77,9 +77,9 @@ class BatchMemory:
         for name, array in arrays.items():
             self._own[name][row] = array
 
-    def whole(self) -> dict[str, npt.NDArray[Any]]:
+    def finish(self) -> dict[str, npt.NDArray[Any]]:
         """All rows of each array, once they are filled. To be called once, and nothing else after it."""
-        return self._own if self._arena is None else self._buffers.lent_arrays(self._arena)
+        return self._own if self._arena is None else self._buffers.lend_arrays(self._arena)
 
 
 class BatchBuffers:
@@ -128,7 +128,7 @@ class BatchBuffers:
                 return arena
         return open_arena(*self._form[:2])
 
-    def lent_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
+    def lend_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
         """The arrays of an arena whose batch is whole; it comes back when nothing looks at them any more. One whose
         batch never became whole does not."""
         free, forks = self._arenas, _forks

@@ -48,7 +48,7 @@ class Slots:
             tuple(NO_SLOT if slot is None else slot.number for slot in slots),
         )
 
-    def answered(self, index: int, number: int, *, in_message: bool) -> Answer:
+    def record_arrival(self, index: int, number: int, *, in_message: bool) -> Answer:
         """A sample arrived.
 
         Args:

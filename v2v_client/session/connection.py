@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import WAITS_TOLD_SECONDS, Arrival, Conversation, Event, State
+from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, State
 from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_protocol.arena import Slot
@@ -134,7 +134,7 @@ class Connection:
             raise
 
     def _await_welcome(self) -> None:
-        self._conversation.happens(Event.OPENED, self._now())
+        self._conversation.handle_event(Event.OPENED, self._now())
         while self._conversation.state is not State.WELCOMED:
             self._step(wait=True)
 
@@ -142,7 +142,7 @@ class Connection:
         """Tells the server, where that does not take long."""
         quiet = self._conversation.silence(self._now()) >= self._patience.ping_seconds
         self._conversation.outbox.clear()
-        self._conversation.happens(Event.LEFT, self._now())
+        self._conversation.handle_event(Event.LEFT, self._now())
         with suppress(ServerLost):  # nobody to tell
             self._send(link)
         link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
@@ -185,7 +185,7 @@ class Connection:
         Raises:
             ServerLost: nothing was heard for ``timeout_seconds``, or this connection was closed.
             UsageError: the connection was opened by another process, from which this one was forked.
-            V2VError: see :meth:`Conversation.hear`.
+            V2VError: see :meth:`Conversation.handle_message`.
         """
         began = self._clock()
         self._listening.listen(began)
@@ -194,7 +194,7 @@ class Connection:
                 arrival, idle = self._step(wait=wait)
                 if wait:
                     began, before = self._clock(), began
-                    self._conversation.waits(began - before, self._now())
+                    self._conversation.record_wait(began - before, self._now())
                 if arrival is not None or (idle and not wait):
                     return arrival
         finally:
@@ -241,15 +241,15 @@ class Connection:
         if conversation.tick(self._now()):
             link.connect(self._largest_frame_bytes, again=True)
         self._send(link)
-        seconds = min(conversation.next_due(self._now()), WAITS_TOLD_SECONDS) if wait else 0.0
+        seconds = min(conversation.next_due(self._now()), WAIT_REPORT_SECONDS) if wait else 0.0
         due = self._clock() + seconds
         frames = link.receive(seconds)
-        self._listening.woke(self._clock(), due)
+        self._listening.wake(self._clock(), due)
         arrival = None
         if frames is not None:
-            arrival = conversation.hear(decode(frames[0]), frames[1:], self._now())
-        elif link.remade():
-            conversation.happens(Event.CUT, self._now())
+            arrival = conversation.handle_message(decode(frames[0]), frames[1:], self._now())
+        elif link.has_reconnected():
+            conversation.handle_event(Event.DISCONNECTED, self._now())
         self._send(link)
         return arrival, frames is None
 

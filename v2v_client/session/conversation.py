@@ -63,7 +63,7 @@ class Event(Enum):
     OPENED = auto()  # there is a link
     WELCOME = auto()  # the server answered Hello
     FORGOTTEN = auto()  # it does not know us: it was restarted, or we were silent for too long
-    CUT = auto()  # the network was cut and is back: what was under way in either direction may be lost
+    DISCONNECTED = auto()  # the network was cut and is back: what was under way in either direction may be lost
     UNANSWERED = auto()  # the server lives, but no request was answered for long: messages may be lost
     SILENCE = auto()  # nothing at all was heard for as long: the link itself is suspect, and is made anew
     LEFT = auto()  # we said Goodbye
@@ -75,21 +75,21 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     },
     State.GREETING: {
         Event.WELCOME: State.WELCOMED,
-        Event.CUT: State.GREETING,
+        Event.DISCONNECTED: State.GREETING,
         Event.SILENCE: State.GREETING,
         Event.LEFT: State.CLOSED,
     },
     State.WELCOMED: {
         Event.WELCOME: State.WELCOMED,
         Event.FORGOTTEN: State.GREETING,
-        Event.CUT: State.WELCOMED,
+        Event.DISCONNECTED: State.WELCOMED,
         Event.UNANSWERED: State.WELCOMED,
         Event.SILENCE: State.GREETING,
         Event.LEFT: State.CLOSED,
     },
 }
 
-WAITS_TOLD_SECONDS = 1.0
+WAIT_REPORT_SECONDS = 1.0
 """From one word about how long samples are waited for to the next."""
 _MOST_CREDIT_DENIALS = 3
 _WARN_SECONDS = 5.0
@@ -166,7 +166,7 @@ class Conversation:
         )
         self._rewant_seconds = min(patience.rewant_seconds, patience.timeout_seconds)
         self._answered = now  # a request, or all were asked again
-        self._hope = now  # the last time that nothing spoke against a sample to come
+        self._available_at = now  # the last time that nothing spoke against a sample to come
         self._warned = False
         self._moved = False  # from a broker that had offered the stream
         self._asked: dict[int, None] = {}  # sent and not answered, in that order
@@ -183,7 +183,7 @@ class Conversation:
         self.credit = 0
         self.strays = 0
         self.waited_seconds = 0.0
-        self._waits_told_at = now
+        self._wait_reported_at = now
         if pinned is not None:
             self._pin(pinned)
 
@@ -194,9 +194,9 @@ class Conversation:
             self._moved = True
         self._address = address
         self._server.heard(now)
-        self._answered = self._hope = now
+        self._answered = self._available_at = now
         self.outbox.clear()
-        self.happens(Event.SILENCE, now)
+        self.handle_event(Event.SILENCE, now)
 
     def _pin(self, stream: StreamIdentity) -> None:
         spec = stream.resolved
@@ -207,7 +207,7 @@ class Conversation:
 
     # --- states -------------------------------------------------------------------------------------------------------
 
-    def happens(self, event: Event, now: float) -> None:
+    def handle_event(self, event: Event, now: float) -> None:
         """Moves on."""
         state = TRANSITIONS[self.state].get(event)
         if state is None:
@@ -235,15 +235,15 @@ class Conversation:
             NoWorkers: for as long, nobody was there to make a sample.
         """
         if self._server.is_gone(now):
-            raise self._lost(now)
+            raise self._server_lost(now)
         if now - self._answered >= self._rewant_seconds:
             silent = self._server.silence(now) >= self._rewant_seconds
             self._answered = now
             self._rewant_seconds = min(2 * self._rewant_seconds, self._patience.timeout_seconds)
             if silent:
-                self.happens(Event.SILENCE, now)
+                self.handle_event(Event.SILENCE, now)
                 return True
-            self.happens(Event.UNANSWERED, now)
+            self.handle_event(Event.UNANSWERED, now)
         ping = self._server.ping_due(now)
         if self.state is State.GREETING:
             if now >= self._hello_due:
@@ -257,11 +257,11 @@ class Conversation:
             self.outbox += [Want(self._epoch, (), waited_seconds=self.waited_seconds), Ping()]
         return False
 
-    def waits(self, seconds: float, now: float) -> None:
+    def record_wait(self, seconds: float, now: float) -> None:
         """Samples have been waited for, so long since the last call, and still are."""
         self.waited_seconds += seconds
-        if self.state is State.WELCOMED and now - self._waits_told_at >= WAITS_TOLD_SECONDS:
-            self._waits_told_at = now
+        if self.state is State.WELCOMED and now - self._wait_reported_at >= WAIT_REPORT_SECONDS:
+            self._wait_reported_at = now
             self.outbox.append(Want(self._epoch, (), waited_seconds=self.waited_seconds))
 
     def next_due(self, now: float) -> float:
@@ -275,7 +275,7 @@ class Conversation:
         """Seconds for which nothing was heard."""
         return self._server.silence(now)
 
-    def _lost(self, now: float) -> ServerLost:
+    def _server_lost(self, now: float) -> ServerLost:
         last = (
             "no sample was received" if self._last is None else f"last sample: epoch {self._epoch}, index {self._last}"
         )
@@ -314,7 +314,7 @@ class Conversation:
 
     # --- hearing ------------------------------------------------------------------------------------------------------
 
-    def hear(self, message: Message, arrays: list[Buffer], now: float) -> Arrival | None:
+    def handle_message(self, message: Message, arrays: list[Buffer], now: float) -> Arrival | None:
         """A message came.
 
         Args:
@@ -334,9 +334,9 @@ class Conversation:
         """
         self._server.heard(now)
         if isinstance(message, Pong):
-            self._hope_or_not(message.trouble, now)
+            self._check_for_workers(message.trouble, now)
         else:
-            self._answered = self._hope = now
+            self._answered = self._available_at = now
         if isinstance(message, SampleHeader):
             return self._sample(message, arrays)
         if arrays:
@@ -345,10 +345,10 @@ class Conversation:
             case Pong():
                 pass
             case Welcome():
-                self._welcomed(message, now)
+                self._accept_welcome(message, now)
             case Denied(code=ErrorCode.UNKNOWN_SESSION):
                 # Every request that was under way is denied: one Hello answers them all.
-                self.happens(Event.FORGOTTEN, now)
+                self.handle_event(Event.FORGOTTEN, now)
             case Denied(code=ErrorCode.CREDIT) if self._may_exceed_credit():
                 # It makes again what it had sent, on the way to us, when we asked again. What it denied stays asked
                 # for, in our account, and goes out again with the rest when such a sample comes, or when all is quiet.
@@ -367,11 +367,11 @@ class Conversation:
                 raise ProtocolError(f"{self._address} sent {type(message).__name__}, which no server sends a consumer")
         return None
 
-    def _hope_or_not(self, trouble: str, now: float) -> None:
+    def _check_for_workers(self, trouble: str, now: float) -> None:
         if not trouble or not self._asked:
-            self._hope, self._warned = now, False
+            self._available_at, self._warned = now, False
             return
-        waited = now - self._hope
+        waited = now - self._available_at
         limit = self._patience.timeout_seconds
         text = f"{self._address}: no sample for {waited:.0f} s, because {trouble}"
         if waited >= limit:
@@ -383,7 +383,7 @@ class Conversation:
     def _may_exceed_credit(self) -> bool:
         return self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS
 
-    def _welcomed(self, welcome: Welcome, now: float) -> None:
+    def _accept_welcome(self, welcome: Welcome, now: float) -> None:
         stream = StreamIdentity.of(welcome)
         if welcome.credit < 1:
             raise ProtocolError(f"{self._address} grants a credit of {welcome.credit} samples")
@@ -394,7 +394,7 @@ class Conversation:
         self.stream, self.credit = stream, welcome.credit
         # A server that was restarted is asked to go on under what we have seen.
         self._hello = replace(self._hello, quarantine=welcome.quarantine)
-        self.happens(Event.WELCOME, now)
+        self.handle_event(Event.WELCOME, now)
 
     def _sample(self, header: SampleHeader, frames: list[Buffer]) -> Arrival | None:
         if header.epoch != self._epoch:
@@ -409,19 +409,19 @@ class Conversation:
         again = header.index not in self._asked
         in_message = bool(frames) or header.slot == NO_SLOT
         arrays = decode_sample(header, frames, unpack) if in_message else None
-        answer = self._slots.answered(header.index, header.slot, in_message=in_message)
+        answer = self._slots.record_arrival(header.index, header.slot, in_message=in_message)
         if answer is Answer.NOWHERE:
             self.strays += 1
-            self._ask_on(again)
+            self._ask_for_more(again)
             return None
         self._hello = replace(self._hello, quarantine=max(self._hello.quarantine or 0, header.quarantine))
         self._asked.pop(header.index, None)
         self._credit_denials = 0
         self._last = header.index
-        self._ask_on(again)
+        self._ask_for_more(again)
         return Arrival(header, arrays, slot_is_free=answer is not Answer.ABANDONED)
 
-    def _ask_on(self, again: bool) -> None:
+    def _ask_for_more(self, again: bool) -> None:
         """After a sample; one that comes again held credit that we took for free."""
         if again and self._owed:
             self._want_again()

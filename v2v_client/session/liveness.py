@@ -62,7 +62,7 @@ class ListeningClock:
         """The caller stops listening."""
         self._paused = now
 
-    def woke(self, now: float, due: float) -> None:
+    def wake(self, now: float, due: float) -> None:
         """The caller waited for post, until ``due`` at the latest. If that is long ago, this process was stopped (in a
         terminal, by a batch system), and the server could not be heard."""
         if now - due > _STOPPED_SECONDS:

@@ -21,7 +21,7 @@ from rich.table import Table
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools.progress import Tell, measuring
+from v2v_client.tools.progress import ReportProgress, show_progress
 from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
@@ -109,7 +109,7 @@ def measure(
     seconds: float,
     warmup_batches: int,
     trainer_seconds: float,
-    tell: Tell = lambda _measured, _batches: None,
+    report: ReportProgress = lambda _measured, _batches: None,
 ) -> tuple[dict[str, Any], ScheduleCheck]:
     """Consumes the dataset for ``seconds`` after warm-up, over as many epochs as that takes. A Ctrl-C ends that sooner:
     the record is of what was measured until then, and ``interrupted``.
@@ -153,7 +153,7 @@ def measure(
             continue
         usage.sample(ended)
         measured.add(batch, wait, trainer_seconds)
-        tell(ended - began, len(measured.waits))
+        report(ended - began, len(measured.waits))
     cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
     elapsed = ended - began
     count = len(measured.waits)
@@ -313,18 +313,20 @@ def run(arguments: argparse.Namespace) -> int:
     results = []
     if arguments.connect:
         dataset = _dataset(arguments, arguments.connect)
-        with measuring(arguments.connect, arguments.seconds) as tell:
-            results.append(measure(dataset, address=arguments.connect, workers=None, server=None, tell=tell, **options))
+        with show_progress(arguments.connect, arguments.seconds) as report:
+            results.append(
+                measure(dataset, address=arguments.connect, workers=None, server=None, report=report, **options)
+            )
     else:
         _dataset(arguments, "tcp://127.0.0.1:0")  # a wrong option should not cost the start of a server
         for workers in arguments.workers or (1, 2):
             with (
                 LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server,
-                measuring(f"{workers} workers", arguments.seconds) as tell,
+                show_progress(f"{workers} workers", arguments.seconds) as report,
             ):
                 dataset = _dataset(arguments, server.address)
                 results.append(
-                    measure(dataset, address=server.address, workers=workers, server=server, tell=tell, **options)
+                    measure(dataset, address=server.address, workers=workers, server=server, report=report, **options)
                 )
             if results[-1][0]["interrupted"]:
                 break

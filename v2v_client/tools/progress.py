@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-Tell = Callable[[float, int], None]
+ReportProgress = Callable[[float, int], None]
 """Takes the seconds that were measured, and the batches that came in them."""
 
 
 @contextlib.contextmanager
-def measuring(what: str, seconds: float) -> Iterator[Tell]:
+def show_progress(what: str, seconds: float) -> Iterator[ReportProgress]:
     """A bar on stderr, with batches a second and the time left; nothing where that is no terminal.
 
     Args:
@@ -25,8 +25,8 @@ def measuring(what: str, seconds: float) -> Iterator[Tell]:
     with Progress(*columns, console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(f"{what}: warm-up", total=seconds)
 
-        def tell(measured: float, batches: int) -> None:
+        def report(measured: float, batches: int) -> None:
             rate = f"{batches / measured:.1f} batches/s" if measured > 0 and batches else "warm-up"
             bar.update(task, completed=min(measured, seconds), description=f"{what}: {rate}")
 
-        yield tell
+        yield report

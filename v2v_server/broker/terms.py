@@ -9,7 +9,7 @@ consumer's.
 from __future__ import annotations
 
 import math
-from collections import abc
+from collections.abc import Sequence
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
@@ -21,13 +21,13 @@ from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.leases import Request
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.videos import VideoEntry
-from v2v_server.schedule.sequences import Sequence
+from v2v_server.schedule.sequences import VideoSequence
 
 
 def lease_for(
     request: Request,
     *,
-    sequence: Sequence,
+    sequence: VideoSequence,
     catalogue: Catalogue,
     spec: StreamSpec,
     seed: int,
@@ -109,7 +109,7 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     return float(math.floor(seconds * spec.samples_per_decode))
 
 
-def check_result(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
+def check_result(payload: Sequence[Any], request: Request, form: Form) -> SampleHeader:
     """The header of a sample that its consumer will be able to read.
 
     Args:
@@ -138,7 +138,7 @@ def check_result(payload: abc.Sequence[Any], request: Request, form: Form) -> Sa
     return header
 
 
-def _fits(frames: abc.Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
+def _fits(frames: Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
     """Whether the frames may hold arrays of these bytes."""
     lengths = tuple(map(len, frames))
     if not packed:

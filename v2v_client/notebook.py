@@ -18,7 +18,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance
 
 
-def picture(
+def draw_samples(
     samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], frames_per_bin: int | None, title: str
 ) -> npt.NDArray[np.uint8]:
     """A sheet of samples: frame, bins, flow, and activity over time.
@@ -49,26 +49,26 @@ def picture(
 _UNMARKED = " (pauses are not marked)"
 
 
-def png(image: npt.NDArray[np.uint8]) -> bytes:
+def to_png(image: npt.NDArray[np.uint8]) -> bytes:
     """The picture as PNG."""
     encoded: bytes = _drawing("files").png_bytes(image)
     return encoded
 
 
-def png_or_none(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
+def try_png(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
     """The picture as PNG, or None where none can be made: a notebook goes on with the text."""
     try:
-        return png(draw())
+        return to_png(draw())
     except UsageError:
         return None
 
 
-def img(encoded: bytes | None) -> str:
+def html_image(encoded: bytes | None) -> str:
     """A PNG as HTML; nothing for None."""
     return "" if encoded is None else f'<img src="data:image/png;base64,{base64.b64encode(encoded).decode()}">'
 
 
-def shown(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
+def to_pil_image(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
     """The picture as a PIL image, which a notebook displays; written to ``path`` as PNG where one is given.
 
     Raises:

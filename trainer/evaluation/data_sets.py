@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-Cut = tuple[float, float]
+TimeRange = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class DataSet:
         name: as in the paper's tables.
         folder: under the folder of data.
         cuts: first and last second by sequence; None scores all of it.
-        published_later: by how many pictures the released conversion cuts later.
+        published_shift: by how many pictures the released conversion cuts later.
     """
 
     name: str
     folder: str
-    cuts: Mapping[str, Cut | None]
-    published_later: int = 0
+    time_ranges: Mapping[str, TimeRange | None]
+    published_shift: int = 0
 
 
 HQF = (
@@ -51,7 +51,7 @@ DATA_SETS = {
                 "playball": (25.0, 30.0),
             },
             # It takes the picture at the end as well, and then drops the first one.
-            published_later=1,
+            published_shift=1,
         ),
         DataSet(
             "IJRR",
