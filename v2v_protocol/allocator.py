@@ -12,7 +12,7 @@ _EVER_BYTES = (1 << 31) - 1
 
 
 def keep_freed_memory(_loader_worker: int = 0, *, most_bytes: int = _EVER_BYTES) -> bool:
-    """Makes this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
+    """Make this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
 
     Every sample is received into fresh memory, and fresh memory from the kernel is cleared and mapped page by page,
     which doubles the processor time of sending it. Kept memory costs nothing of that. The price: the process stays as
@@ -34,7 +34,7 @@ def keep_freed_memory(_loader_worker: int = 0, *, most_bytes: int = _EVER_BYTES)
 
 
 def give_back_freed_memory() -> None:
-    """Hands what this process has freed back to the kernel, wherever it lies. Takes milliseconds; only glibc can."""
+    """Hand what this process has freed back to the kernel, wherever it lies. Takes milliseconds; only glibc can."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

@@ -88,7 +88,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> Never:
-        """Ends with status 2 and one line. A flag that nobody knows comes before anything else that is wrong."""
+        """End with status 2 and one line. A flag that nobody knows comes before anything else that is wrong."""
         known = self._option_string_actions
         for given in self._given:
             flag = given.partition("=")[0]
@@ -108,7 +108,7 @@ def run_command(
     failures: tuple[type[V2VError], ...] = (),
     interrupted: str = "interrupted",
 ) -> int:
-    """Parses and runs.
+    """Parse and runs.
 
     Args:
         parser: of a command with a flag ``--debug``.

@@ -116,7 +116,7 @@ def read_private(file: Path) -> str:
 
 
 def write_key(file: Path, key: PeerKey) -> None:
-    """Writes a key file that only its owner can read.
+    """Write a key file that only its owner can read.
 
     Raises:
         FileExistsError: one is there.
@@ -125,7 +125,7 @@ def write_key(file: Path, key: PeerKey) -> None:
 
 
 def write_private(file: Path, content: str) -> None:
-    """Makes a file of mode 0600.
+    """Make a file of mode 0600.
 
     Raises:
         FileExistsError: one is there.
@@ -164,7 +164,7 @@ class Handshakes:
         self.succeeded = 0
 
     def take(self, waiting: Callable[[], int], receive: Callable[[], Sequence[bytes]]) -> None:
-        """Takes in the events that are there.
+        """Take in the events that are there.
 
         Args:
             waiting: whether there is one.

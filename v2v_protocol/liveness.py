@@ -31,9 +31,9 @@ class Liveness:
         self._gone_seconds = gone_seconds
         self._ping_seconds = ping_seconds
         self._longest_wait = max(ping_seconds, longest_ping_seconds)
-        self.heard(now)
+        self.mark_heard(now)
 
-    def heard(self, now: float) -> None:
+    def mark_heard(self, now: float) -> None:
         """Something came from the peer."""
         self._heard = now
         self._wait = self._ping_seconds

@@ -41,8 +41,8 @@ from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
-from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
+from v2v_server.console.shutdown_summary import format_shutdown_summary
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
@@ -106,7 +106,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
 
 
 def serve(config: ServeConfig) -> None:
-    """Runs a server until SIGINT or SIGTERM.
+    """Run a server until SIGINT or SIGTERM.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -229,7 +229,7 @@ class Server:
         self._give_back_at = math.inf
 
     def turn(self, longest_wait_seconds: float) -> None:
-        """Takes what has come, and does what is due. Waits for a message if none is there.
+        """Take what has come, and does what is due. Waits for a message if none is there.
 
         Raises:
             WorkerCrashLoop: the workers die without finishing anything.
@@ -267,11 +267,11 @@ class Server:
             self._show(now)
 
     def close(self) -> None:
-        """Tells the workers to stop, ends them, and ends all connections."""
+        """Tell the workers to stop, ends them, and ends all connections."""
         self._status.close()
         if self._announced:
             state = self._watch.state(self._clock())
-            for line in farewell(state):
+            for line in format_shutdown_summary(state):
                 self._log.say(line)
             if self._log.is_json:
                 self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)
@@ -286,7 +286,7 @@ class Server:
                 self._port_file.unlink(missing_ok=True)
 
     def _carry_out(self, actions: list[Action]) -> None:
-        """Does what the dispatcher wants, in its order, and tells it what came of it."""
+        """Do what the dispatcher wants, in its order, and tells it what came of it."""
         dispatcher, now = self._dispatcher, self._clock
         todo = deque(actions)
         while todo:
@@ -312,7 +312,7 @@ class Server:
                     todo.extend(self._watch.ask(show))
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
-        """Ends the process of a worker that hangs, if it is one of ours."""
+        """End the process of a worker that hangs, if it is one of ours."""
         loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
@@ -321,7 +321,7 @@ class Server:
         return loss
 
     def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
-        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
+        """Write a verdict down. A server that cannot write goes on: its operator is told what that costs.
 
         Returns:
             the lines that the quarantine has more now.
@@ -389,7 +389,7 @@ class Server:
             self._say(f"workers: {decision.workers} from now on, because {decision.reason}")
 
     def _show(self, now: float) -> None:
-        """Says once that the server is ready; after that keeps the status up to date."""
+        """Say once that the server is ready; after that keeps the status up to date."""
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
             address, worker_address = self._transport.address, self._transport.worker_address
@@ -437,7 +437,7 @@ def _private_address(label: str) -> str:
 
 
 def _write_port_file(file: str, address: str) -> None:
-    """Writes the address in one step: whoever sees the file sees all of it."""
+    """Write the address in one step: whoever sees the file sees all of it."""
     path = Path(file)
     partial = path.parent / f".{path.name}.{os.getpid()}"
     try:

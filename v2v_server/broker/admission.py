@@ -13,7 +13,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
-from v2v_server.broker.worker_registry import shown
+from v2v_server.broker.worker_registry import clean_name
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import Columns, SequenceTable
@@ -115,8 +115,8 @@ class Admission:
             quarantine=quarantine,
             since=now,
             packed=hello.packed,
-            name=shown(hello.name),
-            host=shown(hello.host),
+            name=clean_name(hello.name),
+            host=clean_name(hello.host),
         )
         return session, Welcome(
             spec=spec.to_dict(),

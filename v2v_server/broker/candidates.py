@@ -123,7 +123,7 @@ class Candidates:
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions
-        if not self._sessions.answered(request, 0.0):
+        if not self._sessions.mark_answered(request, 0.0):
             return actions
         self._counters.unavailable += 1
         text = "; ".join(dict.fromkeys(map(str, passed_over.refusals)))

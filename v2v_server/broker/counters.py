@@ -90,7 +90,7 @@ class Counters:
     malformed: int = 0
 
     def count_cache(self, said: str) -> None:
-        """Counts what a sample's header says of the cache."""
+        """Count what a sample's header says of the cache."""
         kind, _, trouble = said.partition(": ")
         self.cache_hits += kind == "hit"
         self.cache_misses += kind == "miss"

@@ -182,7 +182,7 @@ class Dispatcher:
         if session is not None and session.user != user:
             session = None  # another key cannot act for it
         if session is not None:
-            session.heard(now)
+            session.mark_heard(now)
         match message:
             case Hello():
                 return [self._hello(identity, message, now, user)]
@@ -293,11 +293,11 @@ class Dispatcher:
         if isinstance(message, Hello):
             text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
-        if not self.registry.heard(identity, now):
+        if not self.registry.mark_heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
             case Begun(lease):
-                self.leases.begun(lease, identity, now)
+                self.leases.mark_begun(lease, identity, now)
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
@@ -380,7 +380,7 @@ class Dispatcher:
         return actions + self._assign(now)
 
     def stop_workers(self) -> list[ToWorker]:
-        """Tells every worker to finish and leave."""
+        """Tell every worker to finish and leave."""
         return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
@@ -417,7 +417,7 @@ class Dispatcher:
                 actions.append(ToConsumer(request.session, payload))
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
-        self.leases.begun(result.begins, identity, now)
+        self.leases.mark_begun(result.begins, identity, now)
         return actions + self._assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
@@ -441,7 +441,7 @@ class Dispatcher:
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
         """Accounts for a sample; False when nobody waits for it."""
-        if not self.sessions.answered(request, bounded_seconds(header.cpu_seconds)):
+        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
         self.counters.samples += 1
@@ -468,7 +468,7 @@ class Dispatcher:
     # --- requests ----------------------------------------------------------------------------------------------------
 
     def _assign(self, now: float) -> list[Action]:
-        """Gives waiting requests to workers, until there is no request or no room."""
+        """Give waiting requests to workers, until there is no request or no room."""
         actions: list[Action] = []
         while not self.blocked_reason:
             if self._lone:
@@ -487,7 +487,7 @@ class Dispatcher:
         return actions
 
     def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
-        """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
+        """Give a worker the requests of one clip, except those whose candidate is in quarantine."""
         session = self.sessions.get(requests[0].session)
         if session is None:
             return []

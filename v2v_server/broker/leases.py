@@ -152,7 +152,7 @@ class LeaseBook:
         return None if lease is None or lease.worker != worker else lease.request
 
     def grant(self, request: Request, worker: bytes, now: float, work_seconds: float = 0.0) -> int:
-        """Gives the request to a worker.
+        """Give the request to a worker.
 
         Args:
             request, worker: who makes what.
@@ -174,7 +174,7 @@ class LeaseBook:
         self._changed.add(worker)
         return number
 
-    def begun(self, number: int, worker: bytes, now: float) -> None:
+    def mark_begun(self, number: int, worker: bytes, now: float) -> None:
         """The worker started on it. The clock of those queued behind it starts again: they wait through no fault.
 
         A lease begins once: said again it would put off the deadline for ever.

@@ -125,7 +125,7 @@ class Quarantine:
         return None
 
     def extend(self, entries: Iterable[QuarantineEntry]) -> None:
-        """Takes up what was written down since.
+        """Take up what was written down since.
 
         Raises:
             CorpusError: their numbers do not go on where ours end.
@@ -169,7 +169,7 @@ def read_quarantine(file: Path) -> Quarantine:
 
 
 def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[QuarantineEntry]:
-    """Gives a verdict the next number and has it on disk before anybody is served under the new snapshot.
+    """Give a verdict the next number and has it on disk before anybody is served under the new snapshot.
 
     Args:
         file: of the quarantine; made when it is missing.

@@ -93,9 +93,9 @@ class Session:
     def __post_init__(self) -> None:
         self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
 
-    def heard(self, now: float) -> None:
+    def mark_heard(self, now: float) -> None:
         """Its consumer said something."""
-        self.liveness.heard(now)
+        self.liveness.mark_heard(now)
         self.left_at = None
 
     def add_wait(self, seconds: float, now: float) -> float:
@@ -142,7 +142,7 @@ class Sessions:
         return [each.identity for each in self if owner and each.owner == owner]
 
     def forget(self, identity: bytes) -> None:
-        """Drops a session, if there is one; what it owes is remembered."""
+        """Drop a session, if there is one; what it owes is remembered."""
         session = self._sessions.pop(identity, None)
         if session is not None:
             self._turns.remove(identity)
@@ -227,7 +227,7 @@ class Sessions:
         if session is not None and (request.epoch, request.index) in session.unanswered:
             session.waiting.appendleft(request)
 
-    def answered(self, request: Request, worker_seconds: float) -> bool:
+    def mark_answered(self, request: Request, worker_seconds: float) -> bool:
         """The request is answered; returns False when nobody waits for it (the session is gone, or had it already)."""
         session = self._sessions.get(request.session)
         if session is None or (request.epoch, request.index) not in session.unanswered:

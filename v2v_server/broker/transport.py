@@ -113,10 +113,10 @@ class ServerTransport(Protocol):
         """False when the peer is not connected any more, or does not read what it is sent."""
 
     def cut(self, identity: bytes) -> None:
-        """Ends the connection of a consumer."""
+        """End the connection of a consumer."""
 
     def close(self) -> None:
-        """Ends all connections; what was not sent is dropped."""
+        """End all connections; what was not sent is dropped."""
 
 
 class Sockets:
@@ -251,7 +251,7 @@ class Sockets:
         return identity.bytes, frames
 
     def _review(self, gate: Gate, consumers: list[bytes], workers: list[bytes]) -> None:
-        """Forgets those that are gone, and cuts off whose key was revoked."""
+        """Forget those that are gone, and cuts off whose key was revoked."""
         for side, identities in (("consumer", consumers), ("worker", workers)):
             for identity in identities:
                 self._users.pop((side, identity), None)

@@ -47,7 +47,7 @@ class Member:
     memory_bytes: int = 0
 
 
-def shown(text: str) -> str:
+def clean_name(text: str) -> str:
     """What a peer calls itself, fit for a person's eyes: short, and without control characters."""
     return "".join(filter(str.isprintable, text[:LONGEST_NAME]))
 
@@ -90,7 +90,7 @@ class Workers:
     def add(self, identity: bytes, credit: int, now: float, host: str = "") -> None:
         """A worker said hello."""
         room = max(1, min(credit, MOST_WORKER_CREDIT))
-        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), shown(host))
+        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), clean_name(host))
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
@@ -99,12 +99,12 @@ class Workers:
         self._resting.pop(identity, None)
         self._changed.add(identity)
 
-    def heard(self, identity: bytes, now: float) -> bool:
+    def mark_heard(self, identity: bytes, now: float) -> bool:
         """A message came from it; False when nobody of that name said hello."""
         worker = self._workers.get(identity)
         if worker is None:
             return False
-        worker.liveness.heard(now)
+        worker.liveness.mark_heard(now)
         return True
 
     def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:

@@ -32,7 +32,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.used import PARTIAL, counted, locked_use, used_bytes
+from v2v_server.store.used import PARTIAL, count_bytes, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
@@ -203,7 +203,7 @@ class Cache:
         index: FrameIndex,
         missing: Sequence[_Piece],
     ) -> None:
-        """Decodes the missing pieces in one pass, and keeps each.
+        """Decode the missing pieces in one pass, and keeps each.
 
         Raises:
             VideoError: they do not decode.
@@ -227,7 +227,7 @@ class Cache:
                 self._keep(piece.path, head, chain((picture,), more))
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
-        """Writes a piece, and gives it its name if there is room."""
+        """Write a piece, and gives it its name if there is room."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
@@ -247,7 +247,7 @@ class Cache:
                 partial.unlink()
 
     def _remove(self, path: Path, why: str) -> None:
-        """Removes a piece that cannot be read, so that it is made anew."""
+        """Remove a piece that cannot be read, so that it is made anew."""
         self.trouble = f"a damaged piece was removed: {why}"
         with contextlib.suppress(OSError), locked_use(self.folder) as used:
             size = path.stat().st_size
@@ -269,7 +269,7 @@ class _Piece:
 
 
 def make_cache(folder: Path) -> None:
-    """Makes the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
+    """Make the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
     it did not keep.
 
     Raises:
@@ -278,13 +278,13 @@ def make_cache(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(BlockingIOError), locked_use(folder) as used:
-            used.bytes = counted(folder)
+            used.bytes = count_bytes(folder)
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what workers that are gone have left half-written: those that live hold locks."""
+    """Remove what workers that are gone have left half-written: those that live hold locks."""
     for path in (folder / PARTIAL).iterdir():
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -27,7 +27,7 @@ class Used:
     bytes: int
 
     def add(self, more: int) -> None:
-        """Counts so many more."""
+        """Count so many more."""
         self.bytes = max(0, self.bytes + more)
 
 
@@ -56,7 +56,7 @@ def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Us
     with open(_open_regular(folder / _USED, os.O_RDWR | os.O_CREAT), "r+b") as file:
         _lock(file.fileno(), wait_seconds)
         text = file.read(64)
-        used = Used(int(text) if text.isdigit() else counted(folder))
+        used = Used(int(text) if text.isdigit() else count_bytes(folder))
         yield used
         file.seek(0)
         file.write(b"%020d" % used.bytes)
@@ -92,7 +92,7 @@ def _lock(descriptor: int, wait_seconds: float) -> None:
         pause = min(2 * pause, 0.1)
 
 
-def counted(folder: Path) -> int:
+def count_bytes(folder: Path) -> int:
     """The bytes of all files, counted anew."""
     sizes = 0
     for below in folder.iterdir():

@@ -299,7 +299,7 @@ class WorkerConversation:
         return lease
 
     def _results(self) -> list[Action]:
-        """Says what is done, and along with it what is begun next."""
+        """Say what is done, and along with it what is begun next."""
         if not self._unsent:
             return []
         may_go_on = self._leases and not self._stopping and self._callbacks.is_ready(self._leases[0])

@@ -38,7 +38,7 @@ class Logbook:
         return os.pread(self.descriptor, 1, _BYTES) == _DECODES
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Let go of the file."""
         self._file.close()
 
 

@@ -147,7 +147,7 @@ class Worker:
         self._poller.register(self._monitor, zmq.POLLIN)
 
     def stop(self) -> None:
-        """Finishes the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
+        """Finish the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
         self._conversation.stop()
 
     def run(self) -> None:
@@ -180,7 +180,7 @@ class Worker:
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
     def _take(self, step: Action) -> list[Action]:
-        """Takes the next step; returns what the conversation says to what came of it."""
+        """Take the next step; returns what the conversation says to what came of it."""
         conversation = self._conversation
         match step:
             case Listen(seconds):
@@ -328,7 +328,7 @@ def run_worker(
     keys: str | None = None,
     log: Log | None = None,
 ) -> None:
-    """Runs one worker in this process until the server stops it.
+    """Run one worker in this process until the server stops it.
 
     Args:
         address: where the server listens for workers.

@@ -69,7 +69,7 @@ class Decoded:
 
 
 def plan_sample(lease: Lease, index: int) -> SamplePlan:
-    """Draws the camera of one of a lease's indices.
+    """Draw the camera of one of a lease's indices.
 
     Raises:
         ProtocolError: the lease does not fit its form.
@@ -100,7 +100,7 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 def decode_for(
     lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
 ) -> tuple[Decoded, ...]:
-    """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
+    """Decode, in one pass, the frames that some of a lease's indices need, and no more.
 
     Args:
         lease: the work.
@@ -144,7 +144,7 @@ def sample_layout(lease: Lease) -> Layout:
 
 
 def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
-    """Makes a lease's sample of what was decoded for it: view, flow, simulation.
+    """Make a lease's sample of what was decoded for it: view, flow, simulation.
 
     Args:
         lease: the work.

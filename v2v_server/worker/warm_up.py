@@ -38,7 +38,7 @@ _POLL_SECONDS = 0.1
 
 
 def warm_up_in_turn() -> None:
-    """Loads what every worker runs; before that, compiles it or waits for another process that does."""
+    """Load what every worker runs; before that, compiles it or waits for another process that does."""
     with one_compiles(*_place()) as is_to_compile:
         if is_to_compile:
             _compile_apart()
@@ -61,7 +61,7 @@ def is_compiled(variant: Variant) -> bool:
 
 
 def load_kernels() -> None:
-    """Loads from the cache, or compiles, what every worker runs."""
+    """Load from the cache, or compiles, what every worker runs."""
     warm_up()
     import_module("v2v_server.video.full_range")  # importing it compiles, or loads, what is in it
 
@@ -76,7 +76,7 @@ def _place(variant: Variant | None = None) -> tuple[Path, str]:
 
 
 def _compile_apart(*variant: str) -> None:
-    """Compiles in a child process. Should that fail, so will the caller's loading, or it does the work."""
+    """Compile in a child process. Should that fail, so will the caller's loading, or it does the work."""
     command = [sys.executable, "-m", __name__, str(os.getpid()), *variant]
     with suppress(PermissionError):  # a confined worker starts no program: its loading compiles, and keeps the memory
         subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
@@ -112,7 +112,7 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
 
 @contextmanager
 def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
-    """Holds a lock on the file, or none after that time or where there are no locks."""
+    """Hold a lock on the file, or none after that time or where there are no locks."""
     try:
         file = path.open("ab")
     except OSError:

@@ -14,7 +14,7 @@ from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoCha
 from v2v_server.cloud import bucket as bucket_module
 from v2v_server.cloud.bucket import AccessDenied, Bucket, ObjectGone, StoreFault, is_url
 from v2v_server.cloud.copies import Copies, copies_of
-from v2v_server.store.used import PARTIAL, counted, used_bytes
+from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
@@ -57,7 +57,7 @@ def copies(store: Path, most: int = 10 * SIZE) -> Copies:
 def files(made: Copies) -> set[bytes]:
     """The first byte of each copy."""
     found = list(made.folder.glob("??/*"))
-    assert sum(path.stat().st_size for path in found) == used_bytes(made.folder) == counted(made.folder)
+    assert sum(path.stat().st_size for path in found) == used_bytes(made.folder) == count_bytes(made.folder)
     return {path.read_bytes()[:1] for path in found}
 
 

@@ -81,7 +81,7 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
     at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
     at.now = 31.0
     for name in (b"idle", b"resting"):
-        at.dispatcher.registry.heard(name, at.now)
+        at.dispatcher.registry.mark_heard(name, at.now)
     at.dispatcher.registry.vanished(at.now)
     states = {worker.name: worker for worker in watched.state().workers}
     assert {name: worker.state for name, worker in states.items()} == {
