@@ -1,4 +1,4 @@
-"""From arrivals to batches: rows are filled in any order, batches leave in theirs."""
+"""Assemble samples into batches. Rows are filled in any order; batches leave in order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from v2v_protocol.messages import SampleHeader
 
 @dataclass(slots=True)
 class _PartialBatch:
-    """A batch being filled: its memory, and what was said of each sample that came."""
+    """Hold a batch that is being filled: its memory, and the header of each sample received."""
 
     memory: BatchMemory
     headers: dict[int, SampleHeader] = field(default_factory=dict)  # by row
@@ -37,15 +37,15 @@ def deliver(
     shared_memory: bool = True,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Batch]:
-    """The batches of an open connection, in order.
+    """Yield the batches of an open connection, in order.
 
     Args:
-        plan: which samples make up a batch.
+        plan: defines which samples make up a batch.
         batches: numbers of the batches to deliver.
-        epoch: of the samples.
-        resume_state: the state after a batch, by its number and the newest quarantine snapshot seen up to it.
-        buffers: for the batches.
-        shared_memory: whether workers of this host may put samples into memory of this process.
+        resume_state: returns the state after a batch, given its number and the newest quarantine snapshot seen up to
+            it.
+        buffers: reusable memory for the batches.
+        shared_memory: whether workers on this host may write samples into memory of this process.
         clock: seconds, for ``Batch.wait_seconds``.
 
     Raises:
@@ -53,7 +53,7 @@ def deliver(
     """
     window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
     most_partial = -(-connection.credit // plan.batch_size) + 2
-    # And the one that the trainer has: all of them are free when an epoch ends.
+    # One more for the batch that the trainer holds: all of them are free when an epoch ends.
     buffers.shape(connection.layout, plan.batch_size, spare=most_partial + 1)
     partial: dict[int, _PartialBatch] = {}
     quarantine, lend = 0, shared_memory
@@ -79,7 +79,8 @@ def deliver(
     while not window.finished:
         began = clock()
         ask()
-        # What came while the trainer was busy; asking for more before it is busy again keeps the server at work.
+        # First take what arrived while the trainer was busy. Asking for more before it is busy again keeps the server
+        # working.
         while (sample := connection.receive(wait=False)) is not None:
             accept(sample)
             ask()
@@ -88,9 +89,9 @@ def deliver(
                 accept(sample)
                 ask()
         ask()
-        sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
+        sample = None  # a reference kept here would keep the batch's buffers and messages alive
         batch = partial.pop(number)
-        # Workers elsewhere have no use for it, and a message is cheaper without.
+        # Workers on other hosts cannot use slots, and a message without slots is cheaper.
         lend = lend and (batch.memory.in_place > 0 or not batch.memory.has_slots)
         headers = [batch.headers[row] for row in range(plan.batch_size)]
         provenance = tuple(connection.provenance(header) for header in headers)
