@@ -42,6 +42,7 @@ class Scripted:
         self.after_record = after_record
         self.told: list[tuple[Any, ...]] = []
         self.times: list[float] = []
+        self.blocked_reason = ""
         self.counters = Counters()
         self._there = peers().dispatcher
 
@@ -86,8 +87,8 @@ def served(
     **settings: Any,
 ) -> Server:
     """A server that has made one turn."""
-    doubted: list[str] = []
-    catalogue = SimpleNamespace(check=check, doubted=doubted, doubt=doubted.append, root=folder, videos=(), refusals=())
+    stale: list[str] = []
+    catalogue = SimpleNamespace(check=check, stale=stale, mark_stale=stale.append, root=folder, videos=(), refusals=())
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),
@@ -132,7 +133,7 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
     dispatcher = Scripted([missing, missing])
     server = served(dispatcher, tmp_path, check=check)
     assert dispatcher.told == [("looked for", missing, found)] * 2
-    assert cast(Any, server)._catalogue.doubted == ([] if found else ["a.mp4"] * 2)
+    assert cast(Any, server)._catalogue.stale == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
     assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
 

@@ -1,7 +1,7 @@
-"""The server's mind: messages and deaths in, actions out. No sockets, no processes, no clock.
+"""Decide what the server does: messages and lost peers in, actions out. No sockets, no processes, no clock.
 
-Consumers ask (Want), sessions queue, free workers are given leases, results pass through as they are. Whatever a peer
-sends, the answer is an action or a counted fault, never an exception: one bad peer must not stop the others.
+Consumers send Want, sessions queue requests, free workers get leases, and results are passed on unchanged. Every
+message from a peer leads to an action or a counted fault, never to an exception: one bad peer must not stop the others.
 """
 
 from __future__ import annotations
@@ -69,31 +69,30 @@ from v2v_server.catalogue.catalogue import Catalogue
 MOST_SESSIONS = 4096
 _LONGEST_SECRET_BYTES = 64
 MOST_FAULTS = 16
-"""Malformed messages after which a consumer is cut off: to answer each costs as much as a sample."""
+"""Malformed messages after which a consumer is disconnected: answering one costs as much as a sample."""
 
 
 class Dispatcher:
-    """Decides who gets what.
+    """Assign requests of consumers to workers.
 
     Args:
-        catalogue: the corpus.
-        default_spec: what a consumer gets that asks for nothing in particular.
-        lease_deadline_seconds: a worker silent for longer over one sample, besides what that sample may take, is taken
-            for hung.
-        session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
+        default_spec: the spec of a consumer that sends none.
+        lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
+            that the sample may take, is treated as hung.
+        session_idle_seconds: a consumer that is silent for longer is forgotten; it can come back.
         max_credit_bytes: bound on the bytes in flight to one consumer.
-        quarantine: the snapshots; verdicts that were written down are added to it.
-        wall_clock: gives the time for a verdict, ISO 8601.
-        expected_workers: workers that will serve in all, this host's and others', counted before they have said
-            hello: a consumer's credit is settled when it connects, which may be before the first of them is there.
+        quarantine: the snapshots; new entries are added to it once they are on disk.
+        wall_clock: returns the time for a quarantine entry, ISO 8601.
+        expected_workers: total number of workers expected, including other hosts. It sets a consumer's credit when the
+            consumer connects, which may be before the first worker says hello.
 
     Attributes:
-        counters: what happened so far.
+        counters: totals since the start.
         sessions: the consumers.
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         registry: the workers.
-        leases: who makes what.
-        candidates: what was refused.
+        leases: which worker makes what.
+        candidates: which sequences were refused.
     """
 
     def __init__(
@@ -119,31 +118,31 @@ class Dispatcher:
         self.registry = Workers(self.leases)
         self._lone: deque[Request] = deque()
         self.blocked_reason = ""
-        self._faults: dict[bytes, int] = {}  # of consumers that are connected
+        self._faults: dict[bytes, int] = {}  # malformed messages of connected consumers
 
     @property
     def workers(self) -> int:
-        """Workers that said hello and are alive as far as is known."""
+        """Number of workers that said hello and are alive as far as is known."""
         return len(self.registry)
 
     @property
     def waiting(self) -> int:
-        """Asked samples that nobody works on yet."""
+        """Number of requested samples that are not leased to a worker yet."""
         return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
 
     @property
     def waiting_share(self) -> float:
-        """Consumers that asked for something nobody works on yet, of all that are connected: 0 to 1."""
+        """Share of the connected consumers that have requests without a worker: 0 to 1."""
         connected = [session for session in self.sessions if session.left_at is None]
         return sum(bool(session.waiting) for session in connected) / max(len(connected), 1)
 
     @property
     def consumers(self) -> int:
-        """Consumers that are connected, as far as is known."""
+        """Number of consumers that are connected, as far as is known."""
         return sum(session.left_at is None for session in self.sessions)
 
     def identity_of(self, request: Request) -> SampleId | None:
-        """Whose identity a request is for; None when its consumer is gone."""
+        """Return the identity of the sample that a request asks for; None if its consumer is gone."""
         session = self.sessions.get(request.session)
         if session is None:
             return None
@@ -151,7 +150,7 @@ class Dispatcher:
         return SampleId(session.spec.digest, catalogue, NUMERICS_VERSION, session.seed, request.epoch, request.index)
 
     def clip_of(self, request: Request) -> tuple[str, int] | None:
-        """Video and first frame that a request is made from now; None when its consumer is gone."""
+        """Return the video and first frame of the request's current candidate; None if its consumer is gone."""
         session = self.sessions.get(request.session)
         if session is None:
             return None
@@ -160,7 +159,7 @@ class Dispatcher:
 
     @property
     def idle_share(self) -> float:
-        """Workers that hold no lease, of all that there are: 0 to 1."""
+        """Share of the workers that hold no lease: 0 to 1."""
         return max(0.0, 1.0 - self.leases.holders / max(len(self.registry), 1)) if self.registry else 0.0
 
     # --- consumers ---------------------------------------------------------------------------------------------------
@@ -171,8 +170,8 @@ class Dispatcher:
         Args:
             identity: routing id of the connection.
             frames: the message.
-            now: the time.
-            user: name of the key that the connection has; empty without keys.
+            now: monotonic time, seconds.
+            user: name of the connection's key; empty without keys.
         """
         try:
             message = _only(frames)
@@ -180,7 +179,7 @@ class Dispatcher:
             return [self._fault(identity, error)]
         session = self.sessions.get(identity)
         if session is not None and session.user != user:
-            session = None  # another key cannot act for it
+            session = None  # a session belongs to one key
         if session is not None:
             session.mark_heard(now)
         match message:
@@ -208,18 +207,18 @@ class Dispatcher:
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, stray)]
             case _:
-                stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
+                stray = ProtocolError(f"consumers cannot send {type(message).__name__}")
                 return [self._fault(identity, stray)]
 
     def consumer_gone(self, identity: bytes, now: float) -> None:
-        """The connection of a consumer has ended. It may come back at once over another one, and find its session."""
+        """Note that a consumer's connection has ended. The consumer may reconnect at once and find its session."""
         self._faults.pop(identity, None)
         session = self.sessions.get(identity)
         if session is not None:
             session.left_at = now
 
     def consumer_lost(self, identity: bytes) -> None:
-        """The consumer left, or cannot be reached any more."""
+        """Forget a consumer that left or cannot be reached any more."""
         self.sessions.forget(identity)
         self.leases.forget_session(identity)
         self._lone = deque(request for request in self._lone if request.session != identity)
@@ -266,7 +265,7 @@ class Dispatcher:
         return []
 
     def _fault(self, identity: bytes, error: ProtocolError) -> Action:
-        """The answer to a consumer's message that is none."""
+        """Answer a malformed message from a consumer."""
         faults = self._faults[identity] = self._faults.pop(identity, 0) + 1
         if len(self._faults) > MOST_SESSIONS:
             del self._faults[next(iter(self._faults))]
@@ -281,7 +280,7 @@ class Dispatcher:
     # --- workers -----------------------------------------------------------------------------------------------------
 
     def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Action]:
-        """A message from the workers' side. The frames behind a Result are passed on as they are."""
+        """Handle a message from the workers' side. The frames behind a Result are passed on unchanged."""
         try:
             message = decode(frames[0]) if frames else _only(frames)
         except ProtocolError as error:
@@ -312,16 +311,16 @@ class Dispatcher:
                 return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
-        """A worker died, was given up, or cannot be reached any more."""
+        """Take back the leases of a worker that died, was given up, or cannot be reached any more."""
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
     def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
-        """A worker was kept from working for so long; no deadline runs meanwhile."""
+        """Extend the deadlines of a worker by the time in which it could not run."""
         self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
-        """Something sent to a worker did not go out, and nobody will say what became of its process."""
+        """Take back the leases of a worker that a message did not reach and that no supervisor watches."""
         if identity not in self.registry:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
@@ -329,29 +328,30 @@ class Dispatcher:
     def quarantine_recorded(
         self, record: AddToQuarantine, written: Sequence[QuarantineEntry], now: float
     ) -> list[Action]:
-        """What came of a :class:`AddToQuarantine`.
+        """Continue after an :class:`AddToQuarantine`.
 
         Args:
             record: the action.
-            written: the lines that the quarantine has more now, others' among them; none when it cannot be written.
-            now: the time.
+            written: the lines that the quarantine has gained, including those of other processes; empty if it cannot be
+                written.
+            now: monotonic time, seconds.
         """
         before = self._quarantine.latest
         self._quarantine.extend(written)
-        # Consumers that went on under the newest snapshot go on under the newest. One that resumed an older one keeps
-        # it: what was cleared since must not come back, nor what it had refused be admitted.
+        # Consumers under the newest snapshot move on to the new one. A consumer that resumed an older snapshot keeps
+        # it: entries cleared since must not return, and sequences that it refused must stay refused.
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
         return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._assign(now)]
 
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
-        """What came of a :class:`CheckVideo`: the video's fault, or that of the worker's host.
+        """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.
 
         Args:
             missing: the action.
             found: whether this host has the video as it was catalogued.
-            now: the time.
+            now: monotonic time, seconds.
         """
         if not found:
             return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
@@ -361,11 +361,13 @@ class Dispatcher:
         return self._assign(now)
 
     def tick(self, now: float) -> list[Action]:
-        """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
+        """Apply deadlines, lease slow samples to a second worker, and forget silent peers. Call a few times a
+        second.
+        """
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
-        self.blocked_reason = ""  # to try again
+        self.blocked_reason = ""  # cleared so that the next lease is tried
         self.registry.wake(now)
         for identity in self.registry.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
@@ -376,7 +378,7 @@ class Dispatcher:
             if second is not None and not runs_alone(request):
                 self.counters.second_leases += 1
                 actions += self._grant(replace(request, slot=None), second, now)
-        # A consumer that left may have freed a worker that was kept for it, or for its requests.
+        # A consumer that left may have freed a worker that was reserved for its requests.
         return actions + self._assign(now)
 
     def stop_workers(self) -> list[ToWorker]:
@@ -407,8 +409,8 @@ class Dispatcher:
             try:
                 header = check_result(payload, request, session.form)
             except ProtocolError as error:
-                # No worker of ours does this, and one that did it once would do it again.
-                refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
+                # Our workers never send such a result; a worker that sends one would send more.
+                refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
@@ -429,18 +431,18 @@ class Dispatcher:
         if not failed.here:
             self.registry.can_work(identity)
             return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
-        # The catalogue is of this host's files: if the video is here, other workers can have it too.
+        # The catalogue lists this host's files: if the video is here, other workers can probably read it.
         video = self.candidates.sequence(session, request).video
         return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
-        """Who asked for it and waits no more pays for it all the same."""
+        """Charge a consumer for a sample that it asked for and then abandoned."""
         debt = self.leases.debt(lease, worker, now)
         if debt is not None:
             self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Accounts for a sample; False when nobody waits for it."""
+        """Count a sample; return False if no session waits for it."""
         if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
@@ -468,7 +470,7 @@ class Dispatcher:
     # --- requests ----------------------------------------------------------------------------------------------------
 
     def _assign(self, now: float) -> list[Action]:
-        """Give waiting requests to workers, until there is no request or no room."""
+        """Give waiting requests to workers until there are no requests or no free workers."""
         actions: list[Action] = []
         while not self.blocked_reason:
             if self._lone:
@@ -525,28 +527,28 @@ class Dispatcher:
             )
             return [ToWorker(worker, encode(lease))]
         except IndexUnreadable as error:
-            self.blocked_reason = f"{error}; it is tried again ten times a second"
+            self.blocked_reason = f"{error}; retried ten times a second"
             returned = self.leases.finished(number, worker, now)
             if returned is not None:
                 self.sessions.put_back(returned)
             return []
         except V2VError as error:
-            # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
+            # The index of this video cannot be read, or is too large to send; other videos are not affected.
             returned = self.leases.finished(number, worker, now)
             return [] if returned is None else self.candidates.refuse(returned, None, str(error))
 
 
 def _only(frames: Sequence[Buffer]) -> Message:
     if len(frames) != 1:
-        raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
+        raise ProtocolError(f"message with {len(frames)} frames; this kind has one")
     return decode(frames[0], LARGEST_REQUEST_BYTES)
 
 
 def _slots(want: Want) -> list[Slot | None]:
-    """Where the samples may be put.
+    """Return where the samples may be put.
 
     Raises:
-        ProtocolError: that is nowhere.
+        ProtocolError: a slot does not exist, or the numbers of slots and indices differ.
     """
     if not len(want.arenas) == len(want.slots) in (0, len(want.indices)):
         raise ProtocolError(f"want: {len(want.arenas)} arenas, {len(want.slots)} slots for {len(want.indices)} indices")
@@ -560,7 +562,7 @@ def _slots(want: Want) -> list[Slot | None]:
 
 
 def _owner(user: str, secret: bytes) -> bytes:
-    """Name who may take a session over: a key, if there are keys, and a secret."""
+    """Return a digest of who may take a session over: a key, if there are keys, and a secret."""
     return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""
 
 

@@ -1,6 +1,6 @@
-"""From a lease to its samples: decode, view, simulate.
+"""Make the samples of a lease: decode, view, simulate.
 
-Server workers and `v2v-simulate` both come through here, which is why a sample made by either is the same.
+Server workers and `v2v-simulate` both use this module, so they make equal samples.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class SamplePlan:
         spec: the stream's spec.
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
-        cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
-        flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
-        flow_plan: what the statistics of the scene say about flow; None where the spec does not ask them.
+        cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
+        flow: settings of the flow if the lease asks for it; ``cut`` then includes its margin.
+        flow_plan: flow methods chosen from the statistics of the scene; None if the spec does not use them.
     """
 
     spec: StreamSpec
@@ -62,17 +62,17 @@ class SamplePlan:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The decoded part of a sample."""
+    """The decoded clip of a sample, with its plan."""
 
     plan: SamplePlan
     clip: DecodedClip
 
 
 def plan_sample(lease: Lease, index: int) -> SamplePlan:
-    """Draw the camera of one of a lease's indices.
+    """Draw the camera for one of a lease's indices, and plan what to decode.
 
     Raises:
-        ProtocolError: the lease does not fit its form.
+        ProtocolError: the lease is malformed.
     """
     spec = _spec(lease.spec)
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
@@ -100,17 +100,17 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 def decode_for(
     lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
 ) -> tuple[Decoded, ...]:
-    """Decode, in one pass, the frames that some of a lease's indices need, and no more.
+    """Decode, in one pass, exactly the frames that some of a lease's indices need.
 
     Args:
         lease: the work.
-        indices: of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to, on this host; or their copies, from object storage.
-        cache: where what is decoded is kept, and read by later epochs; None keeps nothing.
+        indices: a subset of ``lease.indices``.
+        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        cache: cache of decoded pieces for later epochs; None stores nothing.
 
     Raises:
-        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
-        ProtocolError: the lease does not fit its form.
+        VideoError: the file is not the catalogued one, or cannot deliver the expected frames.
+        ProtocolError: the lease is malformed.
     """
     plans = [plan_sample(lease, index) for index in indices]
     spec = plans[0].spec
@@ -126,16 +126,16 @@ def decode_for(
             if clips is None:
                 clips = clips_of(path, lease.fingerprint, *what)
     except VideoError as error:
-        # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
+        # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
     return tuple(Decoded(plan, clip) for plan, clip in zip(plans, clips, strict=True))
 
 
 def sample_layout(lease: Lease) -> Layout:
-    """dtype and shape of each array of a lease's sample.
+    """Return dtype and shape of each array of a lease's sample.
 
     Raises:
-        ProtocolError: the lease asks for an array that nobody makes.
+        ProtocolError: the lease asks for an unknown array.
     """
     try:
         return _layout(lease.spec, lease.arrays)
@@ -144,17 +144,17 @@ def sample_layout(lease: Lease) -> Layout:
 
 
 def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
-    """Make a lease's sample of what was decoded for it: view, flow, simulation.
+    """Make a lease's sample from its decoded clip: view, flow, simulation.
 
     Args:
         lease: the work.
-        decoded: what was decoded for it.
-        into: C-contiguous arrays for the sample, of :func:`sample_layout`; None makes them.
+        decoded: its decoded clip.
+        into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
 
     Raises:
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
-        ProtocolError: the lease does not fit its form.
+        ProtocolError: the lease is malformed.
     """
     plan, index = decoded.plan, lease.indices[0]
     params, recipe, source = plan.params, plan.spec.recipe, plan.source
@@ -194,13 +194,13 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
 
 
 def _decoder(clip: DecodedClip) -> str:
-    """What a provenance says of where the pixels came from."""
+    """Describe the source of the pixels for the provenance."""
     host = "" if clip.bit_exact else " (host-dependent)"
     return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
-    """The compiled kernels that a lease's sample may need."""
+    """Return the compiled kernels that a lease's sample may need."""
     if "voxels" not in lease.arrays:
         return frozenset()
     return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds)
@@ -236,16 +236,16 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
 
 
 def _frame_index(lease: Lease, frames: int) -> FrameIndex:
-    """The index that a lease carries, of which its server may not have looked at a single byte.
+    """Decode the frame index of a lease. Its server may not have checked it.
 
     Raises:
-        VideoError: it is damaged.
+        VideoError: the index is damaged.
     """
     try:
         frame_index = FrameIndex.from_bytes(lease.frame_index)
         frame_index.position(lease.start_frame, frames)
     except (ProtocolError, UsageError) as error:
-        raise VideoError(lease.video, None, f"the server's index of it is damaged: {error}") from error
+        raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return frame_index
 
 
@@ -254,7 +254,7 @@ def _refusals(lease: Lease) -> tuple[Refusal, ...]:
 
 
 def _refuse_outside(video: str) -> None:
-    """A catalogue id may not lead out of the root, whatever a message says."""
+    """Reject a catalogue id that leads out of the root."""
     relative = PurePosixPath(video)
     if relative.is_absolute() or ".." in relative.parts:
         raise ProtocolError(f"video id {video!r} leads out of the corpus folder")

@@ -203,7 +203,7 @@ def test_any_other_damaged_line_is_named_and_left_alone(tmp_path: Path, line: by
     known = write(file, verdict())
     damaged = file.read_bytes() + line + b"\n"
     file.write_bytes(damaged)
-    with pytest.raises(CorpusError, match=r"q\.jsonl, line 2 is damaged .*; mend or delete it"):
+    with pytest.raises(CorpusError, match=r"q\.jsonl, line 2 is damaged .*; correct or delete the line"):
         read_quarantine(file)
     with pytest.raises(CorpusError, match=r"line 2 is damaged"):
         write_entry(file, verdict(), known)

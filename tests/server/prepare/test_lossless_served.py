@@ -161,7 +161,7 @@ def test_another_video_under_the_name_is_refused(pair: tuple[Path, Path], tmp_pa
         (other,) = [name for name in ("a.mp4", "b.webm") if name != lease.video][:1]
         shutil.copy(pair[1] / other, store / lease.video)
         assert plan_sample(lease, lease.indices[0]).cut.count
-        with pytest.raises(VideoChanged, match="was made of another file"):
+        with pytest.raises(VideoChanged, match="was made from another file"):
             whole_sample(lease, folder)
         (store / lease.video).unlink()
         with pytest.raises(VideoError, match="cannot be read"):

@@ -160,7 +160,7 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
         "cut short": index.to_bytes()[:-3],
         "too few frames": index.slice(0, lease.start_frame + 1).to_bytes(),
     }[damage]
-    with pytest.raises(VideoError, match=r"^a\.mp4.*: the server's index of it is damaged: "):
+    with pytest.raises(VideoError, match=r"^a\.mp4.*: its index from the server is damaged: "):
         decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.root)
 
 
