@@ -1,4 +1,4 @@
-"""What the network that comes with this project makes of a clip that it was not trained on."""
+"""Reconstruct a clip with the shipped network, which was not trained on it."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _FILM_HZ = 10.0
 
 
 def reconstruct(clip: Path, picture: Path) -> None:
-    """Draws events, camera and reconstruction side by side.
+    """Draw events, camera and reconstruction side by side.
 
     Args:
-        clip: a virtual camera makes its events.
-        picture: PNG of a few moments; the film of all of them comes beside it, as MP4.
+        clip: video from which a virtual camera makes the events.
+        picture: PNG of a few moments; the film of all moments is written next to it, as MP4.
     """
     network, _ = load_network(SHIPPED)
     sample = V2VDataset(clip, recipe=_RECIPE)[0].arrays
@@ -43,4 +43,4 @@ def reconstruct(clip: Path, picture: Path) -> None:
     with Video(picture.with_suffix(".mp4"), _FILM_HZ) as video:
         for image in film:
             video.add(add_header(image, _PANELS))
-    print(f"picture: {picture} (events, camera, what the shipped network made of the events; time runs down)")
+    print(f"picture: {picture} (events, camera, reconstruction by the shipped network; time runs down)")

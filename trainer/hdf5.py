@@ -1,4 +1,4 @@
-"""Reading HDF5 files of strangers: a file may name other files, and what it names must not be read."""
+"""Check HDF5 files from untrusted sources: a file may refer to other files, which must not be read."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
 
     Args:
         file: the open file.
-        path: its name, for the message.
+        path: its path, for the error message.
 
     Raises:
         UsageError: it has an external link, a dataset with external storage or a virtual dataset.
-        OSError, RuntimeError, KeyError, ValueError: h5py's, of a damaged file.
+        OSError, RuntimeError, KeyError, ValueError: h5py's errors, if the file is damaged.
     """
     groups, seen = [file["/"]], set[int]()
     while groups:
@@ -27,7 +27,7 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
             link = group.get(name, getlink=True)
             if isinstance(link, h5py.ExternalLink):
                 raise _external_error(path, f"{group.name}/{name}", f"links to {link.filename}")
-            if isinstance(link, h5py.SoftLink):  # of this file: what it leads to is checked in its own place
+            if isinstance(link, h5py.SoftLink):  # within this file: its target is visited by itself
                 continue
             item = group[name]
             if isinstance(item, h5py.Group):
@@ -42,6 +42,6 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
 
 def _external_error(path: Path, name: str, what: str) -> UsageError:
     return UsageError(
-        f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make a file of its own with "
-        "h5repack or h5copy -f ext"
+        f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make the file "
+        "self-contained with h5repack or h5copy -f ext"
     )

@@ -121,7 +121,7 @@ def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
 
 def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
-    with pytest.raises(UsageError, match=r"of none of e2vid, .*--model"):
+    with pytest.raises(UsageError, match=r"is none of e2vid, .*--model"):
         load_network(tmp_path / "a.pth")
     with pytest.raises(UsageError, match="model 'unet': give one of"):
         load_network(tmp_path / "a.pth", name="unet")
