@@ -199,7 +199,7 @@ def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
     run = trained(tmp_path, server.address, "run", run__steps=12, run__judge_every=5)
     assert losses(run) == losses(whole)
     judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
-    assert [record["step"] for record in judged] == [5, 10, 12]
+    assert [record["step"] for record in judged] == [0, 5, 10, 12]
     assert judged[-1]["held_out_total"] < judged[0]["held_out_total"]
     assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
 
@@ -208,6 +208,7 @@ def test_the_network_that_does_best_on_recordings_is_kept(server: FakeServer, wh
     """Scored at the ends of epochs, without changing the training; a resumed run knows what was best before."""
     for seed in range(2):
         random_recording(tmp_path / "recordings" / f"{seed}.h5", seed=seed)
+    blank = "validation_constant_grey_mse"
     validation = {"run__validate": str(tmp_path / "recordings"), "run__validate_every": 2}
     run = trained(tmp_path, server.address, "run", run__steps=23, **validation)
     assert losses(run)[:12] == losses(whole)
@@ -223,6 +224,7 @@ def test_the_network_that_does_best_on_recordings_is_kept(server: FakeServer, wh
     trained(tmp_path, server.address, "run", "run/last.pt", run__steps=43, **validation)
     assert list(scored()) == [10, 20, 30, 40]
     assert load_checkpoint(run / "best.pt").step == min(scored(), key=scored().__getitem__)
+    assert [r["step"] for r in read_metrics(run / METRICS) if blank in r] == [10]  # it does not change
     said = trainer_evaluation_means(run / "best.pt", tmp_path / "recordings")
     assert said["mse"] == pytest.approx(min(scored().values()), rel=1e-6)
 
@@ -319,7 +321,7 @@ def test_flow_is_judged_and_shown_as_well(server: FakeServer, tmp_path: Path) ->
     )  # fmt: skip
     assert server.hellos[-1].arrays == ("voxels", "flow", "flow_valid")
     judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
-    assert [record["step"] for record in judged] == [1, 2]
+    assert [record["step"] for record in judged] == [0, 1, 2]
     assert all(record["held_out_end_point_error_px"] > 0 for record in judged)
     sheet = cv2.imread(str(run / "previews" / "step-0000002-0.png"))
     height, width = 3 * (8 * 16 + 4), 3 * (8 * 20 + 4)
@@ -430,6 +432,25 @@ def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "catalogue_digest" in message
 
 
+def test_a_refused_resume_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither the configuration nor readings of the other corpus, and no reading is dropped."""
+    with FakeServer(sequences=23) as server:
+        run = trained(tmp_path, server.address, "run", run__steps=4, run__save_every=2, run__keep_epochs=1)
+        early = trained(tmp_path, server.address, "early", run__steps=2)
+        shutil.copy(early / LAST, run / "early.pt")
+
+        def content() -> dict[str, bytes]:
+            return {str(path): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+        before = content()
+        server.restart(catalogue="catalogue-2")
+        message = refused(
+            tmp_path, server.address, capsys, resume="run/early.pt", run__steps=9, run__judge_every=1, run__log_every=3
+        )
+    assert "catalogue_digest" in message
+    assert content() == before
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -487,7 +508,7 @@ def test_a_disk_that_refuses_is_said(
 
     monkeypatch.setattr("trainer.loop.save_checkpoint", full)
     message = refused(tmp_path, server.address, capsys, run__steps=2)
-    assert re.search(r"step 2 cannot be saved as .*last\.pt: No space left on device", message)
+    assert re.search(r"step 2 cannot be saved as .*last\.pt: No space left on device; .* start the run again", message)
 
 
 def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import gc
 import json
 import os
+import resource
 import signal
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.config import OptimizerConfig, RunConfig, StreamConfig
+from trainer.config import OptimizerConfig, RunConfig, StreamConfig, TrainConfig
 from trainer.feed import server_flags
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
@@ -277,6 +279,61 @@ def test_a_reading_that_cannot_be_written_is_said(tmp_path: Path) -> None:
         reporter.metrics(1, 0, 0.1, {"total": 1.0})
 
 
+READING = {"total": 1.0, "steps_per_second": 1.0, "data_wait_seconds": 0.0}
+FULL: dict[str, Callable[[Reporter], object]] = {
+    "metrics.jsonl": lambda reporter: reporter.metrics(1, 0, 0.1, READING),
+    "config.yaml": lambda reporter: reporter.configuration(TrainConfig()),
+    "previews": lambda reporter: reporter.preview(1, [np.zeros((2, 16, 16, 3), np.uint8)], ()),
+    "tensorboard": lambda reporter: reporter.held_out(1, {"total": 1.0}),
+}
+
+
+@pytest.mark.parametrize("name", FULL)
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_full_disk_is_said_in_one_line_with_a_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, saved: bool
+) -> None:
+    """No file may grow any more: each write of the reporter is refused, TensorBoard's included."""
+    if saved:
+        (tmp_path / "last.pt").touch()
+    then = f"continue with --resume {tmp_path / 'last.pt'}" if saved else "start the run again"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    reporter = Reporter(tmp_path, speaks=True)
+    if name == "tensorboard":
+        (tmp_path / METRICS).symlink_to("/dev/null")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(UsageError) as caught, reporter:
+            FULL[name](reporter)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert str(caught.value) == (
+        f"{tmp_path / name}: File too large; the checkpoints there are intact. Free space or allow writing, then {then}"
+    )
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_folder_that_becomes_unwritable_is_said(tmp_path: Path) -> None:
+    (tmp_path / "tensorboard").touch()
+    with pytest.raises(UsageError, match=r"tensorboard: File exists; .* then start the run again"):
+        Reporter(tmp_path, speaks=True)
+    with pytest.raises(UsageError, match=r"metrics\.jsonl: Not a directory"):
+        Reporter(tmp_path / "tensorboard" / "run", speaks=True)
+
+
+def test_a_held_out_loss_is_shown_with_the_reading_that_follows_it_and_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Reporter(tmp_path, speaks=True) as reporter:
+        reporter._seconds = 60.0
+        reporter.held_out(0, {"total": 0.5})
+        for step in (1, 2):
+            reporter.metrics(step, 0, 0.1, READING)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("step 1  held out 0.5000  loss 1.0000")
+    assert second.startswith("step 2  loss 1.0000")
+
+
 def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
@@ -285,19 +342,20 @@ def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.Monke
     path.write_text('{"step": 1}\n{"step": 2}\n{"st')
     old = path.read_bytes()
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(UsageError, match=r"metrics\.jsonl: No space left on device; .* then start the run again"):
         Reporter(tmp_path, speaks=True, step=1)
     assert path.read_bytes() == old
     assert [entry.name for entry in tmp_path.iterdir()] == [METRICS]
 
 
 def test_one_process_is_a_rank_by_itself() -> None:
-    with ranks("cpu") as mine:
+    with ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
         assert mine.any(True)
         assert not mine.any(False)
         assert mine.from_first("address") == "address"
         assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
+        assert mine.gather("a") == ["a"]
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt, SystemExit])
@@ -306,10 +364,10 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
 ) -> None:
     left = []
     monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
     monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: left.append(True))
-    with pytest.raises(error) if error else nullcontext(), ranks("cpu") as mine:
+    with pytest.raises(error) if error else nullcontext(), ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size) == (1, 2)
         if error:
             raise error
@@ -327,13 +385,13 @@ def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.Mo
         return weakref.ref(Model())
 
     monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
     known = []
     monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: known.append(model()))
     gc.disable()  # not by chance
     try:
-        with ranks("cpu"):
+        with ranks("cpu", 60.0):
             model = trained()
             assert model() is not None
     finally:
@@ -343,5 +401,5 @@ def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_said() -> None:
-    with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda"):
+    with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda", 60.0):
         pass

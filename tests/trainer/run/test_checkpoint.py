@@ -8,6 +8,8 @@ import os
 import pickle
 import random
 import resource
+import struct
+import zipfile
 from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from trainer.config import TrainConfig
 from trainer.models import E2VID, FireNet
-from trainer.run.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from trainer.run.checkpoint import Checkpoint, load_checkpoint, require_same_run, save_checkpoint
 from trainer.unpickle import Placeholder, read_torch_file
 from trainer.weights import load_into, load_network, read_weights
 from v2v_protocol.errors import UsageError
@@ -423,6 +426,50 @@ def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
     torch.save(torch.load(_written(path, whole), weights_only=True) | {"format": 99}, path)
     with pytest.raises(UsageError, match="format 99, this release reads 2"):
         load_checkpoint(path)
+
+
+def test_a_flipped_bit_in_a_checkpoint_is_found(tmp_path: Path) -> None:
+    """Anywhere in a tensor or in the plain values; ``torch.load`` gives other numbers."""
+    path = tmp_path / "a.pt"
+    save_checkpoint(path, Run().checkpoint())
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        entries = [entry for entry in archive.infolist() if entry.file_size > 8]
+    for entry in entries:
+        content = bytearray(whole)
+        name, extra = struct.unpack_from("<HH", content, entry.header_offset + 26)
+        content[entry.header_offset + 30 + name + extra + entry.file_size // 2] ^= 4
+        path.write_bytes(content)
+        with pytest.raises(UsageError, match=rf"or damaged: wrong CRC-32 of {entry.filename}"):
+            load_checkpoint(path)
+        with pytest.raises(UsageError, match="or damaged: wrong CRC-32"):
+            read_weights(path)
+    path.write_bytes(whole)
+    load_checkpoint(path)
+
+
+def test_files_without_checksums_are_read(tmp_path: Path) -> None:
+    compute = torch.serialization.get_crc32_options()
+    torch.serialization.set_crc32_options(False)
+    try:
+        torch.save(small().state_dict(), tmp_path / "bare.pth")
+    finally:
+        torch.serialization.set_crc32_options(compute)
+    assert same(dict(read_weights(tmp_path / "bare.pth").state), small().state_dict())
+
+
+def test_keys_that_are_newer_than_a_checkpoint_had_their_defaults(tmp_path: Path) -> None:
+    config = TrainConfig()
+    older = config.to_dict()
+    del older["compute"]["group_timeout_seconds"], older["run"]["validate_config"], older["optimizer"]["schedule"]
+    checkpoint = dataclasses.replace(Run().checkpoint(), config=older)
+    assert require_same_run(checkpoint, config) == []
+    compute = dataclasses.replace(config.compute, group_timeout_seconds=60.0)
+    changed = require_same_run(checkpoint, dataclasses.replace(config, compute=compute))
+    assert changed == ["compute.group_timeout_seconds: 7200.0 -> 60.0"]
+    optimizer = dataclasses.replace(config.optimizer, schedule="cosine")
+    with pytest.raises(UsageError, match=r"optimizer\.schedule: 'constant' -> 'cosine'"):
+        require_same_run(checkpoint, dataclasses.replace(config, optimizer=optimizer))
 
 
 def _written(path: Path, content: bytes) -> Path:
