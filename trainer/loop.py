@@ -59,7 +59,7 @@ def train(
         batches = islice(batches, max(0, run.steps - step))
     judges = ranks.first and (run.judge_every or run.preview_every)
     held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
-    validate = Validation(task, learner.trained, run, ranks) if run.validate else None
+    validation = Validation(task, learner.trained, run, ranks) if run.validate else None
     # The first batch comes before anything is written: a server that refuses the run leaves its folder untouched.
     taken = stop.until(batches)
     first = list(islice(taken, 1))
@@ -103,10 +103,29 @@ def train(
         except OSError as error:
             raise UsageError(f"step {step} cannot be saved as {unwritable(out, name, error)}") from error
 
+    def validate(epochs: int) -> None:
+        """Score the network on recordings after ``epochs`` whole epochs, if that is due, and keep the best."""
+        nonlocal saved
+        if validation is None or epochs % run.validate_every != 0:
+            return
+        look()
+        if saved != step and step > begun:
+            save(LAST)  # validation may take long, and fail
+            saved = step
+        scores = validation(baseline=epochs == run.validate_every, stopping=lambda: stop.signal > 0)
+        if scores and reporter.validated(step, scores):
+            save(BEST)
+
     with Reporter(out, speaks=ranks.first, step=step) as reporter:
         reporter.configuration(config)
         if held_out is not None and first and step == 0:
             judge(with_films=False)
+        if validation is not None and not ranks.from_first(step == 0 or reporter.is_validated(step)):
+            # A run that ended within a validation has it when it goes on.
+            if position is not None and position["position"] == 0:
+                validate(epoch)
+            if ranks.any(stop.wanted):
+                first.clear()
         for batch in chain(first, taken):
             first.clear()  # its memory is free once its step is done
             values = learner.step(task.prepare(batch, batch.epoch), step, batch.epoch)
@@ -129,13 +148,8 @@ def train(
                 saved = step
             if keep:
                 save(epoch_name(epoch))
-            if validate is not None and ended and (epoch + 1) % run.validate_every == 0:
-                look()
-                if saved != step:
-                    save(LAST)  # validation may take long, and fail
-                    saved = step
-                if reporter.validated(step, validate(baseline=epoch + 1 == run.validate_every)):
-                    save(BEST)
+            if ended:
+                validate(epoch + 1)
         # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
         if saved != step and (step > begun or stop.failure is None):
             look()

@@ -172,10 +172,18 @@ class Reporter:
         if self._board is None:
             return False
         decisive = f"validation_{next(iter(scores))}"
-        with self._writing(METRICS):
-            before = [record[decisive] for record in read_metrics(self._out / METRICS) if decisive in record]
+        before = [record[decisive] for record in self._records() if decisive in record]
         self._write({"step": step} | {f"validation_{name}": value for name, value in scores.items()})
         return all(scores[decisive.removeprefix("validation_")] < value for value in before)
+
+    def is_validated(self, step: int) -> bool:
+        """Return whether there are scores of this step on recordings."""
+        names = [name for record in self._records() if record["step"] == step for name in record]
+        return any(name.startswith("validation_") for name in names)
+
+    def _records(self) -> list[dict[str, Any]]:
+        with self._writing(METRICS):
+            return read_metrics(self._out / METRICS) if (self._out / METRICS).exists() else []
 
     def configuration(self, config: TrainConfig) -> None:
         """Write all keys of the run to a file that ``v2v-train`` takes."""

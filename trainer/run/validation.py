@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from trainer.config import RunConfig
@@ -58,11 +58,12 @@ class Validation:
         """Return the recordings that this rank scores."""
         return list(self._items[self._ranks.rank :: self._ranks.world_size])
 
-    def __call__(self, *, baseline: bool = False) -> dict[str, float]:
+    def __call__(self, *, baseline: bool = False, stopping: Callable[[], bool] = bool) -> dict[str, float]:
         """Return the scores by name; the first decides which network is the best, lower is better. All ranks call it.
 
         Args:
             baseline: also score what needs no network, such as a constant grey.
+            stopping: asked after each recording; if it is true on any rank, the result is empty.
 
         Raises:
             UsageError: a recording cannot be scored, on any rank, or the recordings have no score in common.
@@ -74,6 +75,8 @@ class Validation:
         try:
             for data_set, path in self._share():
                 means.append((data_set.name, self._scorer.score(path, data_set, baseline=baseline)))
+                if stopping():
+                    break
         except (V2VError, OSError) as error:
             failure = str(error)  # raised on all ranks together: the others would wait for this one
         finally:
@@ -82,6 +85,8 @@ class Validation:
         failures = [failure for _, failure in shares if failure]
         if failures:
             raise UsageError(f"run.validate = {self._data}: {failures[0]}")
+        if sum(len(scored) for scored, _ in shares) < len(self._items):
+            return {}
         by_data_set: dict[str, list[Mapping[str, float]]] = {}
         for number in range(len(self._items)):
             name, scores = shares[number % len(shares)][0][number // len(shares)]

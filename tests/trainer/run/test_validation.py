@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +92,19 @@ class ThreadRanks(Ranks):
             tensor.copy_(self.from_first(tensor))
 
 
-def on_ranks(count: int, config: RunConfig, networks: list[VoxelNetwork]) -> list[Any]:
+def on_ranks(
+    count: int,
+    config: RunConfig,
+    networks: Sequence[VoxelNetwork],
+    stopping: Callable[[int], bool] = lambda _rank: False,
+) -> list[Any]:
     """What each rank gets: its scores, or the error."""
     found: list[Any] = [None] * count
 
     def score(mine: Ranks) -> None:
         try:
-            found[mine.rank] = Validation(picture_task(), networks[mine.rank], config, mine)(baseline=True)
+            validate = Validation(picture_task(), networks[mine.rank], config, mine)
+            found[mine.rank] = validate(baseline=True, stopping=lambda: stopping(mine.rank))
         except UsageError as error:
             found[mine.rank] = error
 
@@ -168,7 +174,7 @@ def test_ranks_share_the_recordings_and_have_the_scores_of_one(tmp_path: Path, c
     networks = [network() for _ in range(count)]
     for number, each in enumerate(networks):
         each.register_buffer("statistics", torch.full((1,), float(number)))
-    assert on_ranks(count, config, list(networks)) == [alone] * count
+    assert on_ranks(count, config, networks) == [alone] * count
     assert [float(each.get_buffer("statistics")) for each in networks] == [0.0] * count
 
 
@@ -177,8 +183,16 @@ def test_an_error_of_one_rank_is_raised_by_all(tmp_path: Path) -> None:
     networks = [network() for _ in range(2)]
     with torch.no_grad():
         next(networks[1].parameters()).fill_(float("nan"))
-    found = on_ranks(2, config, list(networks))
+    found = on_ranks(2, config, networks)
     assert all("run.validate = " in str(error) and "not finite" in str(error) for error in found)
+
+
+@pytest.mark.parametrize("stopped", [0, 1])
+def test_a_rank_that_is_to_stop_ends_the_validation_of_all(tmp_path: Path, stopped: int) -> None:
+    """After the recording at hand; the rank that stops may have scored all of its own."""
+    config = two_sets(tmp_path)
+    found = on_ranks(2, config, [network(), network()], stopping=lambda rank: rank == stopped)
+    assert found == ([{}] * 2 if stopped == 0 else on_ranks(2, config, [network(), network()]))
 
 
 def test_the_blank_is_scored_only_when_it_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
