@@ -525,7 +525,7 @@ def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
     batches = iter(stream)
     next(batches)
     server.call(lambda: setattr(server, "mute", True))
-    with pytest.raises(ServerLost, match=rf"{server.address}: nothing heard for .* last sample: epoch 0, index \d+"):
+    with pytest.raises(ServerLost, match=rf"{server.address}: nothing received for .* last sample: epoch 0, index \d+"):
         list(batches)
 
 

@@ -105,13 +105,13 @@ class Worker:
     def __init__(self, name: bytes, world: World) -> None:
         self.name, self.world = name, world
         self.kernels = False
-        tools = Callbacks(
+        callbacks = Callbacks(
             is_ready=lambda lease: self.kernels or lease.indices[0] % 5 != 0,
             is_compiled=lambda lease: lease.indices[0] % 2 == 0,
             is_decoded=lambda lease: lease.indices[0] % 3 == 0,
         )
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
-        self.conversation = WorkerConversation(hello, "queue://workers", tools, is_watched=True)
+        self.conversation = WorkerConversation(hello, "queue://workers", callbacks, is_watched=True)
         self.step: Action = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))

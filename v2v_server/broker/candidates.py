@@ -19,7 +19,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import MOST_CANDIDATES
-from v2v_server.schedule.sequences import Sequence
+from v2v_server.schedule.sequences import VideoSequence
 
 MOST_LATEST = 20
 """Number of refusals kept for the status."""
@@ -60,7 +60,7 @@ class Candidates:
         deaths = 0 if request.candidate else request.deaths
         return replace(request, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
 
-    def sequence(self, session: Session, request: Request) -> Sequence:
+    def sequence(self, session: Session, request: Request) -> VideoSequence:
         """Return the sequence of the request's candidate."""
         return session.schedule.candidate(session.seed, request.epoch, request.index, request.candidate)
 

@@ -8,7 +8,7 @@ hostile. Only the small header is read. The arrays are measured, unless they lie
 from __future__ import annotations
 
 import math
-from collections import abc
+from collections.abc import Sequence
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
@@ -20,13 +20,13 @@ from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.leases import Request
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.videos import VideoEntry
-from v2v_server.schedule.sequences import Sequence
+from v2v_server.schedule.sequences import VideoSequence
 
 
 def lease_for(
     request: Request,
     *,
-    sequence: Sequence,
+    sequence: VideoSequence,
     catalogue: Catalogue,
     spec: StreamSpec,
     seed: int,
@@ -108,7 +108,7 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     return float(math.floor(seconds * spec.samples_per_decode))
 
 
-def check_result(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
+def check_result(payload: Sequence[Any], request: Request, form: Form) -> SampleHeader:
     """Return the header of a result, after checking that its consumer will be able to read the sample.
 
     Args:
@@ -137,7 +137,7 @@ def check_result(payload: abc.Sequence[Any], request: Request, form: Form) -> Sa
     return header
 
 
-def _fits(frames: abc.Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
+def _fits(frames: Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
     """Return whether the frames may hold arrays of these sizes, bytes."""
     lengths = tuple(map(len, frames))
     if not packed:

@@ -25,7 +25,7 @@ from functools import lru_cache
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.schedule.permutation import Permutation, hashed_below
-from v2v_server.schedule.sequences import Sequence, SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 
 _MOST_ATTEMPTS = 16
 MOST_CANDIDATES = 8
@@ -88,7 +88,7 @@ class Schedule:
         block, within = divmod(index, self._spacing * self._views)
         return block * self._spacing + within % self._spacing
 
-    def candidate(self, seed: int, epoch: int, index: int, candidate: int) -> Sequence:
+    def candidate(self, seed: int, epoch: int, index: int, candidate: int) -> VideoSequence:
         """Return the sequence of candidate number ``candidate`` (0 .. MOST_CANDIDATES - 1) of an index.
 
         Raises:
@@ -101,7 +101,7 @@ class Schedule:
             tried.append(self._substitute(seed, epoch, place, number, {sequence.video.id for sequence in tried}))
         return tried[candidate]
 
-    def _substitute(self, seed: int, epoch: int, place: int, candidate: int, refused: set[str]) -> Sequence:
+    def _substitute(self, seed: int, epoch: int, place: int, candidate: int, refused: set[str]) -> VideoSequence:
         for attempt in range(_MOST_ATTEMPTS):
             sequence = self._table[hashed_below(self._table.count, seed, epoch, place, candidate, attempt)]
             if sequence.video.id not in refused:

@@ -8,7 +8,7 @@ start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L 
 from __future__ import annotations
 
 import math
-from collections import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -29,11 +29,11 @@ MOST_CLIP_BYTES = 2 << 30
 """Largest size of the decoded frames of one lease, bytes."""
 
 
-Videos = abc.Sequence[VideoEntry]
+Videos = Sequence[VideoEntry]
 
 
 @dataclass(frozen=True, slots=True)
-class Sequence:
+class VideoSequence:
     """One run of frames: the video and its first frame."""
 
     video: VideoEntry
@@ -131,7 +131,7 @@ class SequenceTable:
         clips = (_longest_clip(frames, self._recipe) for frames in [*short.tolist(), *runs])
         return tuple(voxels for voxels in clips if voxels)
 
-    def __getitem__(self, rank: int) -> Sequence:
+    def __getitem__(self, rank: int) -> VideoSequence:
         """Return the sequence with this rank, 0 .. count-1.
 
         Raises:
@@ -142,7 +142,7 @@ class SequenceTable:
         video = int(self._ends.searchsorted(rank, side="right"))
         place = rank - (int(self._ends[video - 1]) if video else 0)
         start = None if self._cut is None else self._cut.start(video, place)
-        return Sequence(self._all[video], place * self._stride if start is None else start)
+        return VideoSequence(self._all[video], place * self._stride if start is None else start)
 
 
 class _CutSequences:
@@ -182,7 +182,7 @@ class _CutSequences:
         return int(self._cut.first[run]) + self._stride * (place - int(self._before[run]))
 
 
-class Refusals(abc.Sequence[Refusal]):
+class Refusals(Sequence[Refusal]):
     """Reasons why videos give no sequence.
 
     Args:

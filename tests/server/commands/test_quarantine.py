@@ -35,7 +35,7 @@ def fill(corpus: Path, *frames: int) -> Path:
 
 def test_nothing_is_in_quarantine_at_first(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(corpus)
-    assert capsys.readouterr().out.startswith("snapshot 0 holds 0 verdicts (")
+    assert capsys.readouterr().out.startswith("snapshot 0 holds 0 entries (")
     assert not (corpus.parent / "cache").exists()
 
 
@@ -51,7 +51,7 @@ def test_verdicts_are_listed_with_whether_they_hold(corpus: Path, capsys: pytest
     assert second.startswith("not now   snapshot 2 (")
     assert second.endswith("): cleared")
     assert third == "in force  snapshot 3 " + said.format(80)
-    assert last == f"snapshot 3 holds 1 verdicts ({file})"
+    assert last == f"snapshot 3 holds 1 entries ({file})"
 
 
 def test_clearing_begins_a_snapshot_only_when_there_is_something_to_clear(

@@ -72,7 +72,7 @@ def digests(said: str) -> list[str]:
 
 
 def looked_into(said: str) -> int:
-    return int(re.findall(r"looked into (\d+) files", said)[-1])
+    return int(re.findall(r"probed (\d+) files", said)[-1])
 
 
 @pytest.mark.slow

@@ -111,9 +111,7 @@ def test_a_process_that_ends_is_said_and_started_again_ever_more_slowly(monkeypa
         now += 0.5
     page.stop()
     assert started == [0.0, 1.5, 4.0, 8.5, 17.0]
-    assert said[0] == (
-        "the page's process was ended by SIGKILL; samples are not affected, and it is started again in 1 s"
-    )
+    assert said[0] == ("the page's process was ended by SIGKILL; samples are not affected; it is restarted in 1 s")
     assert page.watch(now) == []
 
 

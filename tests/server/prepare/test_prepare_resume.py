@@ -234,7 +234,7 @@ def test_ctrl_c_says_that_the_same_command_goes_on(
 
     monkeypatch.setattr("v2v_server.prepare.prepare.prepare", interrupted)
     assert main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"]) == 130
-    assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
+    assert capsys.readouterr().err == "v2v-prepare: interrupted; run the same command to continue\n"
 
 
 def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
