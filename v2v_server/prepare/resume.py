@@ -1,4 +1,4 @@
-"""What earlier runs of `v2v-prepare` left in a folder, and which folders it takes at all."""
+"""Read what earlier runs of `v2v-prepare` left in a folder, and refuse unsuitable folders."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _AT_A_TIME = 1024
 
 
 def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
-    """Make sure that source and destination share no file, now or when the source is searched again.
+    """Check that source and destination share no file, now or when the source is searched again.
 
     Args:
         catalogue: the source.
         target: the destination, resolved.
-        single: the source is one video: nothing else of its folder will be taken for one.
+        single: the source is one video: other files of its folder are never used.
 
     Raises:
-        CorpusError: they do, or the source is prepared itself.
+        CorpusError: they do, or the source is a prepared folder itself.
     """
     root = catalogue.folder
     if catalogue.prepared is not None:
@@ -54,10 +54,10 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
 
 @contextlib.contextmanager
 def locked(target: Path) -> Iterator[None]:
-    """Keep other processes out of the folder; the system lets go of the lock however this one ends.
+    """Keep other processes out of the folder; the system releases the lock however this process ends.
 
     Raises:
-        CorpusError: another process is at work there.
+        CorpusError: another process works there.
         OSError: the folder cannot be written to.
     """
     with (target / _LOCK_NAME).open("w") as lock:
@@ -69,17 +69,17 @@ def locked(target: Path) -> Iterator[None]:
 
 
 def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:
-    """The records of all earlier runs, also those set aside, after clearing away what they left unfinished.
+    """Return the records of all earlier runs, including those set aside, after removing unfinished files.
 
     Args:
         target: the destination.
-        header: what this run asks for.
-        videos: of its source.
+        header: settings of this run.
+        videos: videos of its source.
 
     Raises:
         CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings or
             from another source.
-        OSError: it cannot be read, or what is unfinished cannot be removed.
+        OSError: it cannot be read, or unfinished files cannot be removed.
     """
     if not (target / MANIFEST_NAME).exists():
         for folder in target.parents:
@@ -111,8 +111,10 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
 def _refuse_other_source(
     target: Path, earlier: str, now: str, known: dict[str, PreparedVideo], videos: Sequence[VideoEntry]
 ) -> None:
-    """Another corpus would pass for this one with every video changed or removed, and its files would replace those
-    of the same names, which may have taken days. A source that keeps its name, or some video, is the same one."""
+    """Refuse another corpus. Otherwise it would look like this one with every video changed or removed, and its files
+    would replace those of the same names, which may have taken days. A source that keeps its name, or some video, is
+    the same.
+    """
     if earlier == now or not known:
         return
     if any(video.id in known and known[video.id].source_fingerprint == video.fingerprint for video in videos):
@@ -127,12 +129,13 @@ def _refuse_other_source(
 def standing_files(
     target: Path, videos: Sequence[VideoEntry], known: dict[str, PreparedVideo]
 ) -> Generator[tuple[VideoEntry, bool], None, None]:
-    """Whether the prepared file of each video is there, unchanged, and that of this state of the source; in order.
+    """Yield for each video, in order, whether its prepared file exists, is unchanged, and belongs to this state of the
+    source.
 
-    Beginning and end of each file are read, many files at a time: what this waits for is the disk.
+    Beginning and end of each file are read, many files at a time, because this waits for the disk.
 
     Raises:
-        CorpusError: a file is there and cannot be read.
+        CorpusError: a file exists and cannot be read.
     """
     pool = ThreadPoolExecutor(_READERS)
     try:
@@ -144,7 +147,7 @@ def standing_files(
 
 
 def has_failed(video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
-    """Whether an earlier run could not prepare this state of the source."""
+    """Return whether an earlier run could not prepare this state of the source."""
     record = known.get(video.id)
     return record is not None and record.problem is not None and record.source_fingerprint == video.fingerprint
 
