@@ -62,11 +62,11 @@ from v2v_server.video.rows import Rows
 _MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
-"""Of the loop without any message; also from one look at deadlines and deaths to the next."""
+"""Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
-"""What keeps everybody waiting for longer is said."""
+"""Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
-"""From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
+"""Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
 
 
 def question_workers(workers: int, cores: int) -> str:
@@ -74,7 +74,7 @@ def question_workers(workers: int, cores: int) -> str:
     if workers <= _MANY_WORKERS_A_CORE * cores:
         return ""
     return (
-        f"warning: --workers {workers} on {cores} cores: each keeps one core busy, and more than that only "
+        f"warning: --workers {workers} on {cores} cores: each uses one core, and more than {cores} only "
         f"cost memory; --workers {cores} makes as many samples"
     )
 
@@ -95,13 +95,13 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             copies=config.copies or None,
             copies_gib=config.copies_gib,
             scene=config.spec.scene != "off",
-            # A host whose workers are all elsewhere has its cores to itself.
+            # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),
             progress=progress,
             notice=progress.notice,
         )
     gc.collect()
-    give_back_freed_memory()  # of a million names, tens of megabytes that nobody needs again
+    give_back_freed_memory()  # opening a catalogue of a million names leaves tens of megabytes unused
     return catalogue
 
 
@@ -139,7 +139,7 @@ def serve(config: ServeConfig) -> None:
         max_credit_bytes=config.max_credit_bytes,
         expected_workers=config.workers_in_all,
     )
-    # Workers of this host come in where no key is asked for.
+    # Workers of this host use an address that requires no key.
     worker_flags = ["--keys", ""] if config.engine == "local" else []
     worker_flags += ["--log-format", config.log_format]
     if config.cache:
@@ -252,7 +252,9 @@ class Server:
                 self._dispatcher.worker_stalled(identity, stalled)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
-                self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
+                self._say(
+                    f"worker {death.identity.decode()} {death.loss.text}; its leases go to other workers", "warning"
+                )
                 self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
@@ -280,7 +282,7 @@ class Server:
             self._page.stop()
         self._transport.close()
         if self._port_file is not None:
-            with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend
+            with contextlib.suppress(OSError):  # for instance, its folder is gone; the server cannot repair that
                 self._port_file.unlink(missing_ok=True)
 
     def _carry_out(self, actions: list[Action]) -> None:
@@ -315,7 +317,7 @@ class Server:
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
         name = hopeless.identity.decode(errors="replace")
-        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
+        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its leases go to other workers", "warning")
         return loss
 
     def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
@@ -329,8 +331,8 @@ class Server:
             written = write_entry(self._quarantine_file, entry, self._quarantine)
         except (OSError, CorpusError) as error:
             self._say(
-                f"{entry.path} from frame {entry.frame}: {entry.reason}; it is passed over this once and comes "
-                f"again, because the quarantine cannot be written: {error}",
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
+                f"be tried again, because the quarantine cannot be written: {error}",
                 "error",
                 record.request,
                 video=entry.path,
@@ -359,8 +361,8 @@ class Server:
             self._say(
                 f"worker {name} failed on {missing.video}, which "
                 f"{'is on this host as it was catalogued' if is_local else 'is not known to be gone or changed'}: "
-                f"{missing.reason}; others make the sample, and it gets no work for {REST_SECONDS:g} s. Look at "
-                "--videos on its host",
+                f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
+                "Check --videos on its host",
                 "warning",
                 missing.request,
                 video=missing.video,
@@ -375,7 +377,7 @@ class Server:
             self._blocked_due = now + _SOON_SECONDS
         elif now >= self._blocked_due:
             self._blocked_due = math.inf
-            self._say(f"no sample is begun: {self._dispatcher.blocked_reason}", "warning")
+            self._say(f"no samples are started: {self._dispatcher.blocked_reason}", "warning")
 
     def _scale(self, now: float) -> None:
         """Change the number of workers if it is not fixed and the load requires it."""
@@ -392,7 +394,7 @@ class Server:
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
             address, worker_address = self._transport.address, self._transport.worker_address
-            # A private address is of no use to workers elsewhere.
+            # Workers on other hosts cannot use a private address.
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
@@ -418,15 +420,15 @@ class Server:
 
 
 def _turned_away(news: TurnedAway) -> str:
-    times = f"turned away, {AWAY_SECONDS:g} s at a time, until that ends; what is at work goes on"
+    times = f"rejected, for {AWAY_SECONDS:g} s at a time, until that ends; existing connections continue"
     if news.address:
         return (
-            f"{news.address} opens connections for {news.side}s and says nothing on them: new ones from there are "
+            f"{news.address} opens connections for {news.side}s and sends nothing: new ones from this address are "
             f"{times}"
         )
     return (
-        f"connections for {news.side}s are gone before they can be asked where they come from: hosts that have not "
-        f"spoken here within the hour are {times}"
+        f"connections for {news.side}s close before their addresses can be read: hosts that have sent no message "
+        f"within the hour are {times}"
     )
 
 

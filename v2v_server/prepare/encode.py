@@ -55,7 +55,7 @@ def encode_luma(
     Raises:
         VideoError: the encoder or the container refuses (a picture too small or too large for the codec, a full disk).
     """
-    # A first time stamp other than 0 is stored in units of the movie's clock: by default milliseconds.
+    # MP4 stores a first time stamp other than 0 in units of the movie's clock, by default milliseconds.
     container_options = {"movie_timescale": str(time_base.denominator), "movflags": "write_colr"}
     try:
         with av.open(os.fspath(path), "w", format="mp4", options=container_options) as output:

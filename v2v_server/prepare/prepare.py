@@ -39,19 +39,19 @@ from v2v_server.video.rows import Rows
 
 DEFAULT_FLOOR_DB = 35.0
 DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
-"""How far below the clip's floor a frame may lie. The worst frame of a sound clip is some 5 dB worse than the clip at
-most; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
+"""Distance of a frame's floor below the clip's floor. The worst frame of a sound clip is at most some 5 dB worse than
+the clip; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
 
 LEAST_FREE_BYTES = 1 << 30
-"""So much of the disk is left to others: who fills a disk to the last byte stops what else runs there."""
+"""Always keep this much disk space free: a full disk stops other programs."""
 
 _STORED_BITS_PER_PIXEL = 2.2
-"""Of a lossless file, in the middle of the clips that were measured (docs/prepare.md): 0.7 to 3.4."""
+"""Size of a lossless file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
 
 _TELLING_SHARE = 0.02
 
 Progress = Callable[[int, int, int, int], None]
-"""(source frames dealt with, source frames in all, bytes made so far, bytes to expect in all)."""
+"""Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
 
 
 def prepare(
@@ -158,9 +158,9 @@ class _Room:
         free = shutil.disk_usage(target).free
         if self.expected > free - LEAST_FREE_BYTES:
             raise CorpusError(
-                f"{target}: about {self.expected / 1e9:.1f} GB are to be written, and the disk has "
-                f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; make room, keep fewer rows, "
-                "name fewer videos by --list, or take --codec h264"
+                f"{target}: about {self.expected / 1e9:.1f} GB will be written, but the disk has "
+                f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must stay free; "
+                "free disk space, keep fewer rows, select fewer videos with --list, or use --codec h264"
             )
 
     def done(self, video: VideoEntry, made: int) -> None:
@@ -184,8 +184,8 @@ class _Room:
         free = shutil.disk_usage(self._target).free
         if free < LEAST_FREE_BYTES:
             raise CorpusError(
-                f"{self._target}: the disk has {free / 1e9:.2f} GB left, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; "
-                "what is done is kept, and the same command goes on when there is room"
+                f"{self._target}: the disk has {free / 1e9:.2f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must "
+                "stay free; finished files are kept; free disk space and run the same command to continue"
             )
 
 

@@ -21,7 +21,7 @@ _LOCK_NAME = ".v2v-prepare.lock"
 _NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
 _READERS = 16
 _AT_A_TIME = 1024
-"""Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
+"""Files that are read at a time, so that the memory for the requests does not grow with the corpus."""
 
 
 def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
@@ -40,8 +40,8 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
     below = target != root and target.is_relative_to(root)
     if root.is_relative_to(target) or (below and not single):
-        raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
-    # To resolve a path asks the system about each of its parts: done for every folder once, and for links among files.
+        raise CorpusError(f"{target} and the source {root} overlap; choose a destination outside the source")
+    # Resolving a path queries each of its parts, so do it once for every folder, and for files that are links.
     inside: dict[str, bool] = {}
     for video in catalogue.videos:
         path = root / video.id
@@ -64,7 +64,7 @@ def locked(target: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise CorpusError(f"{target}: another v2v-prepare is at work there; wait for its end") from None
+            raise CorpusError(f"{target}: another v2v-prepare works there; wait until it ends") from None
         yield
 
 
@@ -94,12 +94,12 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
         return {}
     manifest = read_manifest(target)
     if not manifest.header.same_settings(header):
-        # One header holds for all files of a folder, so two settings cannot lie in one; and to make all of them anew
-        # unasked may cost days.
+        # One header describes all files of a folder, so it cannot hold two settings; and preparing all of them again
+        # without being asked may cost days.
         made = sum(video.problem is None for records in (manifest.videos, manifest.aside) for video in records.values())
         raise CorpusError(
-            f"{target} was prepared with {manifest.header.settings()}, and now {header.settings()} is asked for, which "
-            f"its {made} prepared videos are not; choose another folder, or delete this one to have all made anew"
+            f"{target} holds {made} videos prepared with {manifest.header.settings()}, but {header.settings()} is "
+            "requested; choose another folder, or delete this one to prepare all of them again"
         )
     known = manifest.aside | manifest.videos
     _refuse_other_source(target, manifest.header.source, header.source, known, videos)
@@ -122,7 +122,7 @@ def _refuse_other_source(
     raise CorpusError(
         f"{target} was prepared from a folder called {earlier}, and none of its {len(known)} videos is one of the "
         f"{len(videos)} of {now}; choose another folder for another corpus. If it is the same one renamed, begin with "
-        "all of its videos, or with its old name"
+        "all of its videos, or use its old name"
     )
 
 
@@ -161,7 +161,7 @@ def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) ->
     except VideoError as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
             raise CorpusError(
-                f"{target / video.id} {error.reason}, so nobody can tell whether it is still what was prepared, and "
-                "nothing was changed; make it readable, or delete it to have it made anew"
+                f"{target / video.id} {error.reason}, so it cannot be checked, and "
+                "nothing was changed; make it readable, or delete it to prepare it again"
             ) from error
         return False

@@ -105,7 +105,7 @@ def transcode(job: Transcoding) -> Made:
     if not job.target.parent.resolve().is_relative_to(job.root):
         raise VideoError(os.fspath(job.source), None, f"{job.target.parent} is a link out of the destination")
     job.target.parent.mkdir(parents=True, exist_ok=True)
-    # Hidden, so that no catalogue takes it in; hashed, so that the longest of names leaves room for the suffix.
+    # Hidden, so that no catalogue includes it; hashed, so that the suffix fits even with the longest names.
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     partial = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     try:
@@ -168,7 +168,7 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
         for picture in stored_pictures(stored, job.window):
             got.update(np.ascontiguousarray(picture).data)
     if wanted.digest() != got.digest():
-        raise VideoError(os.fspath(job.source), None, "verification: what was stored does not give back its frames")
+        raise VideoError(os.fspath(job.source), None, "verification: the stored file does not reproduce the frames")
     return Made(fingerprint(made), made.stat().st_size, HIGHEST_PSNR_DB, HIGHEST_PSNR_DB)
 
 
@@ -185,7 +185,7 @@ def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[n
 
 def _times(job: Transcoding, index: FrameIndex) -> tuple[list[int], Fraction]:
     if index.seekable:
-        # Containers cannot begin before 0, and nothing depends on where the clock begins.
+        # Containers cannot begin before 0, and only differences of time stamps matter.
         return (index.pts - min(0, int(index.pts[0]))).tolist(), Fraction(*index.time_base)
     if not (math.isfinite(job.frames_per_second) and job.frames_per_second > 0):
         raise VideoError(os.fspath(job.source), None, "has neither usable time stamps nor a frame rate")

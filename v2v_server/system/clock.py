@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 _LONGEST_TURN_SECONDS = 1.0
-"""What goes beyond is time in which nobody was listened to."""
+"""A longer step than this counts as time in which the process was stopped."""
 
 
 class Clock:

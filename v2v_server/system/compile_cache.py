@@ -24,10 +24,10 @@ from itertools import takewhile
 from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "simulation"
-"""The folder of every file from which something can get into a kernel."""
+"""The folder of all files whose code or constants a kernel may use."""
 
 PROCESSORS = Path("/proc/cpuinfo")
-"""What Linux says of the processors. Asking LLVM, as numba does, would mean loading it in every process."""
+"""Linux's description of the processors. Asking LLVM, as numba does, would load it in every process."""
 
 _VARIABLE = "NUMBA_CACHE_DIR"
 _KIND = re.compile(r"(vendor_id|cpu family|model|flags|Features|CPU (implementer|architecture|variant|part)|isa)\s*:")
@@ -39,7 +39,7 @@ def use_compile_cache() -> None:
     choose_compile_cache()
     numba = sys.modules.get("numba")
     if numba is not None and not _is_users(numba.config.CACHE_DIR):
-        # It has read the environment already.
+        # Numba has read the environment already.
         numba.config.CACHE_DIR = os.environ.get(_VARIABLE, "")
 
 
@@ -53,7 +53,7 @@ def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> 
 
     If no folder is writable it is not set, and numba reports the problem if it compiles.
     """
-    # A folder of ours comes from a parent process, which may have been started before the sources changed.
+    # One of our folders was set by a parent process, which may have started before the sources changed.
     if _is_users(environment.get(_VARIABLE, "")):
         return
     try:
@@ -85,7 +85,7 @@ def _processor() -> bytes:
     """Return the processor's model and instruction sets, as far as the system reports them."""
     told = [os.uname().machine]
     with suppress(OSError), PROCESSORS.open(encoding="utf-8", errors="replace") as file:
-        told += filter(_KIND.match, takewhile(str.strip, file))  # the first one ends with an empty line
+        told += filter(_KIND.match, takewhile(str.strip, file))  # the first processor's lines end with an empty line
     return "\n".join(told).encode()
 
 
@@ -99,13 +99,13 @@ def _parents(environment: Mapping[str, str]) -> Iterator[Path]:
         yield Path(environment["V2V_CACHE_DIR"]).absolute()
     elif environment.get("XDG_CACHE_HOME"):
         yield Path(environment["XDG_CACHE_HOME"]).absolute() / "v2v"
-    elif (home := os.path.expanduser("~")) != "~":  # a user without an entry in the list of users has none
+    elif (home := os.path.expanduser("~")) != "~":  # a user without an entry in the user database has none
         yield Path(home) / ".cache" / "v2v"
     try:
         temporary = Path(tempfile.gettempdir()) / f"v2v-{os.getuid()}"
     except FileNotFoundError:
-        return  # none can be written
-    # Numba unpickles what it finds, and here anyone could have put it.
+        return  # no folder is writable
+    # Numba unpickles the files it finds, and any user could have written them here.
     if _is_private(temporary):
         yield temporary
 

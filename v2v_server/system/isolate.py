@@ -30,8 +30,8 @@ _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _NO_START = (
-    "a process that reads videos ended as it started ({how}); its own message stands above. In a script, put what "
-    'opens videos below `if __name__ == "__main__":`, because each such process imports the script again'
+    "a process that reads videos ended during its start ({how}); its own message is above. In a script, open "
+    'videos below `if __name__ == "__main__":`, because each such process imports the script again'
 )
 
 
@@ -161,7 +161,7 @@ class _Lane(Generic[J, R]):
         self.connection, other = context.Pipe()
         given = other, function, os.getpid(), memory_bytes, writable
         self._process = context.Process(target=_serve, args=given, daemon=True)
-        # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
+        # The first process also starts multiprocessing's tracker, which would unblock SIGINT again.
         resource_tracker.ensure_running()
         try:
             with _interrupt_held_back():
@@ -178,7 +178,7 @@ class _Lane(Generic[J, R]):
         try:
             self.connection.send(job)
         except OSError:
-            return  # it died before it had the job: finish() finds the end of the pipe
+            return  # it died before it received the job: finish() finds the end of the pipe
 
     def finish(self) -> tuple[J, R | Died] | None:
         """Return the result of the job; None if the process has only reported that it began."""
@@ -234,8 +234,10 @@ def _serve(
         limit_memory(memory_bytes)
     if writable is not None:
         confine(writable, network=False)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
-    connection.send(None)  # begun: what ends this process from here on is no fault of its start
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to all processes; the parent decides what follows
+    connection.send(None)  # report that it began: from here on, its end is not a failed start
     while True:
         try:
             job = connection.recv()

@@ -18,7 +18,7 @@ else:
             import cv2
 
             value = getattr(cv2, name)
-            setattr(self, name, value)  # the next time it is found without coming here
+            setattr(self, name, value)  # the next access does not call this function
             return value
 
     cv2 = _OpenCV()

@@ -19,8 +19,8 @@ from v2v_protocol import allocator
 from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
-_TURN_SECONDS = 0.1  # the longest that Linux grants
-_MOST_FILES = 1 << 16  # a connection of each consumer and worker that a server takes, and a logbook of each worker
+_TURN_SECONDS = 0.1  # the longest time slice that Linux grants
+_MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 
 
@@ -78,7 +78,7 @@ def open_many_files() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
-        with suppress(OSError, ValueError):  # a system may allow fewer than it says
+        with suppress(OSError, ValueError):  # a system may allow fewer than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
@@ -134,7 +134,7 @@ def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/pro
         try:
             quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()
         except (OSError, ValueError):
-            continue  # the topmost group has none
+            continue  # the root group has no limit
         if quota != "max":
             least = min(least, int(quota) / int(period))
     return least
@@ -196,8 +196,8 @@ def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
         return Path(chosen)
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
-    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
+    except RuntimeError as error:  # neither HOME nor an entry in the user database, as in some containers
         raise CorpusError(
-            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
+            f"user {os.getuid()} has no home folder for the catalogue's index: give a folder with --cache-dir or "
             "V2V_CACHE_DIR"
         ) from error

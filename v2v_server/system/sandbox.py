@@ -28,16 +28,16 @@ _ALL_THREADS, _NO_SLOWDOWN = 1, 4  # flags; the second: without the mitigation t
 _ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 _OTHER_ABI = 0x40000000
-"""From this number on: calls of x86_64's 32-bit variant, under which every call is there again."""
+"""Calls from this number on belong to x86_64's 32-bit variant, which repeats every call."""
 _UNIX = 1
 
 _LANDLOCK = (444, 445, 446)  # create, add a rule, restrict; the same on all machines
 _PATH_BENEATH = 1
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
-_LEAST_VERSION = 2  # the first keeps everyone from moving files from one folder to another
+_LEAST_VERSION = 2  # version 1 forbids moving files between folders
 _KNOWN_TO = {2: 14, 3: 15, 4: 15}  # version of Landlock -> how many rights over files it knows; later ones 16
 _FILE_RIGHTS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14 | 1 << 15
-"""Rights that a rule may give over something that is no folder: execute, write, read, truncate, control a device."""
+"""Rights that a rule may give over a file: execute, write, read, truncate, control a device."""
 
 
 _REFUSED = {
@@ -46,12 +46,12 @@ _REFUSED = {
     "perf_event_open": (298, 241), "userfaultfd": (323, 282), "keyctl": (250, 219), "add_key": (248, 217),
     "request_key": (249, 218), "mount": (165, 40), "unshare": (272, 97), "setns": (308, 268),
 }  # fmt: skip
-"""Calls that are refused, by their numbers on x86_64 and aarch64. io_uring could do the others' work unseen."""
+"""Refused calls, by their numbers on x86_64 and aarch64. io_uring could perform the others without the filter."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Machine:
-    architecture: int  # as the kernel tells a filter
+    architecture: int  # as the kernel reports it to a filter
     seccomp: int
     socket: int
     refused: tuple[int, ...]
@@ -104,7 +104,7 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
     kernel = ctypes.CDLL(None, use_errno=True)
     if kernel.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
         return Confined(calls=False, files=False)
-    has_files = writable is not None and _allow_writing(kernel, writable)  # first: seccomp might not allow it
+    has_files = writable is not None and _allow_writing(kernel, writable)  # before seccomp, whose filter might block it
     code = program(machine, network=network)
     buffer = ctypes.create_string_buffer(code, len(code))
     filter_ = struct.pack("@HP", len(code) // 8, ctypes.addressof(buffer))
@@ -140,7 +140,7 @@ def _allow_writing(kernel: ctypes.CDLL, folders: Iterable[Path]) -> bool:
             try:
                 beneath = os.open(folder, os.O_PATH | os.O_CLOEXEC)
             except OSError:
-                continue  # what is not there cannot be written to
+                continue  # a missing folder cannot be written to
             try:
                 rights = handled if folder.is_dir() else handled & _FILE_RIGHTS
                 if _call(kernel, _LANDLOCK[1], rules, _PATH_BENEATH, struct.pack("=Qi", rights, beneath), 0) != 0:

@@ -345,7 +345,7 @@ def test_other_settings_need_another_folder(source: Path, prepared: tuple[Path, 
     for encoding, rows in ((Encoding.of("h264", quality=20, gop=12), "top:0.54"), (H264, "full")):
         with pytest.raises(
             CorpusError,
-            match=r"was prepared with .*which its 4 prepared videos are not; choose another folder, or delete",
+            match=r"holds 4 videos prepared with .* is requested; choose another folder, or delete",
         ):
             run(source, prepared[0], encoding, rows)
 
