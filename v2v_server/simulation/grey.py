@@ -1,4 +1,4 @@
-"""Frames of any usual kind to the grey levels that are simulated."""
+"""Convert frames of any usual kind to the grey levels that are simulated."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _WEIGHTS = (299, 587, 114)
 
 
 def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
-    """Grey levels 0 .. 255 of a clip.
+    """Return the grey levels 0 .. 255 of a clip.
 
     Grey is 0.299 red + 0.587 green + 0.114 blue. Floating point means 0 for black and 1 for white; the result is
-    rounded to the nearest of 256 levels (``simulate_log`` takes what shall not be rounded).
+    rounded to the nearest of 256 levels (use ``simulate_log`` to avoid the rounding).
 
     Args:
         frames: a numpy array or a torch tensor in main memory; uint8, or floating point in 0 .. 1; [n, H, W], colour
-            (RGB) as [n, H, W, 3] or [n, 3, H, W], one channel as [n, H, W, 1] or [n, 1, H, W]. Where both ends could
-            be channels, the last is.
+            (RGB) as [n, H, W, 3] or [n, 3, H, W], one channel as [n, H, W, 1] or [n, 1, H, W]. If both ends could be
+            channels, the last one is.
 
     Returns:
-        uint8 [n, H, W]; grey uint8 as it is, without a copy.
+        uint8 [n, H, W]; grey uint8 is returned without a copy.
 
     Raises:
-        UsageError: anything else.
+        UsageError: another type, shape or range.
     """
     try:
         given = np.asarray(frames)
