@@ -79,9 +79,10 @@ def key_for(address: str, side: str, file: str | os.PathLike[str] | None) -> Pee
 
 
 def read_key(file: Path) -> PeerKey:
-    """
+    """Read a key file.
+
     Raises:
-        KeyRefused: it cannot be read, others can read it, or it is no key file.
+        KeyRefused: it cannot be read, other users can read it, or it is not a key file.
     """
     try:
         key = PeerKey(**parse_json(read_private(file)))

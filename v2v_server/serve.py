@@ -360,7 +360,7 @@ class Server:
             is_local = not isinstance(self._catalogue.root, Copies)
             self._say(
                 f"worker {name} failed on {missing.video}, which "
-                f"{'is on this host as it was catalogued' if is_local else 'is not known to be gone or changed'}: "
+                f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",
                 "warning",

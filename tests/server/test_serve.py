@@ -135,7 +135,7 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
     assert dispatcher.told == [("looked for", missing, found)] * 2
     assert cast(Any, server)._catalogue.stale == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
-    assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
+    assert said.count("worker w failed on a.mp4, which is on this host as catalogued: cannot be read") == found
 
 
 def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,7 +28,7 @@ from v2v_protocol.sample import SampleParams
 
 _SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
-"""Stands for a drawn contrast of 0, because 0.0 means "left alone"; it gives the same flat grey picture."""
+"""Replaces a drawn contrast of 0, because 0.0 means "unchanged"; it gives the same flat grey picture."""
 
 
 class Purpose(IntEnum):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 
 _WEIGHTS = (299, 587, 114)
-"""Of red, green and blue in grey (ITU-R BT.601), thousandths."""
+"""Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""
 
 
 def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
@@ -32,7 +32,7 @@ def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
     """
     try:
         given = np.asarray(frames)
-    except (TypeError, RuntimeError) as error:  # torch's, of a tensor on a GPU or one that asks for gradients
+    except (TypeError, RuntimeError) as error:  # raised by torch for a tensor on a GPU or one that requires gradients
         raise UsageError(f"frames: {error}") from error
     if given.ndim == 4 and given.shape[-1] not in (1, 3):
         given = np.moveaxis(given, 1, -1)
@@ -45,7 +45,7 @@ def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
     if given.ndim == 3 and given.dtype == np.uint8:
         return given
     grey = np.empty(given.shape[:3], np.uint8)
-    for frame, out in zip(given, grey, strict=True):  # one at a time: what is in between is eight times as large
+    for frame, out in zip(given, grey, strict=True):  # one at a time: the intermediate arrays are eight times as large
         out[:] = _of_frame(frame)
     return grey
 

@@ -46,7 +46,7 @@ NoiseKey = tuple[int, int, int, int]
 WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
 PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
-"""What a word is for. Numbers are never reused; 9 to 15 belong to effects."""
+"""Purposes of words. Numbers are never reused; 9 to 15 belong to effects."""
 
 GOLDEN = np.uint32(0x9E3779B9)
 SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))

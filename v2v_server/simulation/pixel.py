@@ -29,10 +29,10 @@ from v2v_server.simulation.vectors import (
 )
 
 BLOCK_PX = 512
-"""Pixels of a block. Fewer would touch each page of frames and voxels more often, more would not stay in the cache."""
+"""Pixels of a block. Smaller blocks touch each page of frames and voxels more often; larger ones exceed the cache."""
 
-PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
-ROWS_AHEAD = 3  # how many steps before its use a row of frames is fetched into the cache
+PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would alias in the processor's store buffer
+ROWS_AHEAD = 3  # number of steps that a row of frames is prefetched before its use
 
 _GOLDEN = noise.GOLDEN
 _S0, _S1, _S2 = noise.SCRAMBLE_FACTORS
@@ -250,7 +250,7 @@ def simulate_pixels(
                 two_normals(
                     radius_words, angle_words, pairs[0, pair], pairs[1, pair], words[2], words[3], floats[2], normal
                 )
-            # Without noise its row is zeros, which changes no more than the sign of a zero, and that is never seen.
+            # Without noise its row is zeros. Adding them changes at most the sign of a zero, which has no effect.
             scale = noise_scale[step] if noisy else tolerance - tolerance
             of_bin = step - row * steps_per_bin
             if of_bin == 0:

@@ -40,12 +40,12 @@ from v2v_protocol.recipe import LARGEST_EVENTS
 AUTO = "auto"
 Real = type[np.floating[Any]]
 LIMITS: dict[str, tuple[Real, float]] = {"float32": (np.float32, 2.0**20), "float64": (np.float64, LARGEST_EVENTS)}
-"""Most events a pixel may fire in a clip, by arithmetic; narrowest first."""
+"""Largest number of events of a pixel in a clip, by arithmetic; narrowest first."""
 THRESHOLD_ENDS = (2.0**-100, 2.0**100)
-"""Thresholds between these neither overflow nor lose digits to underflow, in either arithmetic."""
+"""Limits of a threshold, between which neither arithmetic overflows or loses digits to underflow."""
 
 EFFECTS_MARGIN = 4.0
-"""How many times the error of the plain model that with effects may be."""
+"""Bound of the error with effects, as a multiple of the plain model's error."""
 
 
 def choose(asked: str, events: float) -> Real:
@@ -67,7 +67,7 @@ def choose(asked: str, events: float) -> Real:
     name = "float64" if asked == AUTO else asked
     raise UsageError(
         f"a pixel of this clip may fire {events:.4g} events; {name} counts at most {LIMITS[name][1]:.4g} exactly: "
-        "raise the thresholds, lower noise or hot pixels, take fewer frames"
+        "raise the thresholds, lower noise or hot pixels, or use fewer frames"
         + (", or precision='auto'" if name == "float32" else "")
     )
 

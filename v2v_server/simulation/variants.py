@@ -28,7 +28,7 @@ class Variant(NamedTuple):
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
-"""What :func:`warm_up` loads: without effects every dtype, with effects int8 alone."""
+"""Variants that :func:`warm_up` loads: every dtype without effects, only int8 with effects."""
 
 
 def variants(

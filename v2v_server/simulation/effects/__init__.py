@@ -55,7 +55,7 @@ EFFECTS: tuple[Any, ...] = tuple(
         "dead_pixels",
     )
 )
-"""All effects, in the order in which they take their turns."""
+"""All effects, in the order in which they run."""
 
 
 def prepare(

@@ -25,7 +25,7 @@ PIXEL_POS, PIXEL_NEG, STEP_POS, STEP_NEG = range(11, 15)
 WHITE_SHOT_NOISE = 0.25
 """Shot noise of a white pixel as a share of a black one's (v2e)."""
 LARGEST_SHOT_MEAN = 64.0
-"""Most shot events of one polarity that a step may hold on average."""
+"""Largest mean number of shot events of one polarity in a step."""
 _M0, _M1, _M2 = noise.MIX_FACTORS
 
 
@@ -66,8 +66,8 @@ def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doub
     if means.max() > LARGEST_SHOT_MEAN:
         raise UsageError(
             f"shot noise of {shot_noise_hz:.6g} events a second makes {means.max():.4g} events of a polarity in a step "
-            f"of {durations[-1]:.6g} s; the limit is {LARGEST_SHOT_MEAN:.0f}: lower shot_noise_hz, or take a video of "
-            "more frames a second"
+            f"of {durations[-1]:.6g} s; the limit is {LARGEST_SHOT_MEAN:.0f}: lower shot_noise_hz, or use a video with "
+            "more frames per second"
         )
     return means
 

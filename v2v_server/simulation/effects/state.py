@@ -13,10 +13,10 @@ from v2v_server.simulation.precision import Real
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 compiled: Any = numba.njit(**_OPTIONS)
-"""Decorator of a compiled function without the counting of references, which every view of an array would cost. It can
-make no array: all memory is its caller's."""
+"""Decorator of a compiled function without reference counting, which every view of an array would cost. The function
+cannot create arrays; the caller provides all memory."""
 hook: Any = numba.njit(forceinline=True, **_OPTIONS)
-"""The same for an effect's part of the kernel, which becomes a piece of the kernel itself."""
+"""The same for an effect's functions, which are inlined into the kernel."""
 
 
 class Clip(NamedTuple):
