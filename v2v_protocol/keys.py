@@ -87,9 +87,9 @@ def read_key(file: Path) -> PeerKey:
     try:
         key = PeerKey(**parse_json(read_private(file)))
     except (ValueError, TypeError):
-        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made") from None
+        raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made") from None
     if key.side not in SIDES or not all(map(is_key, (key.server, key.public, key.secret))):
-        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made")
+        raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made")
     return key
 
 

@@ -152,7 +152,7 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
         f"in {seconds:.0f} s"
     ]
     if report.looked_at:
-        lines.append(f"{report.looked_at} were prepared earlier; statistics of their scenes were added")
+        lines.append(f"{report.looked_at} were prepared earlier; only statistics of their scenes were added")
     if report.aside:
         lines.append(
             f"{report.aside} others that were prepared earlier are set aside: not served, and not prepared again if a "

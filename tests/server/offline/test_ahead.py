@@ -169,9 +169,9 @@ def test_parts_that_cannot_be_put_together_are_said(tmp_path: Path, run: Run) ->
     [
         (["--shard", "0/3", "--out", "parts"], "give NUMBER/COUNT from 1/COUNT"),
         (["--shard", "4/3", "--out", "parts"], "give NUMBER/COUNT from 1/COUNT"),
-        (["--shard", "1/3"], "--shard K/N and --out DIR go together"),
-        (["--out", "parts"], "--shard K/N and --out DIR go together"),
-        (["--shard", "1/3", "--out", "parts", "--merge", "parts"], "one at a time"),
+        (["--shard", "1/3"], "--shard K/N needs --out DIR"),
+        (["--out", "parts"], "--shard K/N needs --out DIR"),
+        (["--shard", "1/3", "--out", "parts", "--merge", "parts"], "give one of them"),
         (["--workers", "0"], "give at least 1"),
     ],
 )
