@@ -58,7 +58,7 @@ def test_other_errors_are_not_caught() -> None:
         ended(raised=ZeroDivisionError())
 
 
-def test_flags_that_nobody_knows() -> None:
+def test_unknown_flags_are_reported() -> None:
     assert ended("--unknown") == 2
 
 

@@ -29,14 +29,14 @@ def test_the_wait_between_two_pings_doubles_up_to_its_limit_and_starts_again_whe
     assert not peer.is_gone(1e9)
 
 
-def test_a_peer_nobody_asks_is_never_due() -> None:
+def test_a_peer_without_pings_is_never_due() -> None:
     peer = Liveness(0.0)
     assert not peer.ping_due(1e9)
     assert peer.next_due(1e9) == math.inf
 
 
 @given(away=st.floats(0.0, 1e6), silent=st.floats(0.0, 30.0))
-def test_time_in_which_nobody_listened_does_not_count(away: float, silent: float) -> None:
+def test_time_without_polling_does_not_count_as_silence(away: float, silent: float) -> None:
     peer = Liveness(0.0, gone_seconds=20.0, ping_seconds=5.0)
     peer.leave_out(away)
     now = away + silent

@@ -211,7 +211,7 @@ def test_the_largest_layout_does_not_overflow() -> None:
 
 
 @pytest.mark.parametrize("arrays", [(), ("voxels", "voxels"), ("depth",), ("voxels", "")])
-def test_arrays_nobody_makes_are_refused(arrays: tuple[str, ...]) -> None:
+def test_unknown_arrays_are_refused(arrays: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="arrays"):
         array_layout(Recipe(), "int8", arrays)
 

@@ -256,7 +256,7 @@ def test_this_host_needs_no_word(flag: str, address: str) -> None:
 
 @pytest.mark.parametrize("flag", ["bind", "worker_bind"])
 @pytest.mark.parametrize("address", REACHABLE)
-def test_other_hosts_are_let_in_only_in_so_many_words(flag: str, address: str) -> None:
+def test_addresses_for_other_hosts_need_keys_or_insecure(flag: str, address: str) -> None:
     with pytest.raises(UsageError, match=rf"--{flag.replace('_', '-')} .*--insecure"):
         ServeConfig.load(None, {"videos": "a", flag: address})
     assert getattr(ServeConfig.load(None, {"videos": "a", flag: address, "insecure": True}), flag) == address

@@ -189,7 +189,7 @@ def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
 
 
-def test_a_server_that_stops_says_farewell_whoever_is_there(tmp_path: Path) -> None:
+def test_a_server_stops_even_if_a_worker_is_not_connected(tmp_path: Path) -> None:
     server = served(Scripted(), tmp_path)
     server.close()  # to a worker that is not there
 

@@ -33,7 +33,7 @@ def _rank(rank: int, brokers: list[str], begun: Any, go_on: Any, results: Any) -
 
 
 @pytest.mark.slow
-def test_a_killed_broker_costs_no_sample_and_none_comes_twice(
+def test_a_killed_broker_loses_and_repeats_no_sample(
     clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path))

@@ -93,7 +93,7 @@ def _take_one(address: str, control: Connection) -> None:
 
 
 @pytest.mark.slow
-def test_stalled_consumers_hold_what_the_docstring_says_and_nobody_up(tmp_path: Path) -> None:
+def test_stalled_consumers_hold_bounded_memory_and_do_not_delay_others(tmp_path: Path) -> None:
     """One reads no more, the other is stopped (SIGSTOP), so that even its ZeroMQ takes nothing off the network."""
     for number in range(4):
         write_clip(tmp_path / f"{number}.mp4", panned_luma(401, 160, 208, step=(1, 1 + number)), gop=50)

@@ -41,7 +41,7 @@ def _ask(dealer: zmq.Socket[bytes], *frames: bytes) -> object:
     return decode(dealer.recv_multipart()[0])
 
 
-def test_garbage_on_the_port_disturbs_nobody(raw: tuple[zmq.Socket[bytes], str]) -> None:
+def test_garbage_on_the_port_does_not_disturb_other_peers(raw: tuple[zmq.Socket[bytes], str]) -> None:
     dealer, address = raw
     host, port = address.removeprefix("tcp://").split(":")
     with socket.create_connection((host, int(port))) as plain:

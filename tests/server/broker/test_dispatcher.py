@@ -405,7 +405,7 @@ def trouble(at: Peers) -> str:
     return pong.trouble
 
 
-def test_who_waits_is_told_that_nobody_can_make_a_sample() -> None:
+def test_waiting_consumers_learn_that_no_worker_can_make_a_sample() -> None:
     at = peers()
     assert "no worker is connected" in trouble(at)
     at.join(b"w1", credit=1)
@@ -741,7 +741,7 @@ def test_a_sample_of_the_session_before_is_no_answer_to_the_next() -> None:
     assert [(sample.index, decode_map(sample.provenance)) for sample in samples] == [(0, {"seed": 2}), (1, {"seed": 2})]
 
 
-def test_geometries_asked_for_once_do_not_stay_for_ever() -> None:
+def test_geometries_requested_once_are_evicted() -> None:
     at = peers()
     alive = []
     for number in range(3 * MOST_TABLES):
@@ -831,7 +831,7 @@ def test_hello_again_resets_no_credit_and_no_debt() -> None:
     assert sorted(at.samples()) == [(0, index) for index in range(credit)]
 
 
-def test_a_slow_spec_gets_the_time_it_needs_and_speaks_against_nobody_elses() -> None:
+def test_a_slow_spec_gets_the_time_it_needs_and_does_not_count_against_others() -> None:
     at = peers(corpus(video("v.mp4", width_px=3840, height_px=2160)))
     at.hello(b"slow", on_bad_video="raise")
     at.hello(b"quick")

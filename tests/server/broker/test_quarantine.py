@@ -77,7 +77,7 @@ def test_another_fingerprint_is_another_file() -> None:
     assert quarantine.refusal(2, "v.mp4", "h", 5) is None
 
 
-def test_a_clearing_begins_anew_and_leaves_the_old_snapshots() -> None:
+def test_a_clearing_starts_an_empty_snapshot_and_keeps_the_old_ones() -> None:
     quarantine = Quarantine(numbered(verdict(frame=5), clearing(TIME), verdict(frame=10)))
     assert [quarantine.refusal(n, "v.mp4", "f", 5) is not None for n in range(4)] == [False, True, False, False]
     # Verdicts of before the clearing do not make up two with those after it.
@@ -274,7 +274,7 @@ def test_a_file_that_was_replaced_gives_no_number_twice(tmp_path: Path, keep: in
     assert file.read_bytes() == before
 
 
-def test_nobody_writes_while_another_does(tmp_path: Path) -> None:
+def test_writers_exclude_each_other(tmp_path: Path) -> None:
     file = tmp_path / "q.jsonl"
     write(file, verdict("a.mp4"))
     done = threading.Event()
@@ -310,7 +310,7 @@ def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
         assert [each.frame for each in lines if each.path == name] == list(range(20))
 
 
-def test_a_lock_that_somebody_keeps_stops_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_held_by_another_process_does_not_stop_a_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever may read the file can take a shared lock on it."""
     monkeypatch.setattr(quarantine_module, "_LONGEST_LOCK_SECONDS", 0.05)
     file = tmp_path / "q.jsonl"

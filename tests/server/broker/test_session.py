@@ -206,7 +206,7 @@ def test_tenfold_work_gets_a_tenth_of_the_samples(workers: int, unit: float) -> 
     st.dictionaries(st.binary(min_size=1, max_size=2), st.sampled_from((0.02, 0.1, 0.5, 3.0)), min_size=1, max_size=5)
 )
 @settings(max_examples=25, deadline=None)
-def test_nobody_starves_and_time_is_shared_evenly(costs: dict[bytes, float]) -> None:
+def test_no_session_starves_and_time_is_shared_evenly(costs: dict[bytes, float]) -> None:
     samples = 600
     got = serve(costs, samples)
     assert set(got) == set(costs)

@@ -111,7 +111,7 @@ def test_an_index_that_is_asked_again_keeps_its_first_slot() -> None:
         (ARENA.upper(), [1]),
     ],
 )
-def test_slots_that_are_none_are_refused_and_nothing_is_taken(arena: str, slots: list[int]) -> None:
+def test_malformed_slots_are_refused_and_no_request_is_taken(arena: str, slots: list[int]) -> None:
     at = peers()
     at.join()
     at.hello()

@@ -71,7 +71,7 @@ def test_another_user_of_the_host_is_no_worker() -> None:
         sockets.close()
 
 
-def test_what_is_sent_to_nobody_is_not_sent(sockets: Sockets) -> None:
+def test_sending_to_an_unknown_peer_returns_false(sockets: Sockets) -> None:
     assert not sockets.send(ToWorker(b"w", encode(Stop())))
     assert not sockets.send(ToConsumer(b"c", encode(Pong())))
 

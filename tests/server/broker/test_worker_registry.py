@@ -30,7 +30,7 @@ class Table:
         return self.workers.for_request(keep_one_empty=keep_one_empty, other_than=other_than)
 
 
-def test_who_holds_least_is_next_until_nobody_has_room() -> None:
+def test_the_least_loaded_worker_is_next_until_all_are_full() -> None:
     table = Table(a=2, b=1, c=2)
     taken = []
     while (name := table.next()) is not None:
@@ -48,7 +48,7 @@ def test_credit_is_at_least_one_and_limited() -> None:
     assert table.next() is None
 
 
-def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
+def test_the_registry_starts_empty_and_forgets_removed_workers() -> None:
     table = Table()
     assert (len(table.workers), table.next(), table.workers.for_lone_request()) == (0, None, None)
     table.workers.add(b"a", 1, 0.0)
@@ -117,7 +117,7 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
     assert len(table.workers._heap) <= 4 * 5
 
 
-def test_those_who_came_and_went_are_not_kept_in_mind() -> None:
+def test_workers_that_left_are_not_remembered() -> None:
     """Behind some who are always there, and first in the order."""
     table = Table(**{f"a{number}": 2 for number in range(3)})
     for number in range(2000):
@@ -197,7 +197,7 @@ def test_a_twin_goes_to_somebody_else_with_room() -> None:
     assert table.next(other_than=b"a") is None
 
 
-def test_nobody_is_added_to_a_lone_task_as_a_twin() -> None:
+def test_a_request_that_runs_alone_gets_no_second_worker() -> None:
     table = Table(a=2, b=2)
     table.load("b", deaths=ALONE_AFTER)
     assert table.next(other_than=b"a") is None
@@ -244,7 +244,7 @@ def test_a_hanging_worker_is_reported_once_and_gets_nothing_more() -> None:
     assert table.workers.hanging(100.1 + DEADLINE) == [b"a"]
 
 
-def test_leases_of_somebody_who_never_said_hello_are_nobodys_fault() -> None:
+def test_leases_of_an_unknown_worker_report_no_worker() -> None:
     table = Table(a=1)
     table.load("stranger")
     assert table.workers.hanging(1000.0) == []

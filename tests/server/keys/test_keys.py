@@ -172,7 +172,7 @@ def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(
 
 
 @pytest.mark.parametrize("half", [b"", b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0CURVE" + bytes(15 + 1 + 31)])
-def test_half_open_connections_end_and_starve_nobody(
+def test_half_open_connections_end_and_do_not_starve_other_peers(
     half: bytes, sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path
 ) -> None:
     port = int(sockets.address.rpartition(":")[2])
@@ -255,8 +255,8 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         monitor.close()
 
 
-def test_where_nobody_answers_for_keys_nobody_comes_in(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
-    """Without ZAP_ENFORCE_DOMAIN everybody would."""
+def test_without_an_authentication_thread_no_peer_connects(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
+    """ZAP_ENFORCE_DOMAIN is set; without it every peer would connect."""
     gate = sockets._gate
     assert gate is not None
     gate.close()

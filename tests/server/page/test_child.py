@@ -64,7 +64,7 @@ def test_a_port_that_is_taken_is_said_with_a_remedy() -> None:
             PageProcess("127.0.0.1", port)
 
 
-def test_an_address_of_nobody_is_said() -> None:
+def test_an_unknown_host_is_reported() -> None:
     with pytest.raises(UsageError, match=r"--page 5580 at no-such-host\.invalid: .*give an address of this host"):
         PageProcess("no-such-host.invalid", 5580)
 
@@ -200,7 +200,7 @@ def test_with_keys_the_page_needs_none(clips: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_browser_that_reads_nothing_stalls_nobody(served: tuple[LocalServer, int]) -> None:
+def test_a_browser_that_reads_nothing_does_not_stall_others(served: tuple[LocalServer, int]) -> None:
     server, port = served
     until(lambda: got(port, "/readyz")[0] == 200)
     stalled = [socket.create_connection(("127.0.0.1", port)) for _ in range(8)]

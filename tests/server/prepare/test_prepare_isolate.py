@@ -58,7 +58,7 @@ def square_or_wait(job: tuple[int, str]) -> int:
     return number * number
 
 
-def test_a_job_that_waits_for_ever_costs_itself(tmp_path: Path) -> None:
+def test_a_job_that_never_ends_costs_only_itself(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     jobs = [(1, ""), (2, str(tmp_path / "pipe")), (3, ""), (4, "")]
     allowed = {job: 1.0 if job[1] else 60.0 for job in jobs}

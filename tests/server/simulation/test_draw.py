@@ -141,7 +141,7 @@ def test_a_setting_of_one_purpose_leaves_the_others_alone() -> None:
         assert getattr(paper, name) == getattr(other, name)
 
 
-def test_thresholds_of_a_video_are_for_ever() -> None:
+def test_thresholds_of_a_video_are_the_same_in_every_epoch() -> None:
     recipe = Recipe(threshold_source="video")
     pairs = {(p.threshold_pos, p.threshold_neg) for p in drawn(recipe, 20) + drawn(recipe, 20, seed=9, epoch=3)}
     assert len(pairs) == 1

@@ -148,7 +148,7 @@ def test_a_write_that_fails(source: Path, folder: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "empty", "another"])
-def test_a_damaged_piece_is_made_anew(source: Path, folder: Path, how: str) -> None:
+def test_a_damaged_piece_is_decoded_again(source: Path, folder: Path, how: str) -> None:
     epoch(source, Cache(folder, 1 << 30, 0))
     for path in pieces(folder):
         content = bytearray(path.read_bytes())
@@ -229,7 +229,7 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     assert set(epoch(source, cache)) == {"hit"}
 
 
-def test_bytes_are_counted_anew_at_the_start(source: Path, folder: Path) -> None:
+def test_bytes_are_recounted_at_the_start(source: Path, folder: Path) -> None:
     epoch(source, Cache(folder, 1 << 30, 0))
     right = used_bytes(folder)
     (folder / "used").write_bytes(b"nonsense")

@@ -182,7 +182,7 @@ def test_a_file_of_another_source_is_refused(sound: tuple[Path, npt.NDArray[np.u
         StoreFile(tmp_path / "video")
 
 
-def test_a_file_is_none_before_it_is_closed(tmp_path: Path) -> None:
+def test_an_unclosed_file_is_not_a_store_file(tmp_path: Path) -> None:
     luma = np.zeros((64, 8, 8), np.uint8)
     with StoreWriter(tmp_path / "x", head_of(luma), QUICK) as writer:
         for picture in luma[:40]:

@@ -67,7 +67,7 @@ def test_where_the_code_cannot_be_written_the_cache_folder_is_taken(
 
 
 @pytest.mark.usefixtures("read_only_code")
-def test_the_folder_for_temporary_files_only_where_nobody_else_can_write(
+def test_the_temporary_folder_is_used_only_if_other_users_cannot_write_to_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(compile_cache.tempfile, "gettempdir", lambda: str(tmp_path))
@@ -138,7 +138,7 @@ def test_the_processor_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("first", ["v2v_server", "numba"])
-def test_numba_keeps_the_kernels_there_whoever_is_imported_first(first: str) -> None:
+def test_numba_stores_the_kernels_there_in_any_import_order(first: str) -> None:
     code = f"import {first}; from v2v_server.simulation.pixel import words; print(words.stats.cache_path)"
     assert Path(run(code)).parent == compile_cache.SOURCES / "__pycache__" / NAME
 

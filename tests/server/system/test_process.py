@@ -167,7 +167,7 @@ def test_the_kernel_grants_the_long_turns() -> None:
     assert said == ["True", "True", "100000000"]
 
 
-def test_who_was_put_to_run_when_nobody_else_does_keeps_to_that() -> None:
+def test_a_thread_with_another_scheduling_class_keeps_it() -> None:
     said = _in_a_process(
         "import os\n"
         "from v2v_server.system.process import take_long_turns\n"

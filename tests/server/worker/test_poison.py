@@ -179,7 +179,7 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2), (0, 3)]
 
 
-def test_deaths_count_for_each_candidate_anew() -> None:
+def test_deaths_count_separately_for_each_candidate() -> None:
     at = peers()
     at.hello()
     at.want(0)

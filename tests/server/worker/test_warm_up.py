@@ -39,7 +39,7 @@ def has_ended(process: psutil.Process) -> bool:
         return True
 
 
-def test_the_first_holds_the_lock_and_after_it_nobody_does(tmp_path: Path) -> None:
+def test_the_first_process_holds_the_lock_and_later_ones_need_none(tmp_path: Path) -> None:
     with one_compiles(tmp_path, KEY) as is_first:
         assert is_first
         assert is_held(tmp_path)
@@ -109,7 +109,7 @@ def test_one_that_is_killed_leaves_the_work_to_the_next(tmp_path: Path) -> None:
         assert is_held(tmp_path)
 
 
-def test_one_that_does_not_get_on_is_not_waited_for_for_ever(tmp_path: Path) -> None:
+def test_the_wait_for_a_stuck_process_is_bounded(tmp_path: Path) -> None:
     with one_compiles(tmp_path, KEY), one_compiles(tmp_path, KEY, longest_wait_seconds=0.0) as is_first:
         assert is_first
 
@@ -148,7 +148,7 @@ def test_once_all_is_there_it_is_only_loaded(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.slow
-def test_no_worker_compiles_and_none_becomes_large(tmp_path: Path) -> None:
+def test_workers_neither_compile_nor_grow(tmp_path: Path) -> None:
     code = (
         "import psutil\n"
         "from v2v_server.simulation.clip import simulate_pixels, simulate_pixels_with_effects, words\n"

@@ -110,7 +110,7 @@ def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> No
     assert server.heard() == Goodbye()
 
 
-def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--connect nowhere: .*; write tcp://HOST:PORT"):
         Worker("w", tmp_path, "nowhere")
 
