@@ -59,9 +59,10 @@ def nothing_leaks(old_objects):
     gc.collect()
     process = psutil.Process()
     threads, files, children = process.num_threads(), process.num_fds(), len(process.children())
+    before = set(threading.enumerate())
     yield
     gc.collect()
-    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    others = [thread for thread in threading.enumerate() if thread not in before]
     for thread in others:
         thread.join(10.0)  # PyTorch closes the queues of its workers without waiting for the threads that feed them
     assert [thread.name for thread in others if thread.is_alive()] == []
