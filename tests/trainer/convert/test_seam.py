@@ -46,5 +46,5 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
 
 def test_what_no_form_recognises_is_refused_with_those_that_could(tmp_path: Path) -> None:
     (tmp_path / "raw.toy").write_text("")
-    with pytest.raises(conversion.UsageError, match="is no recording that can be read"):
+    with pytest.raises(conversion.UsageError, match="is not a known recording"):
         recognise(tmp_path / "raw.toy")

@@ -70,7 +70,7 @@ def test_without_weights_the_shipped_network_is_taken(tmp_path: Path) -> None:
     assert (sequence["model"], Path(sequence["weights"]).name) == ("firenet", "firenet.pt")
 
 
-def test_a_ctrl_c_shows_what_was_done(
+def test_an_interrupt_prints_the_completed_scores(
     tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("a.h5", "b.h5"):
@@ -85,7 +85,7 @@ def test_a_ctrl_c_shows_what_was_done(
     monkeypatch.setattr(evaluate_module, "evaluate_sequence", until_the_second)
     assert cli.main(["--weights", str(weights), "--data", str(tmp_path / "own")]) == 130
     shown = capsys.readouterr()
-    assert "these sequences were done" in shown.err
+    assert "scores of the completed sequences" in shown.err
     assert "constant grey" in shown.out
 
 
@@ -187,7 +187,7 @@ def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.Ca
     assert "mean of 2 of 7" in printed
     assert "paper: E2VID WebVid10K" in printed
     assert "0.562" in printed
-    assert "EVAID: none of its 11 sequences is there" in printed
+    assert "EVAID: 0 of 11 sequences found" in printed
     assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")) == [
         "HQF/desk.png",
         "IJRR/office_zigzag.png",
@@ -231,10 +231,10 @@ def test_without_pictures_only_at_a_given_rate(tmp_path: Path, weights: Path) ->
         (["paper-discrete", "--data", "{data}"], "--lpips alex BACKBONE HEADS"),
         (["paper-discrete", "--data", "{data}", "--metrics", "mse"], "holds no sequence of hqf/*.h5 (HQF), evaid"),
         (["--data", "{data}", "--model", "e2vid"], "the weights do not fit"),
-        (["--data", "{data}", "--fps", "10", "--metrics", "mse"], "--fps scores nothing"),
-        (["--data", "{data}", "--fps", "10"], "--fps scores nothing: --out DIR says where"),
+        (["--data", "{data}", "--fps", "10", "--metrics", "mse"], "--fps computes no scores"),
+        (["--data", "{data}", "--fps", "10"], "--fps computes no scores: give --out DIR"),
         (["--data", "{data}", "--rows", "0", "--out", "x"], "0 rows"),
-        (["--data", "{data}", "--video"], "a video needs --out"),
+        (["--data", "{data}", "--video"], "a video needs a folder to write it to: give --out"),
         (["--data", "{data}", "--device", "gpu"], "--device gpu: PyTorch cannot compute there"),
         (["--data", "{data}", "--device", "cuda:99"], "--device cuda:99: PyTorch cannot compute there"),
         (["--data", "{data}", "--device", "meta"], "--device meta: PyTorch cannot compute there"),

@@ -92,9 +92,9 @@ def test_folders_and_files(tmp_path: Path) -> None:
         ({"data": ["HQF"], "colour": 1}, "unknown key 'colour'"),
         ({}, "x: data: None should be a list"),
         ({"data": ["KITTI"]}, "'KITTI' is none of the paper's: HQF, EVAID, IJRR, MVSEC"),
-        ({"data": ["HQF", {"name": "HQF", "sequences": ["b"]}]}, "two sets of the name HQF"),
-        ({"data": [{"name": "a"}]}, "has a name and sequences"),
-        ({"data": [{"name": "a", "sequences": "b"}]}, "sequences are a list"),
+        ({"data": ["HQF", {"name": "HQF", "sequences": ["b"]}]}, "two data sets are named HQF"),
+        ({"data": [{"name": "a"}]}, "needs a name and sequences"),
+        ({"data": [{"name": "a", "sequences": "b"}]}, "sequences .b.: give a list"),
         ({"data": [{"name": "a", "sequences": {"b": [1]}}]}, r"b: \[1\] is not \[first second"),
         ({"data": [{"name": "a", "sequences": {"b": [3, 2]}}]}, r"b: \[3, 2\] s"),
         ({"data": ["HQF"], "voxels": {"kind": "square"}}, "kind 'square'"),
@@ -111,7 +111,7 @@ def test_mistakes_are_named(content: Any, message: str) -> None:
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no file absent; configurations that ship .*paper-discrete"):
+    with pytest.raises(UsageError, match=r"no file absent; shipped configurations: .*paper-discrete"):
         read_config("absent")
     (tmp_path / "a.yaml").write_text("data: [HQF")
     with pytest.raises(UsageError, match="is not YAML"):

@@ -64,7 +64,7 @@ def test_an_event_at_the_time_of_a_picture_belongs_to_the_window_after_it(tmp_pa
         assert [opened.events(window).t.tolist() for window in picture_windows(opened)] == [[1.0, 1.1], [1.2, 1.3]]
 
 
-def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path) -> None:
+def test_event_indices_one_early_are_repaired_or_kept_as_published(tmp_path: Path) -> None:
     path = recording(tmp_path, stamped(1.05, 1.25, 1.45, shift=-1))
     with Recording(path) as opened:
         assert [len(opened.events(window)) for window in picture_windows(opened)] == [2, 2]
@@ -73,7 +73,7 @@ def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path)
         assert opened.events(picture_windows(opened)[0]).t.tolist() == [1.0, 1.1]
 
 
-def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Path) -> None:
+def test_a_time_stamp_that_goes_back_is_repaired_or_kept_as_published(tmp_path: Path) -> None:
     """Pictures at 1.05, 1.25, [1.15], 1.45: the third is moved to 1.35. Published: an empty window, then 3 events."""
     path = recording(tmp_path, stamped(1.05, 1.25, 1.15, 1.45))
     with Recording(path) as opened:
@@ -95,7 +95,7 @@ def test_clocks_that_do_not_fit_are_refused_or_taken_as_published(tmp_path: Path
     """The released aedat4 script searches microseconds in seconds: every event_idx is the number of events."""
     attributes = [{"timestamp": 1.6e15 + step, "event_idx": 6} for step in range(2)]
     path = recording(tmp_path, attributes)
-    with pytest.raises(UsageError, match=r"not one clock.*v2v-convert.*--as-published"):
+    with pytest.raises(UsageError, match=r"different clocks.*v2v-convert.*--as-published"):
         Recording(path)
     with Recording(path, as_published=True) as opened:
         assert [len(opened.events(window)) for window in picture_windows(opened)] == [0]
@@ -107,7 +107,7 @@ def test_clocks_of_another_unit_are_refused_although_they_overlap(tmp_path: Path
     attributes = stamped(1.05, 1.25, 1.45, shift=shift)
     for attribute in attributes:
         attribute["timestamp"] = 1.05 + (attribute["timestamp"] - 1.05) * 1e6
-    with pytest.raises(UsageError, match="not one clock"):
+    with pytest.raises(UsageError, match="different clocks"):
         Recording(recording(tmp_path, attributes))
 
 
@@ -220,7 +220,7 @@ def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
 def test_a_size_may_be_given_where_nothing_states_it(tmp_path: Path) -> None:
     numbers = np.arange(6)
     path = write_h5(tmp_path / "a.h5", T, numbers % 4, numbers % 3, numbers % 2, [])
-    with pytest.raises(UsageError, match="say the sensor's size with --size WxH"):
+    with pytest.raises(UsageError, match="give the sensor's size with --size WxH"):
         Recording(path)
     with Recording(path, size=(3, 4)) as opened:
         assert opened.size == (3, 4)
@@ -310,12 +310,12 @@ def broken(path: Path, kind: str) -> Path:
         ("columns", r"columns of events have \[2, 6\]"),
         ("rows", r"events/xs is int64 \[6, 1\], not a column"),
         ("scalar", r"events/xs is int64 \[\], not a column"),
-        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], of whole numbers"),
+        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], which for coordinates"),
         ("raw", r"no events/ts.*v2v-convert"),
-        ("no images or size", "say the sensor.s size with --size WxH"),
+        ("no images or size", "give the sensor.s size with --size WxH"),
         ("no index", "without the attribute event_idx"),
         ("colour", r"is \[3, 4, 3\], not \[H, W\]"),
-        ("twice back", "only single ones can be mended"),
+        ("twice back", "only single times can be repaired"),
     ],
 )
 def test_what_cannot_be_read_is_refused(tmp_path: Path, kind: str, message: str) -> None:

@@ -73,7 +73,7 @@ def test_what_the_network_cannot_take_or_gives_is_refused(tmp_path: Path) -> Non
     path = random_recording(tmp_path / "a.h5")
     network = FireNet(base_channels=2)
     with Recording(path) as recording:
-        with pytest.raises(UsageError, match="voxels of 4 bins, and the network takes 5"):
+        with pytest.raises(UsageError, match="voxels have 4 bins, but the network takes 5"):
             next(reconstruct(recording, picture_windows(recording), network, VoxelSettings(bins=4)))
         with torch.no_grad():
             network.net.pred.conv2d.bias.fill_(float("nan"))  # type: ignore[union-attr]
