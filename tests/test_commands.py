@@ -87,12 +87,12 @@ def command_lines(text: str) -> list[tuple[str, list[str]]]:
     return [(program, _FLAG.findall(rest)) for program, rest in _LINE.findall(joined) if program in MODULES]
 
 
-def test_the_reader_of_command_lines_sees_them() -> None:
+def test_command_lines_are_found_in_texts() -> None:
     text = "Say `v2v-serve --videos DIR --bind=x`, or\n    v2v-worker --connect A \\\n      --cache B  # --no flag\n"
     assert command_lines(text) == [("v2v-serve", ["--videos", "--bind"]), ("v2v-worker", ["--connect", "--cache"])]
 
 
-def test_every_program_is_asked() -> None:
+def test_every_program_is_checked() -> None:
     named = {value.strip('"') for value in re.findall(r"^(v2v-\w+) = ", (ROOT / "pyproject.toml").read_text(), re.M)}
     assert named - {"v2v-bench"} == set(MODULES)
     assert "--videos" in flags_of("v2v-serve")
@@ -101,7 +101,7 @@ def test_every_program_is_asked() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_flags_that_are_shown_exist(page: Path) -> None:
+def test_shown_flags_exist(page: Path) -> None:
     wrong = [
         f"{program} {flag}"
         for program, flags in command_lines(page.read_text(encoding="utf-8"))
@@ -111,7 +111,7 @@ def test_flags_that_are_shown_exist(page: Path) -> None:
     assert wrong == []
 
 
-def test_images_start_programs_with_flags_of_theirs() -> None:
+def test_images_start_programs_with_valid_flags() -> None:
     lists = [
         *re.findall(r"^(?:ENTRYPOINT|CMD) (\[.*\])$", (ROOT / "deploy" / "Dockerfile").read_text(), re.M),
         *re.findall(r"command: (\[\"--.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M),
@@ -183,7 +183,7 @@ def test_lines_of_code_blocks_are_read_by_their_programs(page: Path) -> None:
     assert [f"{shlex.join(words)}: {wrong}" for words in lines if (wrong := wrong_with(words))] == []
 
 
-def test_what_is_wrong_with_a_line_is_seen() -> None:
+def test_faulty_command_lines_are_detected() -> None:
     text = """
     head$  KEY=a v2v-serve --videos DIR \\
         --workers 8   # and so on
@@ -208,7 +208,7 @@ OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
-def test_programs_and_flags_that_are_named_alone_exist(page: Path) -> None:
+def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-bench", "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)

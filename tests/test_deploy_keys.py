@@ -38,7 +38,7 @@ def secrets() -> dict[str, str]:
 
 @pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not here")
 @pytest.mark.parametrize("components", [["keys"], ["keys", "autoscale"]])
-def test_with_keys_the_manifests_build_and_the_broker_asks_for_them(
+def test_with_keys_the_manifests_build_and_the_broker_requires_them(
     components: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     validate = pytest.importorskip("kubernetes_validate")
@@ -84,9 +84,7 @@ def mounted(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
-def test_a_server_and_a_worker_take_the_keys_that_their_pods_find(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_and_a_worker_use_the_keys_in_their_pods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in NOTES:
         if line.startswith("v2v-keys "):

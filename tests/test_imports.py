@@ -53,7 +53,7 @@ def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def test_the_reader_of_imports_sees_them_all() -> None:
+def test_all_kinds_of_imports_are_found() -> None:
     source = """
 import a.b, c as d
 from e.f import g
@@ -69,12 +69,12 @@ from . import o
 
 
 @pytest.mark.parametrize("package", ["v2v_protocol", *FORBIDDEN])
-def test_there_is_something_to_read(package: str) -> None:
+def test_the_packages_have_modules_to_check(package: str) -> None:
     assert modules(package)
 
 
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
-def test_the_protocol_needs_next_to_nothing(path: Path) -> None:
+def test_the_protocol_needs_only_light_packages(path: Path) -> None:
     may = PROTOCOL_MAY | {"yaml"} if path.name == "safe_yaml.py" else PROTOCOL_MAY
     assert imported(path.read_text(encoding="utf-8")) - may == set()
 
@@ -86,7 +86,7 @@ def test_yaml_is_read_in_one_place() -> None:
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_packages_keep_apart(package: str) -> None:
+def test_packages_import_only_allowed_packages(package: str) -> None:
     for path in modules(package):
         crossed = imported(path.read_text(encoding="utf-8")) & FORBIDDEN[package]
         if path.name == "in_process.py":
@@ -94,7 +94,7 @@ def test_packages_keep_apart(package: str) -> None:
         assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
 
 
-def test_no_import_of_the_server_runs_back_up() -> None:
+def test_server_folders_import_only_lower_folders() -> None:
     upward: set[tuple[str, str]] = set()
     for path in modules("v2v_server"):
         room = path.relative_to(ROOT / "v2v_server").parts[0].removesuffix(".py")
@@ -108,7 +108,7 @@ def test_no_import_of_the_server_runs_back_up() -> None:
     assert upward == set()
 
 
-def test_the_server_is_a_house_of_small_rooms() -> None:
+def test_server_folders_are_small() -> None:
     server = ROOT / "v2v_server"
     assert len(list(server.glob("*.py"))) <= 6
     for folder in server.rglob("*/"):
@@ -118,7 +118,7 @@ def test_the_server_is_a_house_of_small_rooms() -> None:
 @pytest.mark.parametrize(
     "room", ["catalogue/index", *sorted(set(FLOORS) - {"config", "serve", "simulation", "flow", "offline"})]
 )
-def test_a_room_has_a_map_of_its_files(room: str) -> None:
+def test_every_folder_documents_its_files(room: str) -> None:
     folder = ROOT / "v2v_server" / room
     on_the_map = {line.split()[0] for line in (folder / "__init__.py").read_text(encoding="utf-8").splitlines()[2:-1]}
     rooms = {path.parent.name for path in folder.glob("*/__init__.py")}

@@ -24,13 +24,13 @@ def shown_by(source: str, names: dict[str, Any]) -> Any:
     return None if last is None else eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
 
 
-def test_it_is_kept_without_outputs() -> None:
+def test_the_notebook_is_stored_without_outputs() -> None:
     code = [cell for cell in CELLS if cell["cell_type"] == "code"]
     assert len(code) > 5
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
 
 
-def test_pages_that_it_names_are_there() -> None:
+def test_linked_pages_exist() -> None:
     text = "".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "markdown")
     pages = [part.split(")")[0] for part in text.split("](")[1:]]
     assert pages

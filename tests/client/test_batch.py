@@ -37,9 +37,7 @@ def of(voxels: Any) -> Batch:
 @pytest.mark.parametrize(
     ("device", "pinned", "returns_early"), [("cpu", False, False), ("cpu", True, True), ("cuda:1", False, True)]
 )
-def test_only_memory_that_waits_for_the_copy_is_copied_behind_our_back(
-    device: str, pinned: bool, returns_early: bool
-) -> None:
+def test_only_pinned_memory_is_copied_asynchronously(device: str, pinned: bool, returns_early: bool) -> None:
     """Memory of our own is lent to other processes the moment the batch is dropped."""
     voxels = Somewhere(device, pinned=pinned)
     of(voxels).to("cuda:0", non_blocking=True)
@@ -47,7 +45,7 @@ def test_only_memory_that_waits_for_the_copy_is_copied_behind_our_back(
     assert voxels.moves == [("cuda:0", returns_early), ("cuda:0", False)]
 
 
-def test_it_gives_its_tensors_by_name_and_is_no_mapping() -> None:
+def test_a_batch_gives_tensors_by_name_but_is_not_a_mapping() -> None:
     """Frameworks rebuild a Mapping, and count what they can iterate over: a Batch has to go through them whole."""
     batch = of(torch.ones(1, 2))
     assert batch["voxels"] is batch.voxels

@@ -38,7 +38,7 @@ def of_two_bins(text: str) -> str:
     return text.replace("Conv2d(5,", "Conv2d(2,")
 
 
-def test_there_are_examples() -> None:
+def test_the_page_has_examples() -> None:
     assert [name for name, _ in EXAMPLES] == ["A plain loop", "DataLoader", "StatefulDataLoader", *OTHERS]
 
 

@@ -28,12 +28,12 @@ def dataset(server: FakeServer) -> V2VStreamDataset:
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
-def test_a_loader_that_would_put_batches_together_is_told_not_to(server: FakeServer, batch_size: int) -> None:
+def test_a_loader_that_collates_batches_is_refused(server: FakeServer, batch_size: int) -> None:
     with pytest.raises(UsageError, match="batch_size=None"):
         next(iter(DataLoader(dataset(server), batch_size=batch_size)))
 
 
-def test_a_loop_that_counts_batches_ends_the_epoch_too(server: FakeServer) -> None:
+def test_a_loop_that_counts_batches_also_ends_the_epoch(server: FakeServer) -> None:
     """Lightning takes as many as there are, and never asks whether there is another."""
     stream = dataset(server)
     epochs = []
@@ -43,7 +43,7 @@ def test_a_loop_that_counts_batches_ends_the_epoch_too(server: FakeServer) -> No
     assert epochs == [0] * 5 + [1] * 5 + [2] * 5
 
 
-def test_an_epoch_that_is_set_during_the_last_batch_is_the_next(server: FakeServer) -> None:
+def test_an_epoch_set_during_the_last_batch_is_the_next_one(server: FakeServer) -> None:
     stream = dataset(server)
     for batch in stream:
         if batch.indices[-1] == 19:
@@ -72,7 +72,7 @@ class FitLoop:
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_lightning_may_not_begin_a_plain_loader_again(server: FakeServer, workers: int) -> None:
+def test_lightning_cannot_resume_a_plain_loader(server: FakeServer, workers: int) -> None:
     """Its loop calls iter() itself, and knows how far it is."""
     theirs: dict[str, Any] = {"__name__": "lightning.pytorch.loops.fit_loop", "Namespace": SimpleNamespace}
     exec(LIGHTNING, theirs)
@@ -90,7 +90,7 @@ def test_lightning_may_not_begin_a_plain_loader_again(server: FakeServer, worker
     assert theirs["FitLoop"](3, 0, False).advance(loader).epoch == 3
 
 
-def test_a_child_that_was_forked_may_not_read_on(server: FakeServer) -> None:
+def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
     batches = iter(dataset(server))
     next(batches)
     here, there = FORK.Pipe()

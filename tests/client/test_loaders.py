@@ -35,7 +35,7 @@ def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
     queue.close()
 
 
-def test_a_spawned_process_sends_what_it_handed_over() -> None:
+def test_a_spawned_process_sends_its_queued_batches_before_it_exits() -> None:
     spawn = multiprocessing.get_context("spawn")
     queue = spawn.Queue()
     process = spawn.Process(target=hand_over_and_leave, args=(queue,))

@@ -91,7 +91,7 @@ TestArrivals = Arrivals.TestCase
 TestArrivals.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_duplicates_and_strays_are_told_apart():
+def test_duplicates_and_strays_are_counted_separately():
     window = ReorderWindow([0], lambda _: (5, 6), 2, 4)
     assert window.ask() == (5, 6)
     assert window.receive(5) is not None

@@ -59,7 +59,7 @@ def test_colours_of_known_events(dtype: type[np.generic]) -> None:
     assert np.argmax(DARKER) == 2
 
 
-def test_a_single_event_is_seen_whatever_the_scale() -> None:
+def test_a_single_event_is_visible_at_any_scale() -> None:
     image = draw_events(np.array([[1, 0, -1]], np.int8), 1000.0).astype(int)
     assert (image[0, 1] == WHITE).all()
     assert np.abs(image[0, 0] - WHITE).max() > 80
@@ -81,7 +81,7 @@ def test_more_events_are_never_paler(values: list[int]) -> None:
     assert (np.diff(green) <= 0).all()
 
 
-def test_full_colour_is_no_outliers() -> None:
+def test_full_colour_ignores_outliers() -> None:
     counts = np.full(1000, 3, np.int8)
     counts[0] = 127
     assert full_colour([counts, np.zeros(5, np.int8)]) == 3.0
@@ -135,7 +135,7 @@ def test_moments_are_active_and_not_paused() -> None:
     assert camera(voxels[:1]).moments(3) == [0]
 
 
-def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise() -> None:
+def test_a_half_paused_moment_is_preferred_to_pure_noise() -> None:
     voxels = np.zeros((20, 5, 4, 4), np.int8)
     voxels[:, :, 0, 0] = 1
     voxels[9] = 30
@@ -144,7 +144,7 @@ def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise(
     assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
 
 
-def test_a_cut_is_no_moment() -> None:
+def test_a_moment_never_spans_a_shot_boundary() -> None:
     voxels = np.zeros((20, 5, 4, 4), np.int8)
     voxels[7, 4], voxels[12] = 100, 3
     assert camera(voxels).moments(1) == [12]
@@ -301,7 +301,7 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert busiest.index(max(busiest)) == 3
 
 
-def test_nothing_at_all_is_drawn_without_a_warning() -> None:
+def test_empty_samples_are_drawn_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")

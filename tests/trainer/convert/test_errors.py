@@ -158,7 +158,7 @@ def evt21(path: Path, header: bytes) -> Path:
         (lambda path: evt21(path, b"% evt 2.1\n% format EVT21;height=18;width=24"), 'decoded: unknown version "EVT21"'),
     ],
 )
-def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: str) -> None:
+def test_errors_name_the_fault(tmp_path: Path, make: object, message: str) -> None:
     source = make(tmp_path)  # type: ignore[operator]
     with pytest.raises(UsageError, match=message):
         convert(source, tmp_path / "out" / "a.h5")
@@ -176,17 +176,17 @@ class PanicException(BaseException):
         (KeyboardInterrupt("index out of bounds"), KeyboardInterrupt),
     ],
 )
-def test_a_panic_of_the_decoder_is_told_as_damage(raised: BaseException, expected: type[BaseException]) -> None:
+def test_a_panic_of_the_decoder_is_reported_as_damage(raised: BaseException, expected: type[BaseException]) -> None:
     with pytest.raises(expected, match="index out of bounds"), _errors_of_faery(Path("a.aedat4")):
         raise raised
 
 
-def test_size_given_where_the_file_has_none(tmp_path: Path) -> None:
+def test_a_size_may_be_given_if_the_file_has_none(tmp_path: Path) -> None:
     done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=ConvertOptions(size=SensorSize(30, 20)))
     assert done.written.size == SensorSize(30, 20)
 
 
-def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> None:
+def test_a_bag_with_several_topics_needs_a_choice(tmp_path: Path) -> None:
     raw_forms.write_bag(tmp_path / "a.bag", scene())
     for options, message in (
         (ConvertOptions(events_topic="/none"), r"0 topics of events; .*/dvs/events \(dvs_msgs/msg/EventArray\)"),
@@ -199,7 +199,7 @@ def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> Non
         convert(tmp_path / "b.bag", tmp_path / "b.h5")
 
 
-def test_source_and_destination_are_kept_apart(tmp_path: Path) -> None:
+def test_source_and_destination_must_differ(tmp_path: Path) -> None:
     folder = tmp_path / "slow"
     raw_forms.write_folder(folder, raw_forms.ijrr_members(scene()))
     with pytest.raises(UsageError, match="lies in the source folder"):
@@ -226,9 +226,7 @@ def test_blocks_may_end_anywhere(monkeypatch: pytest.MonkeyPatch, block: int) ->
         list(read_text_events(io.BytesIO(broken), "a.txt"))
 
 
-def test_it_is_said_where_the_size_is_that_of_the_events_area(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_guessed_size_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "own.txt").write_text("10 3 2 1\n20 7 4 0\n")
     for name, flags, size, guessed in (("a", [], "8 x 5", True), ("b", ["--size", "24x18"], "24 x 18", False)):
         cli.main([str(tmp_path / "own.txt"), "--out", str(tmp_path / f"{name}.h5"), *flags])

@@ -78,7 +78,7 @@ def check_events(path: Path, expected: Scene) -> None:
 
 @pytest.mark.parametrize("case", WITH_PICTURES)
 @pytest.mark.parametrize("kind", ["discrete", "interpolated"])
-def test_conversion_reader_and_voxels(tmp_path: Path, case: str, kind: str) -> None:
+def test_every_raw_form_gives_the_known_voxel_grids(tmp_path: Path, case: str, kind: str) -> None:
     form, name, write = WITH_PICTURES[case]
     source, destination = tmp_path / name, tmp_path / "out" / "sequence.h5"
     original = scene()
@@ -108,7 +108,7 @@ def test_conversion_reader_and_voxels(tmp_path: Path, case: str, kind: str) -> N
 
 
 @pytest.mark.parametrize("case", WITHOUT)
-def test_events_alone(tmp_path: Path, case: str) -> None:
+def test_events_without_pictures_are_converted(tmp_path: Path, case: str) -> None:
     form, name, write = WITHOUT[case]
     original = scene()
     write(tmp_path / name, original)
@@ -128,7 +128,7 @@ def test_events_alone(tmp_path: Path, case: str) -> None:
             np.testing.assert_array_equal(grid, expected_voxels(number, "discrete"))
 
 
-def test_the_published_event_index_is_kept_beside_ours(tmp_path: Path) -> None:
+def test_the_published_event_index_is_written_as_well(tmp_path: Path) -> None:
     """HQF's script pairs a picture with the event before; MVSEC's takes the index in the raw file."""
     original = scene()
     raw_forms.write_bag(tmp_path / "desk.bag", original)

@@ -44,7 +44,7 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
         assert (np.asarray(events.p) > 0).tolist() == [True, False, True]
 
 
-def test_what_no_form_recognises_is_refused_with_those_that_could(tmp_path: Path) -> None:
+def test_an_unknown_form_is_refused_with_a_list_of_forms(tmp_path: Path) -> None:
     (tmp_path / "raw.toy").write_text("")
     with pytest.raises(conversion.UsageError, match="is not a known recording"):
         recognise(tmp_path / "raw.toy")

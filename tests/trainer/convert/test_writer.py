@@ -85,7 +85,7 @@ def test_events_later_than_the_buffer_reaches_are_refused(tmp_path: Path, monkey
         ([SensorSize(5, 5), chunk([0]), picture(0)], None, r"the sensor is SensorSize\(width=5"),
     ],
 )
-def test_what_cannot_be_is_refused_and_leaves_nothing(
+def test_invalid_items_are_refused_and_leave_no_file(
     tmp_path: Path, items: list[Item], size: SensorSize | None, message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):

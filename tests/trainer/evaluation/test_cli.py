@@ -63,7 +63,7 @@ def test_scores_of_a_converted_bag_equal_those_computed_by_hand(tmp_path: Path, 
     assert (mean["sequence"], mean["mse"], mean["voxels"]) == (None, sequence["mse"], "discrete")
 
 
-def test_without_weights_the_shipped_network_is_taken(tmp_path: Path) -> None:
+def test_without_weights_the_shipped_network_is_used(tmp_path: Path) -> None:
     out = tmp_path / "records.json"
     assert cli.main(["--data", str(random_recording(tmp_path / "a.h5")), "--json", str(out)]) == 0
     sequence, _ = json.loads(out.read_text())
@@ -123,7 +123,7 @@ def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path
 
 
 @pytest.mark.parametrize(("folder", "name", "end"), [("evaid", "outdoor", 1.4), ("ijrr", "slider_depth", 2.5)])
-def test_as_published_evaid_is_cut_a_picture_later(
+def test_as_published_evaids_time_ranges_are_one_picture_later(
     tmp_path: Path, weights: Path, folder: str, name: str, end: float
 ) -> None:
     """Its script keeps the picture at the end, and then drops the first one; the other scripts do neither."""
@@ -140,7 +140,7 @@ def test_as_published_evaid_is_cut_a_picture_later(
 
 
 @pytest.mark.parametrize("name", ["a.hdf5", "a.hdf", "a"])
-def test_a_single_file_is_that_file(tmp_path: Path, weights: Path, name: str) -> None:
+def test_a_single_file_is_evaluated_alone(tmp_path: Path, weights: Path, name: str) -> None:
     random_recording(tmp_path / "own" / "a.h5", images=3)
     random_recording(tmp_path / "own" / name, images=5)
     (record, _) = evaluate("--weights", weights, "--data", tmp_path / "own" / name, "--metrics", "mse")
@@ -213,7 +213,7 @@ def test_pictures_and_video(tmp_path: Path, weights: Path) -> None:
     assert np.abs(difference).mean() < 20
 
 
-def test_without_pictures_only_at_a_given_rate(tmp_path: Path, weights: Path) -> None:
+def test_recordings_without_pictures_need_a_rate(tmp_path: Path, weights: Path) -> None:
     raw_forms.write_evt3(tmp_path / "own.raw", scene())
     convert_cli.main([str(tmp_path / "own.raw"), "--out", str(tmp_path / "h5")])
     arguments = ("--fps", 100, "--rows", 1, "--out", tmp_path)
@@ -256,7 +256,7 @@ def test_mistakes_end_with_status_2(
         (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: cannot be written: no folder"),
     ],
 )
-def test_what_is_refused_is_so_before_anything_is_evaluated(
+def test_bad_recordings_are_refused_before_any_evaluation(
     tmp_path: Path,
     weights: Path,
     arguments: tuple[str, ...],

@@ -88,7 +88,7 @@ def test_outdoors_the_hood_does_not_count_unless_as_published(tmp_path: Path) ->
     assert published["zeros"].means["aee_dense"] == pytest.approx(later, rel=1e-5)
 
 
-def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path) -> None:
+def test_a_window_without_counted_pixels_is_left_out_or_scores_0(tmp_path: Path) -> None:
     path = recording(tmp_path / "outdoor_day2.h5", empty=1)
     right = evaluate_flow(run(constant(0, 0), as_published=False), path, None)["zeros"]
     assert (right.windows, right.means["aee_sparse"]) == (3, pytest.approx((1 + 2) / 2, rel=1e-5))
@@ -96,7 +96,7 @@ def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path
     assert published.means["aee_dense"] == pytest.approx((0 + 2 + 8) / 3 * (1 + 9 * 0.05), rel=1e-5)
 
 
-def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
+def test_without_pictures_a_time_range_counts_from_the_first_field(tmp_path: Path) -> None:
     path = recording(tmp_path / "a.h5")
     assert evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.11))["zeros"].windows == 1
     with pytest.raises(UsageError, match=r"1 flow fields in the time range .*v2v-convert reads MVSEC's"):
@@ -104,7 +104,7 @@ def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(
+def test_a_network_that_uses_the_previous_window_has_an_output_for_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
@@ -113,7 +113,7 @@ def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(
     assert found["network"].windows == 3
 
 
-def test_the_command_shows_the_paper_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "data" / "mvsec").mkdir(parents=True)
     recording(tmp_path / "data" / "mvsec" / "indoor_flying1.h5")
     torch.save(constant(0, 0).state_dict(), tmp_path / "a.pth")

@@ -77,7 +77,7 @@ def by_hand(predicted: float, fields: tuple[int, ...], counted: tuple[str, ...])
 
 @pytest.mark.parametrize("name", ["indoor_flying1", "outdoor_day1"])
 @pytest.mark.parametrize("as_published", [False, True])
-def test_aee_and_3pe_of_a_constant_prediction_and_of_none(tmp_path: Path, name: str, as_published: bool) -> None:
+def test_aee_and_3pe_of_a_constant_and_a_zero_prediction(tmp_path: Path, name: str, as_published: bool) -> None:
     data, weights, out = tmp_path / "data" / "mvsec", tmp_path / "a.pth", tmp_path / "a.json"
     assert not convert([str(write_raw(tmp_path, name)), "--out", str(data)])
     torch.save(constant(PREDICTED, 0.0).state_dict(), weights)
@@ -121,7 +121,7 @@ def test_as_published_the_events_of_eraft_are_those_of_the_window_before(tmp_pat
         assert found["zeros"].means[name] == pytest.approx(share * of_zeros[name], rel=1e-5), "it is no E-RAFT"
 
 
-def test_zeros_by_hand() -> None:
+def test_zeros_match_values_computed_by_hand() -> None:
     """What the test above expects, for two cases in plain numbers."""
     # Dense, outdoors: 400 px of A, 360 of B; fields 0, 1, 2.
     right = by_hand(0.0, (0, 1, 2), ("A", "B"))

@@ -47,7 +47,7 @@ def oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> np.nd
 
 
 @given(recorded, st.sampled_from(("discrete", "interpolated")), st.integers(1, 7))
-def test_equals_the_oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> None:
+def test_voxel_grids_equal_the_oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> None:
     np.testing.assert_allclose(grid(rows, kind, bins), oracle(rows, kind, bins), rtol=0, atol=1e-5)
 
 
@@ -115,7 +115,7 @@ def test_truncation_moves_an_event_that_is_just_below_its_microsecond(truncate: 
 
 @pytest.mark.parametrize("kind", ["discrete", "interpolated"])
 @pytest.mark.parametrize("span", ["events", "window"])
-def test_no_event_and_events_at_one_time(kind: str, span: str) -> None:
+def test_no_events_and_simultaneous_events_are_valid(kind: str, span: str) -> None:
     nothing = Events(np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
     settings = VoxelSettings(kind=kind, span=span)  # type: ignore[arg-type]
     assert not voxel_grid(nothing, SIZE, settings, (0, 1)).any()

@@ -257,7 +257,7 @@ def test_the_sum_is_weighted_and_its_terms_are_reported() -> None:
     assert prediction.grad is not None
 
 
-def test_nothing_waits_for_the_device() -> None:
+def test_computing_does_not_synchronise_with_the_device() -> None:
     """Fake tensors have no values: reading one raises."""
     loss = ReconstructionLoss(
         lpips=LPIPS("squeeze"), temporal=TemporalConsistency(first_step=1), lpips_weight=1, temporal_weight=1

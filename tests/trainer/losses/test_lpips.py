@@ -81,7 +81,7 @@ def squeeze() -> LPIPS:
     return metric
 
 
-def test_a_picture_is_at_distance_zero_of_itself_and_the_distance_is_symmetric(squeeze: LPIPS) -> None:
+def test_the_distance_is_symmetric_and_zero_for_equal_pictures(squeeze: LPIPS) -> None:
     first, second = picture(0, 24, 24), picture(1, 24, 24)
     assert squeeze(first, first).item() == 0
     assert squeeze(first, second).item() > 0

@@ -61,7 +61,7 @@ def close(network: VoxelNetwork, eager: VoxelNetwork) -> None:
     "name",
     [pytest.param(name, marks=[] if name == "firenet" else [pytest.mark.slow]) for name in NETWORKS],
 )
-def test_a_turn_is_traced_as_it_is(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_iteration_is_traced_without_changes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """All that ``torch.compile`` does but the making of machine code."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)

@@ -87,7 +87,7 @@ def test_unknown_settings_are_refused(options: dict[str, str]) -> None:
         E2VID(**options)  # type: ignore[arg-type]
 
 
-def test_padding_is_cut_off_again() -> None:
+def test_padding_is_cropped_from_the_output() -> None:
     model = E2VID(base_channels=4, encoders=2)
     voxels = torch.from_numpy(counts((1, 2, 5, 16, 32)))
     voxels[..., 13:, :] = 0

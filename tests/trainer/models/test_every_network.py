@@ -257,7 +257,7 @@ def test_wrong_shapes_are_refused(network: VoxelNetwork, shape: tuple[int, ...])
 
 
 @pytest.mark.parametrize("padding", ["bottom-right", "centred", "top-left"])
-def test_padding_is_zeros_where_it_is_said(name: str, padding: str) -> None:
+def test_padding_is_zeros_at_the_stated_sides(name: str, padding: str) -> None:
     """As a picture that has these zeros itself."""
     torch.manual_seed(0)
     network = NETWORKS[name](**SMALL[name], padding=padding).eval()  # type: ignore[arg-type]
@@ -275,7 +275,7 @@ def test_padding_is_zeros_where_it_is_said(name: str, padding: str) -> None:
         torch.testing.assert_close(network.forward_sequence(voxels), expected, rtol=0, atol=1e-5)
 
 
-def test_nothing_waits_for_the_device(name: str, network: VoxelNetwork) -> None:
+def test_computing_does_not_synchronise_with_the_device(name: str, network: VoxelNetwork) -> None:
     """Fake tensors have no values: reading one (``item``, ``if tensor``, boolean indexing) raises."""
     network.normalizes = True
     guide = Guide(torch.zeros(2, 3, 1, 17, 20), 0.5)

@@ -42,7 +42,7 @@ def test_equals_the_numpy_network(normalizes: bool) -> None:
         np.testing.assert_allclose(pictures.numpy(), expected, rtol=0, atol=1e-5)
 
 
-def test_starts_grey() -> None:
+def test_an_untrained_network_predicts_grey() -> None:
     torch.manual_seed(0)
     pictures = FireNet().forward_sequence(torch.zeros(1, 2, 5, 8, 8))
     assert abs(pictures.mean() - 0.5) < 0.2

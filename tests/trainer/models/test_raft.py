@@ -93,7 +93,7 @@ def test_parameters(size: str) -> None:
     assert set(map(torchvision_name, RAFT(size).state_dict())) == set(RAFT(size).state_dict())
 
 
-def test_batches_are_cut_without_a_trace_and_bytes_are_as_good_as_floats(tmp_path: Path) -> None:
+def test_chunking_and_dtype_do_not_change_the_flow(tmp_path: Path) -> None:
     path = saved(tmp_path, "small")
     first, second = pictures()
     whole = RaftFlow("small", path)(first, second)
@@ -124,7 +124,7 @@ def test_bfloat16_stays_near() -> None:
     assert 0 < (near[0] - exact[0]).norm(dim=0).median() < 0.1
 
 
-def test_the_neighbourhood_is_read_where_it_should_be() -> None:
+def test_correlations_are_sampled_at_the_right_positions() -> None:
     """Against plain indexing: offsets in x vary slowest, those in y fastest."""
     plane = torch.arange(35.0).reshape(1, 1, 5, 7).repeat(35, 1, 1, 1)
     y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
@@ -137,7 +137,7 @@ def test_the_neighbourhood_is_read_where_it_should_be() -> None:
     np.testing.assert_allclose(found[0], expected, atol=1e-4)
 
 
-def test_weights_that_do_not_serve_are_refused_with_a_source(tmp_path: Path) -> None:
+def test_unsuitable_weights_are_refused_with_a_source(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no file .*none\.pth.*download\.pytorch\.org.*raft_small"):
         RaftFlow("small", tmp_path / "none.pth")
     (tmp_path / "text.pth").write_text("hello")

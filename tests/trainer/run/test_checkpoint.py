@@ -81,7 +81,7 @@ def test_calls_in_a_pickle_become_placeholders(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_whole_objects_beside_the_weights_do_no_harm(tmp_path: Path, zipped: bool) -> None:
+def test_pickled_objects_beside_the_weights_are_ignored(tmp_path: Path, zipped: bool) -> None:
     """As event_cnn_minimal and V2V save: optimiser and scheduler as objects, a ConfigParser."""
     model = small()
     optimizer = torch.optim.Adam(model.parameters(), amsgrad=True)
@@ -153,7 +153,7 @@ def test_absent_files_and_files_without_weights_are_refused(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "module._orig_mod.", "_orig_mod.module."])
 @pytest.mark.parametrize("container", ["bare", "state_dict", "model"])
-def test_wrappers_leave_no_trace(tmp_path: Path, prefix: str, container: str) -> None:
+def test_prefixes_of_wrappers_are_removed(tmp_path: Path, prefix: str, container: str) -> None:
     model = small()
     wrapped = OrderedDict((prefix + name, tensor) for name, tensor in model.state_dict().items())
     torch.save(wrapped if container == "bare" else {container: wrapped, "epoch": 1}, tmp_path / "wrapped.pth")
@@ -202,7 +202,7 @@ def test_firenet_plus_names(tmp_path: Path) -> None:
     assert same(other.state_dict(), model.state_dict())
 
 
-def test_a_misfit_is_refused_whole_and_reported(tmp_path: Path) -> None:
+def test_a_misfit_is_reported_and_leaves_the_network_unchanged(tmp_path: Path) -> None:
     model = small()
     state = dict(model.state_dict())
     del state["unetrecurrent.head.conv2d.bias"]
@@ -370,7 +370,7 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: p
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
 
 
-def test_what_the_disk_says_is_what_is_raised(tmp_path: Path) -> None:
+def test_disk_errors_are_raised_unchanged(tmp_path: Path) -> None:
     """Not what PyTorch's writer makes of it."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     large = dataclasses.replace(Run().checkpoint(), ema={"weight": torch.zeros(60_000)})
@@ -401,14 +401,14 @@ def test_the_data_are_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch
     assert calls == ["file", "replace", "folder"]
 
 
-def test_what_needs_code_to_be_read_is_refused_before_writing(tmp_path: Path) -> None:
+def test_objects_that_need_code_to_load_are_refused_before_writing(tmp_path: Path) -> None:
     checkpoint = dataclasses.replace(Run().checkpoint(), config={"sizes": [1, {"seed": np.int64(3)}]})
     with pytest.raises(UsageError, match=r"config\['sizes'\]\[1\]\['seed'\] is a int64"):
         save_checkpoint(tmp_path / "a.pt", checkpoint)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
+def test_other_files_are_refused_as_checkpoints(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     with pytest.raises(UsageError, match="no file"):
         load_checkpoint(path)
