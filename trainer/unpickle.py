@@ -8,10 +8,13 @@ with an inert :class:`Placeholder`, without importing it.
 
 from __future__ import annotations
 
+import lzma
 import pickle
 import struct
 import tarfile
 import warnings
+import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -79,8 +82,23 @@ _TENSORS_ONLY = SimpleNamespace(Unpickler=_TensorUnpickler, load=_load, __name__
 _DAMAGE = (
     *(pickle.UnpicklingError, struct.error, EOFError, OSError, ImportError, AttributeError),
     *(ArithmeticError, AssertionError, LookupError, MemoryError, RuntimeError, TypeError, ValueError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
 )
 """Errors that PyTorch and pickle raise on malformed files."""
+
+
+def _check_sums(path: str | Path) -> None:
+    """Check the CRC-32 of each entry of a zip archive; ``torch.load`` does not.
+
+    Raises:
+        BadZipFile: an entry is damaged.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        # PyTorch writes 0 everywhere where it is told not to compute them.
+        if any(entry.CRC for entry in archive.infolist()) and (damaged := archive.testzip()):
+            raise zipfile.BadZipFile(f"wrong CRC-32 of {damaged}")
 
 
 def read_torch_file(path: str | Path, *, plain: bool = False) -> Any:
@@ -99,6 +117,7 @@ def read_torch_file(path: str | Path, *, plain: bool = False) -> Any:
     try:
         if tarfile.is_tarfile(path):
             raise UsageError(f"{path} is a tar archive (packed, or PyTorch before 0.1.12): give the checkpoint itself")
+        _check_sums(path)
         with warnings.catch_warnings():
             # These warnings concern how the file was written (its pickle protocol, old storage classes).
             warnings.simplefilter("ignore", UserWarning)

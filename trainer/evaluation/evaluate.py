@@ -68,6 +68,7 @@ class Run:
         size: height and width of the sensor, see :class:`Recording`.
         drawing: pictures and videos to write.
         stretch: see :func:`reconstruct`.
+        score_blank: also score a blank picture in the mean grey of each target.
     """
 
     network: VoxelNetwork
@@ -83,6 +84,7 @@ class Run:
     size: tuple[int, int] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     stretch: Stretch = "none"
+    score_blank: bool = True
 
 
 def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
@@ -106,8 +108,13 @@ def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
         UsageError: see :class:`Recording`.
     """
     for path in find_recordings(data, data_set).values():
-        with Recording(path, as_published=run.as_published, size=run.size) as recording:
-            _windows(run, recording, data_set)
+        check_recording(run, path, data_set)
+
+
+def check_recording(run: Run, path: Path, data_set: DataSet) -> None:
+    """Check that a recording can be evaluated; raises as :func:`check_data_set`."""
+    with Recording(path, as_published=run.as_published, size=run.size) as recording:
+        _windows(run, recording, data_set)
 
 
 def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
@@ -140,7 +147,7 @@ def evaluate_sequence(
     """Score one recording, and draw it if requested."""
     with Recording(path, as_published=run.as_published, size=run.size) as recording, ieee_products():
         windows = _windows(run, recording, data_set)
-        scorer = SequenceScorer(run.metrics)
+        scorer = SequenceScorer(run.metrics, run.score_blank)
         rows = []
         shown = choose_steps(len(windows), run.drawing.rows)
         with _video(run.drawing, data_set.name, recording.name, windows) as video:

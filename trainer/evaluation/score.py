@@ -39,9 +39,10 @@ class SequenceScore:
 
 @dataclass
 class SequenceScorer:
-    """Collect the scores of one sequence, step by step."""
+    """Collect the scores of one sequence step by step; ``score_blank`` adds those of the blank and doubles the work."""
 
     metrics: Mapping[str, Metric]
+    score_blank: bool = True
     values: dict[str, list[float]] = field(default_factory=dict)
     blank: dict[str, list[float]] = field(default_factory=dict)
     by_frame: list[dict[str, float]] = field(default_factory=list)
@@ -62,7 +63,8 @@ class SequenceScorer:
         for name, metric in self.metrics.items():
             scored[name] = metric(prediction, target)
             self.values.setdefault(name, []).append(scored[name])
-            self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
+            if self.score_blank:
+                self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
 
     def score(self, data_set: str, sequence: str, repaired_images: int) -> SequenceScore:
         """Return the means over the steps added so far."""
@@ -75,6 +77,10 @@ class SequenceScorer:
 
 def mean_over_sequences(scores: Sequence[SequenceScore], *, blank: bool = False) -> dict[str, float]:
     """Return the unweighted mean of each metric that every sequence has; with ``blank``, of the blank pictures."""
-    found = [score.blank if blank else score.means for score in scores]
+    return mean_by_name([score.blank if blank else score.means for score in scores])
+
+
+def mean_by_name(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the unweighted mean by name, of the names that all of ``found`` have."""
     names = [name for name in found[0] if all(name in means for means in found)] if found else []
     return {name: float(np.mean([means[name] for means in found])) for name in names}

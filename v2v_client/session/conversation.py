@@ -196,7 +196,7 @@ class Conversation:
             self._pinned_by += f", begun at {self._address},"
             self._moved = True
         self._address = address
-        self._server.heard(now)
+        self._server.mark_heard(now)
         self._answered = self._available_at = now
         self.outbox.clear()
         self.handle_event(Event.SILENCE, now)
@@ -334,7 +334,7 @@ class Conversation:
             StateMismatch: the server offers another stream than the pinned one.
             ProtocolError: the message breaks the protocol.
         """
-        self._server.heard(now)
+        self._server.mark_heard(now)
         if isinstance(message, Pong):
             self._check_for_workers(message.trouble, now)
         else:
