@@ -1,4 +1,4 @@
-"""What `deploy/` says of the commands holds of the commands."""
+"""Check that `deploy/` agrees with the commands."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_mistyped_folder_of_videos_is_not_created() -> None:
 
 
 def test_a_container_has_minimal_rights() -> None:
-    """Root's neither: both images name a user."""
+    """It does not run as root either: both images set a user."""
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     for service in services.values():
         assert service["cap_drop"] == ["ALL"]

@@ -1,4 +1,4 @@
-"""The component of keys: what kustomize makes of it, and that a server and a worker take what its pods find."""
+"""Test the component "keys": the output of kustomize, and that a server and a worker accept the files in its pods."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ NOTES = [line.removeprefix("#").strip() for line in (COMPONENT / "kustomization.
 
 
 def patch_of(name: str) -> dict[str, Any]:
-    """The pod that a patch of the component describes."""
+    """Return the pod that a patch of the component describes."""
     spec: dict[str, Any] = yaml.safe_load((COMPONENT / name).read_text())["spec"]["template"]["spec"]
     return spec
 
 
 def secrets() -> dict[str, str]:
-    """Files that the secrets of the notes are made from, by their names."""
+    """Return the files from which the documented secrets are created, by name."""
     lines = [re.fullmatch(r"kubectl -n v2v create secret generic (\S+) --from-file=(\S+)", line) for line in NOTES]
     return {found[1]: found[2] for found in lines if found}
 
@@ -73,7 +73,7 @@ def test_with_keys_the_manifests_build_and_the_broker_requires_them(
 
 
 def mounted(folder: Path, files: dict[str, bytes]) -> Path:
-    """A folder as Kubernetes mounts a secret for the group of a pod: links to links, which the group may read."""
+    """Create a folder as Kubernetes mounts a secret for the group of a pod: links to links, readable by the group."""
     data = folder / "..2026_11_24"
     data.mkdir(parents=True)
     for name, content in files.items():

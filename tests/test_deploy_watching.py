@@ -1,4 +1,4 @@
-"""What `deploy/` asks of a server's metrics, the server tells."""
+"""Check that the server exports every metric that `deploy/` uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drawn curve: what was logged, with the steps of several runs counted on."""
+"""Test the drawn curve: the logged values, with consecutive steps over several runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may import whom. Read from the source, so that an import inside a function counts as well."""
+"""Check which package may import which, by reading the source, so that imports inside functions count as well."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLOORS = (
 
 
 def imported_modules(source: str) -> set[str]:
-    """Full names of everything a module imports, wherever in it: statements, and import_module("...") calls."""
+    """Return the full names of all imports anywhere in a module: statements, and import_module("...") calls."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -45,7 +45,7 @@ def imported_modules(source: str) -> set[str]:
 
 
 def imported(source: str) -> set[str]:
-    """The top-level names of these."""
+    """Return the top-level names of a module's imports."""
     return {name.split(".")[0] for name in imported_modules(source)}
 
 
@@ -80,7 +80,7 @@ def test_the_protocol_needs_only_light_packages(path: Path) -> None:
 
 
 def test_yaml_is_read_in_one_place() -> None:
-    """Its own loaders expand aliases without a bound."""
+    """YAML's own loaders expand aliases without a bound."""
     users = [path for package in PACKAGES for path in modules(package) if "yaml" in imported(path.read_text("utf-8"))]
     assert users == [ROOT / "v2v_protocol" / "safe_yaml.py"]
 
@@ -140,7 +140,7 @@ def test_imports_are_absolute() -> None:
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:
-    """What others import on their own account counts too."""
+    """Indirect imports count too."""
     program = f"import sys, {module}\nprint(*sorted({set(without)!r} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120

@@ -1,4 +1,4 @@
-"""The notebook runs from its first cell to its last, and shows what it says that it shows."""
+"""Test that the notebook runs from its first cell to its last, and shows what its text describes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 
 
 def shown_by(source: str, names: dict[str, Any]) -> Any:
-    """Runs a cell as a notebook does; returns the value of an expression at its end."""
+    """Run a cell as a notebook does, and return the value of an expression at its end."""
     tree = ast.parse(source)
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, str(NOTEBOOK), "exec"), names)

@@ -1,4 +1,4 @@
-"""Clips from photographs: smooth, of a fixed size, the same frames for the same seed."""
+"""Test clips from photographs: smooth, of a fixed size, with equal frames for equal seeds."""
 
 import sys
 
@@ -27,7 +27,7 @@ def test_motion_begins_at_rest_position_and_never_jumps():
 
 
 def test_the_same_seed_gives_the_same_frames(monkeypatch):
-    """Of the files that cannot be said: x264 does not always give the same bytes for the same frames."""
+    """The files may differ: x264 does not always give the same bytes for the same frames."""
     monkeypatch.setattr(pan_photographs, "FRAMES", 5)
     one, two, other = (
         pan_photographs.clip([data.chelsea()], [], np.random.default_rng(seed)) for seed in ((3, 0), (3, 0), (3, 1))

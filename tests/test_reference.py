@@ -1,4 +1,4 @@
-"""The reference page of all keys, and the flags that the documentation names."""
+"""Check the reference page of all keys, and the flags that the documentation names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What would run what a stranger sent is nowhere, or in the few places that are named here."""
+"""Check that code which could execute received data is absent, or only in the few places named here."""
 
 from __future__ import annotations
 

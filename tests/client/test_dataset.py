@@ -47,7 +47,7 @@ def server():
 
 @pytest.fixture(scope="module", autouse=True)
 def old_objects():
-    """What was there before is not looked through again and again: with torch that takes a third of a second."""
+    """Freeze existing objects, so that garbage collection skips them: with torch it takes a third of a second."""
     gc.collect()
     gc.freeze()
     yield
@@ -231,7 +231,7 @@ def test_wrong_options_are_refused_at_once(options, word):
 
 
 def test_options_that_depend_on_the_servers_spec_are_checked_by_the_server():
-    """It may make clips of 80 voxels, and four samples of a decode."""
+    """The server's own spec may have clips of 80 voxels, and four samples per decode."""
     for recipe in (None, {"bins": 3}):
         V2VStreamDataset("tcp://127.0.0.1:1", recipe=recipe, flow_from=60, sibling_spacing=48)
 
@@ -271,7 +271,7 @@ def test_leaving_early_and_iterating_again_repeats_the_epoch(server):
 
 @pytest.mark.parametrize("loaded", [False, True])
 def test_an_epoch_set_while_another_is_finished_is_the_next_one(server, loaded):
-    """As a trainer does that says at the last batch which epoch follows, or reads ahead in a thread."""
+    """A trainer may set the next epoch at the last batch, or while a thread reads ahead."""
     stream = dataset(server)
     batches = iter(stream)
     state = next(batches).resume_state
@@ -331,7 +331,7 @@ def test_a_remainder_smaller_than_a_batch_starts_the_next_epoch(server):
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_set_epoch_to_a_loaded_epoch_with_no_batch_left_repeats_no_samples(server, workers):
-    """As every training loop over epochs has it: load_state_dict(state), then set_epoch(state["epoch"])."""
+    """Training loops over epochs call load_state_dict(state), then set_epoch(state["epoch"])."""
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(4)][-1]
     again = dataset(server, batch_size=8)
@@ -471,7 +471,7 @@ def test_lost_samples_are_requested_again(server):
 
 @pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
 def test_repeated_requests_name_no_shared_memory(server):
-    """The worker that was asked first may be writing there still."""
+    """The first worker may still be writing there."""
     server.drop = {(0, 2), (0, 17)}
     assert places(dataset(server)) == epoch_places(0)
     named = {asked: slot for asked, slot in zip(server.wants, server.slots, strict=True) if slot != NO_SLOT}
@@ -482,7 +482,7 @@ def test_repeated_requests_name_no_shared_memory(server):
 
 
 def test_a_denial_for_credit_after_repeated_requests_is_recovered(server):
-    """A sample that was on its way when it was asked for again is made twice, and fills the server's account."""
+    """A sample that was on its way when it was requested again is made twice, and uses up credit at the server."""
     server.drop = {(0, 2)}
     server.refuse_repeat = True
     assert places(dataset(server)) == epoch_places(0)
@@ -663,7 +663,7 @@ def test_an_error_in_a_loader_worker_is_raised_in_the_parent(server):
 
 @pytest.mark.parametrize("kind", [RemoteError, SampleUnavailable])
 def test_a_refusal_in_a_loader_worker_keeps_its_code(kind):
-    """As PyTorch carries it: its kind, and its trace as a text."""
+    """PyTorch passes on its type, and its traceback as text."""
     try:
         raise kind("unknown-session", "the server refused [twice]: say Hello again")
     except kind:
@@ -748,7 +748,7 @@ def test_slots_stop_once_a_whole_batch_came_in_messages(server):
 
 
 def test_many_small_batches_do_not_exhaust_open_files(monkeypatch):
-    """The rest of them comes in messages, and memory is lent on as it comes back."""
+    """Samples without an arena come in messages; arenas are reused as they come back."""
     monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
     with FakeServer(sequences=160, credit=40) as server:
         before, most = len(os.listdir("/proc/self/fd")), 0
@@ -761,7 +761,7 @@ def test_many_small_batches_do_not_exhaust_open_files(monkeypatch):
 
 
 def test_a_late_write_of_an_abandoned_worker_does_not_change_a_batch(server):
-    """Index 1 is lost with its worker, is asked for again, and comes from another one; then the first wakes."""
+    """Index 1 is lost with its worker, is requested again, and comes from another worker; then the first one wakes."""
     server.drop = {(0, 1)}
     stream = iter(dataset(server))
     batch = next(stream)

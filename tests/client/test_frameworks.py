@@ -1,4 +1,4 @@
-"""What loaders, loops and launchers of others do with the dataset: it works, or the error says what to do instead."""
+"""Test the dataset with other loaders, loops and launchers: it works, or the error says what to do instead."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_loader_that_collates_batches_is_refused(server: FakeServer, batch_siz
 
 
 def test_a_loop_that_counts_batches_also_ends_the_epoch(server: FakeServer) -> None:
-    """Lightning takes as many as there are, and never asks whether there is another."""
+    """Lightning takes ``len`` batches and never asks for another."""
     stream = dataset(server)
     epochs = []
     for _ in range(3):
@@ -52,7 +52,7 @@ def test_an_epoch_set_during_the_last_batch_is_the_next_one(server: FakeServer) 
 
 
 def test_a_loader_prepared_by_accelerate_is_refused(server: FakeServer) -> None:
-    """All of its loaders set the epoch by a count of their own before they iterate."""
+    """All of accelerate's loaders set the epoch from their own count before they iterate."""
     theirs: dict[str, object] = {"__name__": "accelerate.data_loader", "stream": dataset(server)}
     with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
         exec("stream.set_epoch(0)", theirs)
@@ -73,7 +73,7 @@ class FitLoop:
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_lightning_cannot_resume_a_plain_loader(server: FakeServer, workers: int) -> None:
-    """Its loop calls iter() itself, and knows how far it is."""
+    """Lightning's loop calls iter() itself, and knows its own position."""
     theirs: dict[str, Any] = {"__name__": "lightning.pytorch.loops.fit_loop", "Namespace": SimpleNamespace}
     exec(LIGHTNING, theirs)
     stream = dataset(server)

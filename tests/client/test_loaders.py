@@ -1,4 +1,4 @@
-"""A process that ends takes the batches in its queue's thread along."""
+"""Test that a loader worker sends its queued batches before it ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _the_end_has_come = threading.Event()
 
 
 class Ponderous:
-    """A batch whose pickling, as that of tensors may, goes on while its process ends."""
+    """Hold a batch whose pickling goes on while its process ends, as that of tensors may."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         _the_end_has_come.wait()
@@ -23,7 +23,7 @@ class Ponderous:
 
 
 def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
-    """As a loader worker does whose trainer left early (torch.utils.data._utils.worker)."""
+    """Queue a batch and exit, as a loader worker does if its trainer leaves early (torch.utils.data._utils.worker)."""
     # What is registered last is called first: the batch is pickled from the end's beginning on, and where nobody waits
     # for that, the process is gone before another thread has its turn.
     atexit.register(os._exit, 0)

@@ -1,4 +1,4 @@
-"""A dataset with a server of its own leaves nothing behind, however it ends."""
+"""Test that a dataset with a local server leaves no process behind, in whatever way it ends."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def servers() -> Iterator[set[psutil.Process]]:
-    """Processes that this process has started since."""
+    """Return the processes that this process has started since."""
     before = set(psutil.Process().children(recursive=True))
     started: set[psutil.Process] = set()
     yield started
@@ -76,7 +76,7 @@ def test_a_local_dataset_streams_and_stops_its_server(clips: Path, servers: set[
 
 @pytest.mark.slow
 def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers: set[psutil.Process]) -> None:
-    """It is a fork, and has a copy of all that would stop it."""
+    """A loader worker is a fork, with copies of all objects that would stop the server."""
     dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
     for _ in range(2):
         assert sum(1 for _ in DataLoader(dataset, batch_size=None, num_workers=1)) == len(dataset)

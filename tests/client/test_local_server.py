@@ -21,7 +21,7 @@ DEAF = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """Replaces ``python -m v2v_server`` by a program of the test's own."""
+    """Replace ``python -m v2v_server`` by a program of the test."""
 
     def write(text):
         package = tmp_path / "v2v_server"

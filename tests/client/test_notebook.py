@@ -1,4 +1,4 @@
-"""What a notebook shows of batches, samples, provenance and datasets."""
+"""Test how a notebook displays batches, samples, provenance and datasets."""
 
 from __future__ import annotations
 

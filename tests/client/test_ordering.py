@@ -8,7 +8,7 @@ from v2v_protocol.errors import LimitExceeded
 
 
 class Arrivals(RuleBasedStateMachine):
-    """Samples come in any order, twice, or unasked; the model is the set of what is under way."""
+    """Deliver samples in any order, twice, or unrequested. The model is the set of samples under way."""
 
     @initialize(batch_size=st.integers(1, 5), batches=st.integers(0, 12), credit=st.integers(1, 14))
     def open(self, batch_size, batches, credit):

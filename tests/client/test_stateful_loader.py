@@ -1,8 +1,8 @@
-"""What torchdata's StatefulDataLoader does to a dataset, done by hand.
+"""Test a dataset with the calls of torchdata's StatefulDataLoader, made by hand.
 
-In every loader worker it loads that worker's own state, makes an iterator, and asks for the state after each batch and
-after the end. A loader whose state says that its epoch was finished makes such workers, drops them unused, and makes
-fresh ones from the dataset of the main process.
+In every loader worker it loads that worker's own state, creates an iterator, and requests the state after each batch
+and after the end. If a loader's state says that its epoch was finished, the loader creates such workers, drops them
+unused, and creates new ones from the dataset of the main process.
 """
 
 import multiprocessing
@@ -22,7 +22,7 @@ FORK = multiprocessing.get_context("fork")
 
 @dataclass
 class Outcome:
-    """One loader worker: the indices of each batch with the state after it, and the state after the end."""
+    """Hold the outcome of one loader worker: each batch's indices and state, and the state after the end."""
 
     batches: list[tuple[int, tuple[int, ...], dict[str, Any]]]
     ended: dict[str, Any] | None
@@ -55,7 +55,7 @@ def _worker(dataset, worker, workers, seed, state, most, connection):
 
 
 def run(dataset, seed, states=(None, None), most=(99, 99)):
-    """One iteration of a loader: its workers' outcomes. They begin to read only when all have begun to iterate."""
+    """Run one iteration of a loader and return its workers' outcomes. All create their iterators before any reads."""
     started = []
     for worker in range(WORKERS):
         here, there = FORK.Pipe()
@@ -79,7 +79,7 @@ def run(dataset, seed, states=(None, None), most=(99, 99)):
 
 
 def in_order(outcomes):
-    """What the training loop sees: a batch of each worker in turn."""
+    """Return the batches in the training loop's order: one of each worker in turn."""
     rows = [[(epoch, indices) for epoch, indices, _ in outcome.batches] for outcome in outcomes]
     longest = max(len(row) for row in rows)
     return [row[turn] for turn in range(longest) for row in rows if turn < len(row)]
@@ -139,7 +139,7 @@ def test_a_restored_epoch_with_no_batches_left_yields_no_batches(server):
 
 
 def test_a_late_loader_worker_starts_the_epoch_of_the_others(server):
-    """All workers of an iteration deliver one epoch, even where one has finished it before another begins."""
+    """All workers of an iteration deliver the same epoch, even if one finishes it before another starts."""
     stream = dataset(server, batch_size=20)  # one batch: worker 1 has none, and is done at once
     for epoch in (0, 1):
         outcomes = run(stream, 100 + epoch)
@@ -163,7 +163,7 @@ def test_loader_workers_resume_from_the_state_of_a_rank(server):
 
 
 def test_a_state_loaded_twice_starts_the_iteration_at_its_position(server):
-    """As after two losses that are not finite. A loader's state has its seeds, so they are those of the first time."""
+    """A trainer does this after two non-finite losses. The seeds are in the loader's state, so they are equal."""
     stream = dataset(server)
     states = [outcome.batches[-1][2] for outcome in run(stream, 100, most=(2, 1))]
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The colour wheel: direction is hue, length is saturation."""
+"""Test the colour wheel: direction is hue, length is saturation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HDF5 files that name other files are refused before anything of those is read."""
+"""Test that HDF5 files which refer to other files are refused before those are read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours of events and flow, sizes, and files."""
+"""Test colours of events and flow, sizes, and files."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_picture_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fps", [1.0, 65.5354, 149.993, 1000.123])
 def test_a_video_of_any_rate_is_written(tmp_path: Path, fps: float) -> None:
-    """EVAID has 150 pictures a second, and time stamps of microseconds make an odd number of them."""
+    """EVAID has 150 pictures per second, and time stamps in microseconds make the rate fractional."""
     with Video(tmp_path / "a.mp4", fps) as video:
         video.add(np.zeros((17, 24, 3), np.uint8))
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-2)

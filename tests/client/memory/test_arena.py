@@ -1,5 +1,5 @@
-"""An arena from both ends: a sample that a worker makes there is a row of the consumer's batch, or the worker says that
-it could not."""
+"""Test an arena from both ends: a sample that a worker writes there is a row of the consumer's batch, or the worker
+reports that it could not write it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sample(seed: int) -> dict[str, np.ndarray]:
 
 
 def write(slot: Slot, seed: int) -> bool:
-    """What a worker does."""
+    """Write to a slot as a worker does."""
     there = slot_arrays(slot, LAYOUT)
     for name, array in sample(seed).items():
         if there is not None:
@@ -168,7 +168,7 @@ def test_a_file_that_is_not_the_named_arena_is_not_written(arena: Arena, tmp_pat
 
 @pytest.mark.parametrize("flaw", ["not sealed", "too small", "of more slots"])
 def test_unsealed_memory_is_not_written(flaw: str) -> None:
-    """A page that is not there, or is taken away while one writes to it, is a signal that kills."""
+    """Writing to a page that is missing, or removed meanwhile, kills the process by a signal."""
     import fcntl
 
     good = ArenaName.parse(Arena(LAYOUT, ROWS).slot(0).arena)

@@ -132,7 +132,7 @@ def test_a_batch_has_the_rows_written_to_it(shared):
 
 
 def test_a_batch_leaves_its_arena_if_a_worker_may_still_write():
-    """With the samples that are there, and those that other workers put there yet."""
+    """It takes along the samples already there, and those that other workers still write there."""
     buffers = shaped()
     memory = buffers.take(shared=True)
     for row in range(4):
@@ -183,7 +183,7 @@ def test_an_arena_with_an_incomplete_batch_is_not_reused():
 
 @contextmanager
 def forked(check):
-    """A process that was forked before the block, checks after it, and is to succeed."""
+    """Fork a process before the block, run its checks after the block, and require that they succeed."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:

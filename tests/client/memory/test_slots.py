@@ -1,4 +1,4 @@
-"""Which slots a connection names, and what an arrival says of that of its sample."""
+"""Test which slots a connection's requests name, and what an arrival means for the slot of its sample."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ A, B = "arena a", "arena b"
 
 
 def offered(*indices: int) -> Slots:
-    """With a slot for each."""
+    """Return slots with one offered for each index."""
     slots = Slots()
     slots.offer({index: Slot(A, index + 1) for index in indices})
     return slots
@@ -23,7 +23,7 @@ def test_a_request_names_the_slots_that_were_offered() -> None:
 
 
 def test_a_repeated_request_names_no_slot() -> None:
-    """The first worker may be writing to the one that was named."""
+    """The first worker may still be writing to the slot that was named."""
     slots = offered(3, 1, 7)
     slots.want(0, [3, 1])
     assert slots.want(0, [1, 7]) == Want(0, (1, 7), ("", A), (NO_SLOT, 8))

@@ -1,4 +1,4 @@
-"""Several brokers: whose consumer is whose, and what happens when one is lost or serves something else."""
+"""Test several brokers: which consumer uses which, and what happens if one is lost or serves another stream."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_brokers_of_different_videos_are_refused_with_both_named(servers: tuple[
 def test_a_broker_that_takes_over_with_other_videos_is_refused(
     servers: tuple[FakeServer, FakeServer],
 ) -> None:
-    """It may have been restarted on another folder since they were compared."""
+    """The broker may have been restarted on another folder since the comparison."""
     one, other = servers
     batches = iter(dataset([one.address, other.address]))
     next(batches)

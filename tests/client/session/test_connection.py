@@ -1,4 +1,4 @@
-"""A connection by itself, where the order of messages matters and no clock may help."""
+"""Test a connection alone, where the order of messages matters and timers must not help."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def server() -> Iterator[FakeServer]:
 
 
 def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(server: FakeServer) -> None:
-    """Asked again while it was on its way, sample 0 is made twice, and for the server it is still due."""
+    """Sample 0 is requested again while it is on its way, so it is made twice, and the server still counts it."""
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
@@ -58,7 +58,7 @@ def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(serve
 
 
 def test_a_reopened_session_keeps_the_newest_quarantine_snapshot_received(server: FakeServer) -> None:
-    """Be it one whose provenance nobody has opened yet."""
+    """This includes samples whose provenance was not decoded yet."""
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
@@ -76,7 +76,7 @@ def test_a_reopened_session_keeps_the_newest_quarantine_snapshot_received(server
 def test_time_in_which_the_trainer_was_stopped_is_not_silence(
     server: FakeServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For hours perhaps, with its server: what it could not hear meanwhile is no silence of the server's."""
+    """A trainer may be stopped for hours together with its server; that time is not the server's silence."""
     stopped = [0.0]
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
@@ -95,7 +95,7 @@ def test_time_in_which_the_trainer_was_stopped_is_not_silence(
 
 
 def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server that took most of the deadline to start, and is killed then, is missed after one deadline, not two."""
+    """If a server needs most of the deadline to start, and is then killed, it counts as lost after one deadline."""
     waited: list[float] = []
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
 
@@ -122,7 +122,7 @@ def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch:
     [("tcp://localhost:1", [0, 1, 0]), ("tcp://127.0.0.1:1", [0, 1, 0]), ("tcp://[::1]:1", [1] * 3)],
 )
 def test_a_host_name_is_tried_as_ipv4_then_ipv6_in_turn(address: str, kinds: list[int]) -> None:
-    """Most hosts have "localhost" in both kinds, and a server listens on 127.0.0.1."""
+    """On most hosts "localhost" has an IPv4 and an IPv6 address, and a server listens on 127.0.0.1."""
     found = []
     with closing(link.Link(address)) as tried:
         for _ in kinds:
@@ -170,7 +170,7 @@ def test_a_signal_at_any_line_of_opening_and_closing_raises_instead_of_hanging(s
     sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
 
     def interrupted_at(line: int) -> bool:
-        """Whether as many lines were run as it takes to be interrupted at that one."""
+        """Return whether enough lines ran to reach the one to interrupt."""
         passed = 0
 
         def trace(frame: FrameType, event: str, argument: object) -> object:

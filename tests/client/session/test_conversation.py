@@ -1,4 +1,4 @@
-"""What a consumer says, and when: by a clock that jumps to whatever is due next, without a socket."""
+"""Test what a consumer sends, and when, without a socket, by a clock that jumps to the next timer."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def said(talk: Conversation) -> list[Message]:
 def timeline(
     talk: Conversation, until: float, answer: Callable[[Message], Message | None] = lambda _: None
 ) -> list[tuple[float, Any]]:
-    """What is done in a silence, and when."""
+    """Return the actions during a silence, with their times."""
     now, done = 0.0, []
     while now < until:
         now += talk.next_due(now)
@@ -137,7 +137,7 @@ def test_hello_is_repeated_with_backoff() -> None:
 
 @pytest.mark.parametrize("timeout_seconds", [0.5, 2.0, 3.0])
 def test_a_server_is_pinged_before_it_counts_as_lost(timeout_seconds: float) -> None:
-    """However short the deadline is beside the time between pings: a server that is busy says nothing by itself."""
+    """This holds for any deadline relative to the ping interval, because a busy server sends nothing by itself."""
     assert at(timeline(begun(patience=Patience(timeout_seconds)), 10.0), Ping)[0] < timeout_seconds
 
 
@@ -203,7 +203,7 @@ def test_timeouts_must_be_positive(name: str) -> None:
 
 
 class Queues:
-    """A link to a server in this thread, whose answers are lost until ``silent_until``; waiting passes the time."""
+    """Link to a server in this thread. Its answers are lost until ``silent_until``; waiting advances the clock."""
 
     def __init__(self, silent_until: float = 0.0) -> None:
         self.now = 0.0
@@ -254,7 +254,7 @@ def sample(index: int) -> Frames:
 
 @pytest.mark.parametrize(("silent_until", "made_anew"), [(0.0, 0), (25.0, 2)])
 def test_a_connection_works_over_queues(silent_until: float, made_anew: int) -> None:
-    """Without a socket or a thread; a silence of twenty-five seconds takes no time."""
+    """It needs no socket and no thread, so a silence of 25 s takes no time."""
     link = Queues(silent_until)
     connection = Connection("tcp://x:1", HELLO, 0, patience=PATIENCE, clock=lambda: link.now, transport=lambda _: link)
     connection.open()

@@ -1,4 +1,4 @@
-"""Damaged, incomplete and mistaken sources: one clear message, and no file."""
+"""Test damaged, incomplete and wrong sources: each gives one clear message, and no file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def evaid(path: Path, **changes: bytes) -> Path:
 
 
 def patched_zip(path: Path, *, flags: int = 0, method: int = 8) -> Path:
-    """The same bytes under other flags or another method, in both headers of every member."""
+    """Write the same bytes with other flags or another method, in both headers of every member."""
     source = ijrr(path)
     content = bytearray(source.read_bytes())
     for signature, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
@@ -85,7 +85,7 @@ def short_bag(path: Path) -> Path:
 
 
 def bag_with(path: Path, **changes: bytes) -> Path:
-    """A bag in which fields in the header of the first message begin with other values."""
+    """Write a bag in which header fields of the first message begin with other values."""
     raw_forms.write_bag(path / "a.bag", scene())
     content = bytearray((path / "a.bag").read_bytes())
     for name, value in changes.items():
@@ -166,7 +166,7 @@ def test_errors_name_the_fault(tmp_path: Path, make: object, message: str) -> No
 
 
 class PanicException(BaseException):
-    """As Rust's is seen from here: by its name and base only."""
+    """Stand in for Rust's panic, which Python code can recognise only by its name and base class."""
 
 
 @pytest.mark.parametrize(

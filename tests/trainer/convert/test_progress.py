@@ -1,4 +1,4 @@
-"""How far a conversion is, where there is no terminal."""
+"""Test the progress of a conversion without a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A form of recording is a file that yields items, and one line in ``FORMS``."""
+"""Test that a new form of recordings needs only a file that yields items, and one line in ``FORMS``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """Lines of ``t_ns x y p``, between two grey pictures."""
+    """Yield events from lines of ``t_ns x y p``, between two grey pictures."""
     t, x, y, p = np.loadtxt(path, dtype=np.int64).T
     yield SensorSize(6, 4)
     yield Picture(0, np.zeros((4, 6), np.uint8))

@@ -1,4 +1,4 @@
-"""The command from end to end: raw forms, conversion, reconstruction, scores, tables, records, pictures, video."""
+"""Test the command end to end: raw forms, conversion, reconstruction, scores, tables, records, pictures, video."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def evaluate(*arguments: object) -> list[dict[str, Any]]:
-    """Runs the command and gives its records."""
+    """Run the command and return its records."""
     out = Path(str(arguments[arguments.index("--weights") + 1])).with_name("records.json")
     cli.main([str(argument) for argument in (*arguments, "--json", out)])
     records: list[dict[str, Any]] = json.loads(out.read_text())
@@ -44,7 +44,7 @@ def evaluate(*arguments: object) -> list[dict[str, Any]]:
 
 
 def test_scores_of_a_converted_bag_equal_those_computed_by_hand(tmp_path: Path, weights: Path) -> None:
-    """From the known voxel grids, the network in one pass, and the formulas in float64."""
+    """The expected scores come from the known voxel grids, one pass of the network, and the formulas in float64."""
     original = scene()
     raw_forms.write_bag(tmp_path / "desk.bag", original)
     convert_cli.main([str(tmp_path / "desk.bag"), "--out", str(tmp_path / "h5")])
@@ -126,7 +126,7 @@ def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path
 def test_as_published_evaids_time_ranges_are_one_picture_later(
     tmp_path: Path, weights: Path, folder: str, name: str, end: float
 ) -> None:
-    """Its script keeps the picture at the end, and then drops the first one; the other scripts do neither."""
+    """EVAID's script keeps the picture at the end, and then drops the first one; the other scripts do neither."""
     random_recording(tmp_path / folder / f"{name}.h5", images=30, period=0.125)
     per_frame, last = tmp_path / "frames.csv", {}
     for flags in ((), ("--as-published",)):
@@ -156,7 +156,7 @@ def test_names_in_brackets_are_shown(tmp_path: Path, weights: Path, capsys: pyte
 
 
 def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two sequences of IJRR, cut; one of HQF, whole; the mean over sequences; the paper's rows beside."""
+    """Two sequences of IJRR have time ranges, one of HQF is whole; the table has the mean and the paper's rows."""
     data = tmp_path / "data"
     random_recording(data / "ijrr" / "slider_depth.h5", images=41, period=0.1, events=3000, seed=1)
     random_recording(data / "ijrr" / "office_zigzag.h5", images=131, period=0.1, events=3000, seed=2)

@@ -1,4 +1,4 @@
-"""Configurations, the paper's data sets, and its results."""
+"""Test configurations, the paper's data sets, and its results."""
 
 from __future__ import annotations
 

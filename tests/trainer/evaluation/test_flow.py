@@ -1,4 +1,4 @@
-"""Flow of recordings with known flow: the analytic errors, in both conventions."""
+"""Test scores of flow on recordings with known flow: the analytic errors, in both conventions."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run(network: EVFlowNet | ERAFT, *, as_published: bool) -> FlowRun:
 
 
 def test_the_field_at_the_start_of_a_window_is_its_flow(tmp_path: Path) -> None:
-    """Indoors nothing is cut off: a twentieth of the rows has ten times the flow."""
+    """Indoors all rows count: a twentieth of them has ten times the flow."""
     found = evaluate_flow(run(constant(0.6, 0.8), as_published=False), recording(tmp_path / "indoor.h5"), None)
     share = 1 - HOOD_ROW / HEIGHT
     expected = {
@@ -129,7 +129,7 @@ def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_flow_of_mvsec_is_converted_with_its_recording(tmp_path: Path) -> None:
-    """True flow and predicted no motion: the numbers of the raw file come out of the evaluation."""
+    """With a prediction of no motion, the scores are the lengths of the raw file's flow."""
     rng = np.random.default_rng(0)
     times, lengths = 100.0 + 0.05 * np.arange(3), (2.0, 5.0, 1.0)
     with h5py.File(tmp_path / "indoor_flying1_data.hdf5", "w") as file:

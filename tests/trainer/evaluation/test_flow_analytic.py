@@ -1,4 +1,4 @@
-"""Known flow in files of MVSEC's layout, through converter and command: AEE and 3PE by hand, in both conventions.
+"""Test AEE and 3PE for known flow in files of MVSEC's layout, through converter and command, in both conventions.
 
 columns   0: no depth   1: no flow   2-5: flow (length, 0), by field and part of the rows
 events    window 0, 1: rows 0-49 of column 2 (part A), rows 100-119 of column 3 (part B), rows 190-199 of column 4
@@ -96,7 +96,7 @@ def test_aee_and_3pe_of_a_constant_and_a_zero_prediction(tmp_path: Path, name: s
 
 
 class Late(EVFlowNet):
-    """Also takes the window before, as E-RAFT does, and has no use for it."""
+    """Take the previous window as well, as E-RAFT does, and ignore it."""
 
     lead_voxels = 1
 
@@ -122,7 +122,7 @@ def test_as_published_the_events_of_eraft_are_those_of_the_window_before(tmp_pat
 
 
 def test_zeros_match_values_computed_by_hand() -> None:
-    """What the test above expects, for two cases in plain numbers."""
+    """State the expectation of the test above as plain numbers, for two cases."""
     # Dense, outdoors: 400 px of A, 360 of B; fields 0, 1, 2.
     right = by_hand(0.0, (0, 1, 2), ("A", "B"))
     assert right["aee_dense"] == pytest.approx(

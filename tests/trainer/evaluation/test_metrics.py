@@ -1,4 +1,4 @@
-"""Metrics against float64 numpy that follows the formulas, window by window."""
+"""Compare metrics with float64 NumPy that follows the formulas, window by window."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def pair(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def slow_ssim(a: np.ndarray, b: np.ndarray, data_range: float) -> float:
-    """Every 7 x 7 window on its own; variances divided by 48."""
+    """Compute SSIM for each 7 x 7 window separately, with variances divided by 48."""
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     values = []
     for top in range(a.shape[0] - 6):

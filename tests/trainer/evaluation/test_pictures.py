@@ -1,4 +1,4 @@
-"""Which steps are drawn."""
+"""Test which steps are drawn."""
 
 from __future__ import annotations
 

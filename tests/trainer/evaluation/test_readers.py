@@ -1,4 +1,4 @@
-"""Recordings in the layout of each data set, with the faults that published files have."""
+"""Test recordings in the layout of each data set, with the faults of published files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_different_clocks_are_refused_or_accepted_as_published(tmp_path: Path) -
 
 @pytest.mark.parametrize("shift", [0, -1])
 def test_clocks_of_different_units_are_refused_even_if_they_overlap(tmp_path: Path, shift: int) -> None:
-    """Both count from the first picture, one in microseconds."""
+    """Both clocks start at the first picture, but one counts microseconds."""
     attributes = stamped(1.05, 1.25, 1.45, shift=shift)
     for attribute in attributes:
         attribute["timestamp"] = 1.05 + (attribute["timestamp"] - 1.05) * 1e6
@@ -357,7 +357,7 @@ def test_nan_times_are_refused(tmp_path: Path) -> None:
 
 
 def damaged(path: Path, name: str) -> Path:
-    """A recording in which the compressed bytes of one dataset are none."""
+    """Write a recording in which one dataset's compressed bytes are invalid."""
     import h5py
 
     file = recording(path, stamped(1.05, 1.25, 1.45))

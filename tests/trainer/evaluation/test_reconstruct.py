@@ -1,4 +1,4 @@
-"""Running a network over a recording: memory, padding, windows without pictures; and which network a file is of."""
+"""Test running a network over a recording: memory, padding, windows without pictures, recognising weight files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def small_e2vid(**options: object) -> E2VID:
 
 @pytest.mark.parametrize("network", [small_e2vid(), FireNet(base_channels=4)], ids=["e2vid", "firenet"])
 def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelNetwork) -> None:
-    """More windows than one call takes, and a size that the network has to pad (37 x 43)."""
+    """There are more windows than one call takes, and the network must pad the size (37 x 43)."""
     count = 2 * WINDOWS_PER_CALL + 3
     path = random_recording(tmp_path / "a.h5", size=(37, 43), images=count + 1, events=4000)
     with Recording(path) as recording:
@@ -132,7 +132,7 @@ def test_unknown_networks_are_refused(tmp_path: Path) -> None:
 
 
 def test_equalized_pictures_have_every_grey_value_as_often() -> None:
-    """Whatever the order-preserving curve that a network's pictures went through."""
+    """This holds after any monotonic mapping of the network's pictures."""
     ramp = np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(1, 64, 64)
     (equal,) = _stretch(ramp**1.3, "equalized")
     counts, _ = np.histogram(equal, 8, (0, 1))

@@ -1,4 +1,4 @@
-"""Voxel grids: a slow oracle in exact fractions, conservation, time reversal, the two kinds of span."""
+"""Test voxel grids: a slow oracle in exact fractions, conservation, time reversal, the two kinds of span."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def grid(rows: list[tuple[int, int, int, int]], kind: str, bins: int = 5, **opti
 
 
 def oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> np.ndarray:
-    """The module's formulas, event by event, in exact fractions."""
+    """Compute the module's formulas event by event, in exact fractions."""
     result = [[[Fraction(0)] * SIZE[1] for _ in range(SIZE[0])] for _ in range(bins)]
     delta = Fraction(1, 1000 if kind == "discrete" else 10_000)
     for t, x, y, p in rows:
@@ -79,7 +79,7 @@ def test_reversed_time_reverses_interpolated_bins(rows: list[tuple[int, int, int
 
 @given(st.lists(st.integers(0, 999), min_size=1, max_size=40), st.integers(1, 7))
 def test_reversed_time_reverses_discrete_bins(steps: list[int], bins: int) -> None:
-    """With the events inside the bins: at an edge an event belongs to the later bin, in either direction."""
+    """Events lie inside the bins, because at an edge an event belongs to the later bin in both directions."""
     # Odd multiples of 1 us in a span of bins * 2000 us are never on an edge; 0 and the end fix the span.
     times = [0, *sorted(2 * bins * step + 1 for step in steps), 2000 * bins]
     inside = [t for t in times if t % 2000 or t in (0, 2000 * bins)]

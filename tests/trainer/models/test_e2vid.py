@@ -1,4 +1,4 @@
-"""E2VID against a float64 numpy network, and its published keys."""
+"""Compare E2VID with a float64 NumPy network, and with its published keys."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_keys_shapes_and_size_are_the_published_ones() -> None:
 
 
 def test_equals_the_numpy_network() -> None:
-    """Full size, two clips of two steps, sides that need padding."""
+    """The network has its full size; the input is two clips of two steps with sides that need padding."""
     model = E2VID()
     weights = oracle.random_weights(model, seed=1)
     voxels = counts((2, 2, 5, 13, 18))

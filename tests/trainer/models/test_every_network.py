@@ -1,4 +1,4 @@
-"""What holds for every network: published keys and sizes, memory, batches, sizes of pictures, no waits."""
+"""Test properties of every network: published keys and sizes, memory, batches, picture sizes, no synchronisation."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(autouse=True)
 def _two_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of E-RAFT, whose other ten say nothing new here."""
+    """Limit E-RAFT to two updates; the other ten would test nothing more."""
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
 
 
 @pytest.fixture
 def network(name: str) -> VoxelNetwork:
-    """Each network, small, with weights that let the memory matter."""
+    """Return each network at a small size, with weights for which the memory matters."""
     torch.manual_seed(0)
     return NETWORKS[name](**SMALL[name]).eval()
 
@@ -183,7 +183,7 @@ def test_published_files_are_recognised_and_load_strictly(
 
 
 def test_pieces_with_their_state_equal_the_whole(name: str, network: VoxelNetwork) -> None:
-    """Sides that divide by nothing."""
+    """The sides are not multiples of any size that a network needs."""
     voxels = torch.from_numpy(counts((2, 5, 5, 17, 23)))
     with torch.no_grad():
         whole, last = network(voxels)
@@ -258,7 +258,7 @@ def test_wrong_shapes_are_refused(network: VoxelNetwork, shape: tuple[int, ...])
 
 @pytest.mark.parametrize("padding", ["bottom-right", "centred", "top-left"])
 def test_padding_is_zeros_at_the_stated_sides(name: str, padding: str) -> None:
-    """As a picture that has these zeros itself."""
+    """The output equals that for an input which contains these zeros."""
     torch.manual_seed(0)
     network = NETWORKS[name](**SMALL[name], padding=padding).eval()  # type: ignore[arg-type]
     left, right, top, bottom = network._edges(19, 21)

@@ -1,4 +1,4 @@
-"""FireNet against a float64 numpy network, and its published weights."""
+"""Compare FireNet with a float64 NumPy network, and test its published weights."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_an_untrained_network_predicts_grey() -> None:
 
 @pytest.mark.parametrize("name", ["firenet_evreal.pth", "firenet_plus_state_dict.pth"])
 def test_published_weights_load_strictly_and_follow_an_edge(published: Path, name: str) -> None:
-    """A bright bar moving right: where it stands the reconstruction is brighter than behind and ahead of it."""
+    """A bright bar moves right: the reconstruction is brighter at the bar than behind and ahead of it."""
     model = FireNet(normalize_voxels=name == "firenet_evreal.pth")
     report = load_into(model, published / name)
     assert len(report.used) == len(model.state_dict()) == 24

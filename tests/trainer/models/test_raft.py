@@ -1,4 +1,4 @@
-"""RAFT against recordings of torchvision's (``record_raft.py``), and the two layouts of its weights."""
+"""Compare RAFT with recordings of torchvision's (``record_raft.py``), and test both layouts of its weights."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _TO_AUTHORS = (
 
 
 def in_the_authors_layout(state: dict[str, Tensor], size: str) -> dict[str, Tensor]:
-    """As princeton-vl/RAFT saves it, from DataParallel: the norm of each shortcut stands there twice."""
+    """Rename a state dict as princeton-vl/RAFT saves it, from DataParallel, with the norm of each shortcut twice."""
     renamed = {}
     for name, value in state.items():
         for pattern, replacement in _TO_AUTHORS:
@@ -117,7 +117,7 @@ def test_small_pictures_are_padded_to_what_the_pyramid_needs(tmp_path: Path) -> 
 @pytest.mark.skipif(not PUBLISHED.is_file(), reason=f"no {PUBLISHED}; set V2V_TEST_WEIGHTS")
 @pytest.mark.slow
 def test_bfloat16_stays_near() -> None:
-    """With weights that estimate flow: those of the formula amplify every rounding."""
+    """It uses weights that estimate flow, because those of the formula amplify every rounding."""
     exact = RaftFlow("small", PUBLISHED)(*pictures())
     near = RaftFlow("small", PUBLISHED, bfloat16=True)(*pictures())
     assert near.dtype == torch.float32
