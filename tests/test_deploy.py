@@ -57,7 +57,7 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
 
 
 def test_the_unit_waits_for_its_bind_address(unit: RawConfigParser) -> None:
-    # 192.0.2.0/24 is nobody's, like an address that the host does not have yet.
+    # No host has an address in 192.0.2.0/24, so it acts like one that this host does not have yet.
     with pytest.raises(UsageError, match=r"--bind tcp://192\.0\.2\.1:5555"):
         Sockets("tcp://192.0.2.1:5555", "ipc://@v2v-test-deploy")
     assert "network-online.target" in unit["Unit"]["After"].split()

@@ -159,9 +159,9 @@ class FakeServer:
         Raises:
             TimeoutError: one is left.
         """
-        everybody_left: Future[None] = Future()
-        self.call(lambda: self._waiting.append(everybody_left))
-        everybody_left.result(20.0)
+        all_left: Future[None] = Future()
+        self.call(lambda: self._waiting.append(all_left))
+        all_left.result(20.0)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
@@ -262,7 +262,7 @@ class FakeServer:
             self._answer(identity, session, *key)
 
     def answer(self, epoch: int, index: int) -> None:
-        """Answers that sample to everybody who waits for it, held or not; under :meth:`call`."""
+        """Answer that sample to every session that waits for it, held or not; use it under :meth:`call`."""
         for identity, session in self._sessions.items():
             if (epoch, index) in session.unanswered:
                 self._answer(identity, session, epoch, index)

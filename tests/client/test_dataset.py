@@ -247,7 +247,7 @@ def test_a_malformed_address_says_what_to_give():
 def test_length_is_that_of_an_epoch_and_known_before_the_first_iteration(server):
     stream = dataset(server)
     assert len(stream) == len(loader(stream, 2)) == 5
-    assert len(server.hellos) == 2  # one to learn the layout; whoever asks again is told what was said
+    assert len(server.hellos) == 2  # one to learn the layout; later calls use the first answer
     assert stream.stream is None  # how siblings are spaced depends on how many loader workers iterate
     first = next(iter(stream))
     assert len(stream) == 5

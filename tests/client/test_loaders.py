@@ -24,8 +24,8 @@ class Ponderous:
 
 def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
     """Queue a batch and exit, as a loader worker does if its trainer leaves early (torch.utils.data._utils.worker)."""
-    # What is registered last is called first: the batch is pickled from the end's beginning on, and where nobody waits
-    # for that, the process is gone before another thread has its turn.
+    # Exit functions run in reverse order. The batch is pickled from the first of them on, and if no function waits for
+    # that, the process ends before another thread runs.
     atexit.register(os._exit, 0)
     send_before_exit()
     send_before_exit()

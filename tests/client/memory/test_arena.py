@@ -44,7 +44,7 @@ def holds(arrays: dict[str, np.ndarray], row: int, seed: int) -> bool:
     return all(np.array_equal(arrays[name][row], array) for name, array in sample(seed).items())
 
 
-def nobody() -> None:
+def ignore() -> None:
     pass
 
 
@@ -61,7 +61,7 @@ def test_workers_write_the_rows_of_the_batch(arena: Arena) -> None:
     for row in (3, 1, 2, 0):
         assert write(arena.slot(row), row)
     arena.put(4, sample(4))  # came in a message
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert {name: (str(array.dtype), array.shape) for name, array in arrays.items()} == {
         name: (dtype, (ROWS, *shape)) for name, (dtype, shape) in LAYOUT.items()
     }
@@ -71,20 +71,20 @@ def test_workers_write_the_rows_of_the_batch(arena: Arena) -> None:
 
 def test_writes_to_a_batch_are_private(arena: Arena) -> None:
     assert write(arena.slot(2), 2)
-    for array in arena.arrays(nobody).values():
+    for array in arena.arrays(ignore).values():
         array[...] = 111
-    again = arena.arrays(nobody)
+    again = arena.arrays(ignore)
     assert holds(again, 2, 2)
 
 
 def test_an_unwritten_mapping_is_reused(arena: Arena) -> None:
     assert write(arena.slot(2), 1)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     first = arrays["voxels"].ctypes.data
     assert holds(arrays, 2, 1)
     del arrays
     assert write(arena.slot(2), 2)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert arrays["voxels"].ctypes.data == first
     assert holds(arrays, 2, 2)
 
@@ -94,12 +94,12 @@ def test_an_unwritten_mapping_is_reused(arena: Arena) -> None:
 def test_writes_to_an_earlier_batch_do_not_reappear(arena: Arena, name: str, row: int) -> None:
     for other in range(ROWS):
         assert write(arena.slot(other), other)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     arrays[name][row].reshape(-1)[-1] += 1
     assert not holds(arrays, row, row)
     del arrays
     assert write(arena.slot(1), 7)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert [holds(arrays, other, 7 if other == 1 else other) for other in range(ROWS)] == [True] * ROWS
 
 
@@ -115,8 +115,8 @@ def test_without_pagemap_an_earlier_write_does_not_reappear(
     really = os.pread
     monkeypatch.setattr(os, "pread", pread)
     assert write(arena.slot(ROWS - 1), 5)
-    arena.arrays(nobody)["frames"].reshape(-1)[-1] += 1  # in the last page, of which it says too little
-    assert holds(arena.arrays(nobody), ROWS - 1, 5)
+    arena.arrays(ignore)["frames"].reshape(-1)[-1] += 1  # in the last page, which the short answer leaves out
+    assert holds(arena.arrays(ignore), ROWS - 1, 5)
 
 
 def test_a_row_can_be_copied_out(arena: Arena) -> None:
@@ -146,7 +146,7 @@ def test_another_process_of_this_user_can_write(arena: Arena) -> None:
     slot = arena.slot(3)
     command = [sys.executable, "-c", code, slot.arena, str(slot.number)]
     assert subprocess.run(command, timeout=60, check=False).returncode == 0
-    assert holds(arena.arrays(nobody), 3, 4)
+    assert holds(arena.arrays(ignore), 3, 4)
 
 
 def test_a_file_that_is_not_the_named_arena_is_not_written(arena: Arena, tmp_path: Path) -> None:

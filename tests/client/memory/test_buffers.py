@@ -76,7 +76,7 @@ def test_referenced_memory_is_not_reused(hold):
     gc.collect()
     again = buffers.arrays()["voxels"]
     assert address(again) == first, "the last user is gone, yet the memory did not come back"
-    assert (again == 7).all(), "somebody wrote into memory that was held"
+    assert (again == 7).all(), "memory in use was written to"
 
 
 def test_arrays_have_the_requested_shapes():

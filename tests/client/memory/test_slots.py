@@ -46,7 +46,9 @@ def test_a_sample_in_a_message_with_its_slot_frees_the_slot() -> None:
 def test_a_sample_from_another_worker_abandons_the_slot() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE  # in another's slot: nobody may read that
+    assert (
+        slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE
+    )  # in another sample's slot, which must not be read
     assert slots.record_arrival(5, NO_SLOT, in_message=True) is Answer.ABANDONED
 
 

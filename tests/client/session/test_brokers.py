@@ -19,7 +19,7 @@ from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 
 QUICK = Patience(timeout_seconds=2.0, ping_seconds=0.05, takeover_seconds=0.3)
-NOBODY = "tcp://127.0.0.1:9"
+UNUSED_ADDRESS = "tcp://127.0.0.1:9"
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_after_a_broker_falls_silent_every_sample_still_comes_once(
 
 
 def test_a_broker_that_never_answers_is_skipped(servers: tuple[FakeServer, FakeServer]) -> None:
-    assert len(list(dataset([NOBODY, servers[0].address]))) == 6
+    assert len(list(dataset([UNUSED_ADDRESS, servers[0].address]))) == 6
 
 
 def test_brokers_of_different_videos_are_refused_with_both_named(servers: tuple[FakeServer, FakeServer]) -> None:
@@ -116,7 +116,7 @@ def test_a_broker_that_takes_over_with_other_videos_is_refused(
 
 
 def test_the_server_is_lost_once_each_broker_had_its_turn() -> None:
-    with pytest.raises(ServerLost, match="none of tcp") as lost:
+    with pytest.raises(ServerLost, match="^tcp.*no sample for") as lost:
         next(iter(dataset(["tcp://127.0.0.1:9", "tcp://127.0.0.1:11"], patience=QUICK, timeout_seconds=0.5)))
     assert "127.0.0.1:9, tcp://127.0.0.1:11" in str(lost.value)
 

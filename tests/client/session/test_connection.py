@@ -147,7 +147,7 @@ def test_a_reconnection_keeps_the_ip_version_that_worked(server: FakeServer) -> 
 def test_a_signal_while_closing_raises_instead_of_hanging(
     server: FakeServer, monkeypatch: pytest.MonkeyPatch, which: int
 ) -> None:
-    """ZeroMQ's context waits for ever for a socket that nobody closed."""
+    """ZeroMQ's context waits indefinitely for a socket that was not closed."""
     connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
     connection.open()
     closing_socket, calls = zmq.Socket.close, iter(range(1, 100))
@@ -165,8 +165,10 @@ def test_a_signal_while_closing_raises_instead_of_hanging(
 @pytest.mark.timeout(60)
 @pytest.mark.filterwarnings("ignore:Unclosed (socket|context):ResourceWarning")  # the collector closes some of them
 def test_a_signal_at_any_line_of_opening_and_closing_raises_instead_of_hanging(server: FakeServer) -> None:
-    """ZeroMQ's context waits for ever for a socket that nobody closed, be it one that is being made, or whose closing
-    has begun. The exception's traceback keeps it alive, as that of an interrupted program does."""
+    """ZeroMQ's context waits indefinitely for a socket that was not closed, even one that is being created or closed.
+
+    The exception's traceback keeps it alive, as that of an interrupted program does.
+    """
     sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
 
     def interrupted_at(line: int) -> bool:

@@ -51,7 +51,7 @@ def timeline(
         now += talk.next_due(now)
         try:
             if talk.tick(now):
-                done.append((now, "anew"))
+                done.append((now, "reconnect"))
         except ServerLost as error:
             return [*done, (now, type(error))]
         messages = said(talk)
@@ -116,7 +116,7 @@ def test_a_forgotten_session_reopens_once_and_repeats_all_requests() -> None:
 def test_a_dead_server_is_pinged_then_reconnected_with_backoff_then_lost() -> None:
     done = timeline(begun(), 100.0)
     assert at(done, Ping) == [2, 4, 6, 8]
-    assert at(done, "anew") == [10, 30]
+    assert at(done, "reconnect") == [10, 30]
     assert at(done, Hello)[0] == 10
     assert done[-1] == (60, ServerLost)
 
@@ -125,7 +125,7 @@ def test_requests_to_a_server_that_only_answers_pings_are_repeated_with_backoff(
     done = timeline(begun(), 200.0, pongs)
     asked = [now for now in at(done, Want) if now % 10 == 0]
     assert {10, 30, 70, 130, 190} <= set(asked)
-    assert "anew" not in [kind for _, kind in done]
+    assert "reconnect" not in [kind for _, kind in done]
     assert done[-1][0] >= 200
 
 
@@ -141,7 +141,7 @@ def test_a_server_is_pinged_before_it_counts_as_lost(timeout_seconds: float) -> 
     assert at(timeline(begun(patience=Patience(timeout_seconds)), 10.0), Ping)[0] < timeout_seconds
 
 
-# --- nobody who could -------------------------------------------------------------------------------------------------
+# --- no workers ---------------------------------------------------------------------------------------------------
 
 
 def test_a_server_without_workers_is_logged_and_then_an_error(caplog: pytest.LogCaptureFixture) -> None:

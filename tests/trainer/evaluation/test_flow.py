@@ -66,9 +66,9 @@ def test_the_field_at_the_start_of_a_window_is_its_flow(tmp_path: Path) -> None:
         "network": (LENGTHS[:3], lambda length: (length - 1) * (1 - share) + (10 * length - 1) * share),
         "zeros": (LENGTHS[:3], lambda length: length * (1 - share) + 10 * length * share),
     }
-    for who, (lengths, of) in expected.items():
+    for predictor, (lengths, of) in expected.items():
         for kind in ("dense", "sparse"):
-            assert found[who].means[f"aee_{kind}"] == pytest.approx(
+            assert found[predictor].means[f"aee_{kind}"] == pytest.approx(
                 np.mean([of(length) for length in lengths]), rel=1e-5
             )
     # Errors of the network: 0, 3 and 1 px above, 9, 39 and 19 px below; 3 is not more than 3.

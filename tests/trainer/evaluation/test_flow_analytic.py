@@ -87,12 +87,12 @@ def test_aee_and_3pe_of_a_constant_and_a_zero_prediction(tmp_path: Path, name: s
     found = {record["predictor"]: record for record in json.loads(out.read_text())}
     whole = as_published or name.startswith("indoor")
     counted = ("A", "B", "hood") if whole else ("A", "B")
-    for who, predicted in (("network", PREDICTED), ("zeros", 0.0)):
+    for predictor, predicted in (("network", PREDICTED), ("zeros", 0.0)):
         expected = by_hand(predicted, (1, 2, 3) if as_published else (0, 1, 2), counted)
         if as_published:  # the window without events scores 0
             expected = {key: value * 2 / 3 if "sparse" in key else value for key, value in expected.items()}
-        assert found[who]["windows"] == 3
-        assert {key: found[who][key] for key in expected} == pytest.approx(expected, rel=1e-5)
+        assert found[predictor]["windows"] == 3
+        assert {key: found[predictor][key] for key in expected} == pytest.approx(expected, rel=1e-5)
 
 
 class Late(EVFlowNet):
