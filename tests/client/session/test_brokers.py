@@ -116,7 +116,7 @@ def test_a_broker_that_takes_over_with_other_videos_is_refused(
 
 
 def test_the_server_is_lost_once_each_broker_had_its_turn() -> None:
-    with pytest.raises(ServerLost, match="^tcp.*no sample for") as lost:
+    with pytest.raises(ServerLost, match=r"^tcp.*no sample for") as lost:
         next(iter(dataset(["tcp://127.0.0.1:9", "tcp://127.0.0.1:11"], patience=QUICK, timeout_seconds=0.5)))
     assert "127.0.0.1:9, tcp://127.0.0.1:11" in str(lost.value)
 
