@@ -265,7 +265,7 @@ def test_bad_recordings_are_refused_before_any_evaluation(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     random_recording(tmp_path / "hqf" / "desk.h5")
-    random_recording(tmp_path / "ijrr" / "slider_depth.h5")  # shorter than its cut
+    random_recording(tmp_path / "ijrr" / "slider_depth.h5")  # shorter than its time range
     evaluated = []
 
     def reconstruct(recording: Recording, *_rest: object, **_named: object) -> Iterator[Step]:

@@ -132,7 +132,7 @@ def test_time_ranges_count_from_the_first_picture(tmp_path: Path) -> None:
         windows = picture_windows(opened, (1.0, 3.0))
         assert len(windows) == 19
         assert windows[0].begin == pytest.approx(2.0)
-        assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a cut is not in it, as released
+        assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a time range is not in it, as released
         assert len(picture_windows(opened, (0.0, 60.0))) == 50
         with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the time range is from 5 to 20 s.*--cuts none"):
             picture_windows(opened, (5.0, 20.0))
@@ -224,7 +224,7 @@ def test_a_size_may_be_given_if_the_file_states_none(tmp_path: Path) -> None:
         Recording(path)
     with Recording(path, size=(3, 4)) as opened:
         assert opened.size == (3, 4)
-    write_h5(path, T, numbers % 4, numbers % 3, numbers % 2, [], sensor_resolution=(4, 3))  # x, y: the wrong way round
+    write_h5(path, T, numbers % 4, numbers % 3, numbers % 2, [], sensor_resolution=(4, 3))  # x, y swapped
     with Recording(path, size=(3, 4)) as opened:
         assert opened.size == (3, 4)
 
