@@ -310,7 +310,10 @@ def run(arguments: argparse.Namespace) -> int:
         V2VError: wrong usage, or no server.
     """
     if arguments.seconds <= 0 or arguments.warmup_batches < 0 or arguments.trainer_ms < 0:
-        raise UsageError("give --seconds above 0, and --warmup-batches and --trainer-ms of 0 or more")
+        raise UsageError(
+            f"--seconds {arguments.seconds:g}, --warmup-batches {arguments.warmup_batches}, --trainer-ms "
+            f"{arguments.trainer_ms:g}: give --seconds above 0, and 0 or more of the others"
+        )
     if arguments.connect and (arguments.workers or arguments.rows):
         raise UsageError("--workers and --rows need a local server: use them with --videos")
     options = {
