@@ -231,7 +231,12 @@ def _parser() -> Parser:
     measuring.add_argument(
         "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulate a training step of this length (default 0)"
     )
-    stream.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    stream.add_argument(
+        "--arrays",
+        default=",".join(DEFAULT_ARRAYS),
+        metavar="NAME,NAME",
+        help="arrays to receive (default %(default)s)",
+    )
     stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
     stream.add_argument(
         "--samples-per-decode", type=int, metavar="K", help="samples per decoded clip (default: the preset's)"
