@@ -54,7 +54,9 @@ class WeightFile:
         first: dict[str, str] = {}
         for name, own in names.items():
             if not torch.equal(self.state[first.setdefault(own, name)], self.state[name]):
-                raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
+                raise UsageError(
+                    f"{self.path}: two tensors have the same name without prefixes; give a file of one network"
+                )
         return names
 
     def recognise(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:

@@ -1,4 +1,4 @@
-"""Pages and films of cameras: what is known must be found at its place, in its colour."""
+"""Test pages and films of cameras: known content must be at its place, in its colour."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_colours_of_known_events(dtype: type[np.generic]) -> None:
     assert np.argmax(DARKER) == 2
 
 
-def test_a_single_event_is_seen_whatever_the_scale() -> None:
+def test_a_single_event_is_visible_at_any_scale() -> None:
     image = draw_events(np.array([[1, 0, -1]], np.int8), 1000.0).astype(int)
     assert (image[0, 1] == WHITE).all()
     assert np.abs(image[0, 0] - WHITE).max() > 80
@@ -67,7 +67,7 @@ def test_a_single_event_is_seen_whatever_the_scale() -> None:
 
 
 def test_the_least_count_of_int8_does_not_wrap() -> None:
-    """|-128| is no int8: its colour must not turn."""
+    """|-128| does not fit int8: its colour must not change to that of the other sign."""
     counts = np.full((12, 12), -128, np.int8)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -81,7 +81,7 @@ def test_more_events_are_never_paler(values: list[int]) -> None:
     assert (np.diff(green) <= 0).all()
 
 
-def test_full_colour_is_no_outliers() -> None:
+def test_full_colour_ignores_outliers() -> None:
     counts = np.full(1000, 3, np.int8)
     counts[0] = 127
     assert full_colour([counts, np.zeros(5, np.int8)]) == 3.0
@@ -108,7 +108,7 @@ def test_rates_are_events_a_pixel_of_each_sign() -> None:
 
 @given(st.data())
 def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> None:
-    """Against the definition, frame by frame: what the draw says of each position."""
+    """Compare with the definition, frame by frame, from the draw's pauses."""
     grids, bins, per_bin, lead = (data.draw(st.integers(low, 4)) for low in (1, 1, 1, 0))
     steps = (grids + lead) * bins * per_bin
     still = data.draw(st.lists(st.booleans(), min_size=steps, max_size=steps))
@@ -135,7 +135,7 @@ def test_moments_are_active_and_not_paused() -> None:
     assert camera(voxels[:1]).moments(3) == [0]
 
 
-def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise() -> None:
+def test_a_half_paused_moment_is_preferred_to_pure_noise() -> None:
     voxels = np.zeros((20, 5, 4, 4), np.int8)
     voxels[:, :, 0, 0] = 1
     voxels[9] = 30
@@ -144,7 +144,7 @@ def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise(
     assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
 
 
-def test_a_cut_is_no_moment() -> None:
+def test_a_moment_never_spans_a_shot_boundary() -> None:
     voxels = np.zeros((20, 5, 4, 4), np.int8)
     voxels[7, 4], voxels[12] = 100, 3
     assert camera(voxels).moments(1) == [12]
@@ -196,7 +196,7 @@ def test_pauses_are_hatched_and_named() -> None:
 
 
 def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the middle to the edge, so half of the strip's height; higher rates are cut there, and the text says so."""
+    """A full bar is half of the strip's height, from middle to edge. Higher rates are clipped, and the text says so."""
     voxels = np.zeros((40, 5, 10, 10), np.int8)
     voxels[:, :, :5] = 1  # half an event a pixel in each bin
     voxels[10, 0] = 1  # twice as many
@@ -220,7 +220,7 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
 
 @pytest.mark.parametrize("draw", [draw_sheet, lambda cameras, title: list(draw_film(cameras, title))])
 def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera that sees next to nothing must not look as busy as one that sees motion."""
+    """A camera with hardly any events must not look as active as one with motion."""
     busy, quiet = np.ones((4, 2, 16, 16), np.int8), np.zeros((4, 2, 16, 16), np.int8)
     quiet[:, :, 0, 0] = 1
     written: list[str] = []
@@ -236,7 +236,7 @@ def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.Monk
 
 
 def test_a_drawn_dark_floor_is_described() -> None:
-    """It is all in which the preset `sensor` differs from `paper`."""
+    """It is the only difference between the presets `sensor` and `paper`."""
     shown = camera(np.zeros((2, 2, 16, 16), np.int8))
     params = dataclasses.replace(PARAMS, log_eps=0.125)
     floor = dataclasses.replace(shown, provenance=dataclasses.replace(PROVENANCE, params=params))
@@ -267,7 +267,7 @@ def test_the_whole_picture_has_a_box_around_the_crop() -> None:
 
 
 def test_arrows_of_flow_point_where_pixels_move() -> None:
-    """Flow to the right in the upper half, none below: dark tips lie right of the light rims' beginnings, above."""
+    """Flow is to the right in the upper half and zero below: only above are dark tips, right of the light rims."""
     flow = np.zeros((2, 32, 32), np.float32)
     flow[0, :16] = 3.0
     page = Canvas(128, 128)
@@ -301,7 +301,7 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert busiest.index(max(busiest)) == 3
 
 
-def test_nothing_at_all_is_drawn_without_a_warning() -> None:
+def test_empty_samples_are_drawn_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")

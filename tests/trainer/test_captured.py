@@ -137,7 +137,7 @@ def test_a_captured_step_is_the_step(tmp_path: Path, network: str, settings: lis
         torch.testing.assert_close(captured.trained.state_dict()[name], tensor, rtol=1e-4, atol=1e-5, msg=name)
 
 
-def test_another_shape_or_share_of_the_guide_is_recorded_anew(tmp_path: Path) -> None:
+def test_another_shape_or_guide_share_is_recorded_again(tmp_path: Path) -> None:
     trained = learner(tmp_path, "hypere2vid")
     graphs: list[FakeGraph] = []
 

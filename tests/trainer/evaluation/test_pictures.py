@@ -1,4 +1,4 @@
-"""Which steps are drawn."""
+"""Test which steps are drawn."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def test_steps_are_evenly_spaced_and_end_with_the_last(count: int, rows: int) ->
 
 
 @pytest.mark.parametrize(("count", "rows", "steps"), [(12, 2, {5, 11}), (2, 6, {0, 1}), (10, 1, {9})])
-def test_some_of_them(count: int, rows: int, steps: set[int]) -> None:
+def test_chosen_steps_of_known_cases(count: int, rows: int, steps: set[int]) -> None:
     assert choose_steps(count, rows) == steps

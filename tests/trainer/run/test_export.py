@@ -33,7 +33,7 @@ def test_the_averaged_weights_are_exported_where_there_are_any(
         assert torch.equal(tensor, (average if is_averaged else model)[key])
 
 
-def test_what_is_no_checkpoint_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(SHIPPED), str(tmp_path / "firenet.pt")]) == 2
     assert "is no checkpoint of a training run" in capsys.readouterr().err
     assert not (tmp_path / "firenet.pt").exists()

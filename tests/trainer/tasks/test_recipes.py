@@ -126,7 +126,7 @@ def flow_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
+def test_a_shipped_configuration_builds_trains_and_minimises_its_loss(
     server: FakeServer, weights: Path, name: str
 ) -> None:
     config = reduced(name, weights)
@@ -175,7 +175,7 @@ class Waits(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_step_neither_waits_for_the_device_nor_copies_to_it(
+def test_a_step_neither_synchronises_with_the_device_nor_copies_to_it(
     server: FakeServer, weights: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the batch on the device to the reading of the meter."""
