@@ -21,7 +21,7 @@ from trainer.tasks.task import chosen, limited
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
-from v2v_protocol.settings import Setting, nearest, of_type, settings_of, shown
+from v2v_protocol.settings import Setting, format_value, nearest, of_type, settings_of
 from v2v_protocol.spec import StreamSpec
 
 
@@ -268,7 +268,7 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _section(kind: Any, name: str, content: Any) -> Any:
     if not isinstance(content, Mapping):
-        raise UsageError(f"{name} = {shown(content)}: it is a section, give keys and values")
+        raise UsageError(f"{name} = {format_value(content)}: it is a section, give keys and values")
     hints, stated = typing.get_type_hints(kind), settings_of(kind)
     for key in content:
         if key not in hints:
@@ -288,5 +288,5 @@ def setting_of(key: str, hint: Any, value: Any, stated: Setting | None = None) -
     if setting is not None:
         return setting.check(key, value)
     if hint == Mapping[str, Any] and not isinstance(value, Mapping):
-        raise UsageError(f"{key} = {shown(value)}: give keys and values")
+        raise UsageError(f"{key} = {format_value(value)}: give keys and values")
     return copy.deepcopy(value)

@@ -284,7 +284,7 @@ def obeying_weights(config: TrainConfig) -> TrainConfig:
     if not config.network.weights:
         return config
     try:
-        found = read_weights(config.network.weights).recognised()
+        found = read_weights(config.network.weights).recognise()
     except UsageError as error:
         raise UsageError(f"network.weights: {error}") from error
     if found is None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from trainer.config import TrainConfig
 from trainer.config_file import show_config
-from trainer.pictures import Image, Video, contact_sheet, headed
+from trainer.pictures import Image, Video, add_header, contact_sheet
 from trainer.run.board import Board
 from trainer.run.checkpoint import replacing, unwritable
 from trainer.run.distributed import Ranks
@@ -209,12 +209,12 @@ class Reporter:
         with self._writing("previews"):
             (self._out / "previews").mkdir(exist_ok=True)
             for number, film in enumerate(films):
-                sheet = headed(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
+                sheet = add_header(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
                 path = self._out / "previews" / f"step-{step:07d}-{number}"
                 path.with_suffix(".png").write_bytes(png_bytes(sheet))
                 with Video(path.with_suffix(".mp4"), FRAMES_PER_SECOND) as video:
                     for image in film:
-                        video.add(headed(image, panels))
+                        video.add(add_header(image, panels))
                 self._board.picture(f"preview/{number}", sheet, step)
 
     def _note(self, values: Mapping[str, float]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from trainer.config import RunConfig
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.evaluate import find_recordings
 from trainer.evaluation.score import mean_by_name
 from trainer.evaluation.voxelise import VoxelSettings

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from trainer import pictures
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.flow import FlowRun, evaluate_flow
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings
@@ -144,10 +144,10 @@ class FlowScorer:
     def check(self, path: Path, data_set: DataSet) -> None:
         """Check that the recording has flow in the cut."""
         with Recording(path) as recording:
-            flow_windows(recording, data_set.cuts[path.stem])
+            flow_windows(recording, data_set.time_ranges[path.stem])
 
     def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> dict[str, float]:
         """Return means over the windows."""
-        found = evaluate_flow(self.run, path, data_set.cuts[path.stem])
+        found = evaluate_flow(self.run, path, data_set.time_ranges[path.stem])
         zeros = {f"zeros_{name}": value for name, value in found["zeros"].means.items()} if baseline else {}
         return found["network"].means | zeros

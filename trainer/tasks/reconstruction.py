@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from trainer import pictures
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.evaluate import Run, check_recording, evaluate_sequence
 from trainer.evaluation.metrics import make_metrics
 from trainer.evaluation.voxelise import VoxelSettings

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models.sequence import Guide, VoxelNetwork
 from trainer.pictures import Image

@@ -172,7 +172,7 @@ def test_e2vid_plus_gives_its_image_channel(tmp_path: Path) -> None:
     other = small(seed=1)
     report = load_into(other, tmp_path / "plus.pth")
     assert same(other.state_dict(), model.state_dict())
-    assert report.cut == ("unetrecurrent.pred.conv2d.weight", "unetrecurrent.pred.conv2d.bias")
+    assert report.sliced == ("unetrecurrent.pred.conv2d.weight", "unetrecurrent.pred.conv2d.bias")
     assert len(report.renamed) == len(state)
     assert "(in the file unetflow.head.conv2d.weight)" in str(report)
     assert "channel 0 only" in str(report)
@@ -240,7 +240,7 @@ def test_the_variant_of_e2vid_is_read_from_its_file(tmp_path: Path, options: dic
     if "final_activation" in options:
         content["model"] = {"num_bins": 5, "skip_type": "sum", "recurrent_block_type": "convlstm", "norm": "BN"}
     torch.save(content, tmp_path / "e2vid.pth.tar")
-    name, found = read_weights(tmp_path / "e2vid.pth.tar").recognised()
+    name, found = read_weights(tmp_path / "e2vid.pth.tar").recognise()
     assert name == "e2vid"
     assert found == {
         "bins": 5,

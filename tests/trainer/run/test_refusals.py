@@ -163,12 +163,12 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
 
         server.alter = silent_from_the_third_batch
         message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=2.0)
-    assert "nothing heard" in message
+    assert "nothing received" in message
     assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
     assert (tmp_path / "run" / METRICS).is_file()
 
 
 def test_a_server_that_never_was_there_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(tmp_path, f"ipc://{tmp_path}/nobody", capsys, stream__timeout_seconds=0.1)
-    assert "nothing heard" in message
+    assert "nothing received" in message
     assert not (tmp_path / "run" / LAST).exists()
