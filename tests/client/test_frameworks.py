@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 from collections.abc import Iterator
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from torch.utils.data import DataLoader
+from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import FakeServer
-from v2v_client import Batch, UsageError, V2VStreamDataset
+from v2v_client import Batch, RepeatedSamplesWarning, UsageError, V2VStreamDataset
 
 FORK = multiprocessing.get_context("fork")
 
@@ -88,6 +92,45 @@ def test_lightning_cannot_resume_a_plain_loader(server: FakeServer, workers: int
     assert theirs["FitLoop"](0, 1, True).advance(loader).indices == (4, 5, 6, 7)
     stream.set_epoch(3)
     assert theirs["FitLoop"](3, 0, False).advance(loader).epoch == 3
+
+
+@pytest.mark.slow
+# Theirs are ignored. Ours is an error: loader workers inherit the filter, and raise it.
+@pytest.mark.filterwarnings("ignore", "error::v2v_client.RepeatedSamplesWarning")
+@pytest.mark.parametrize("sets_epoch", [True, False])
+@pytest.mark.parametrize(("loader", "workers"), [(StatefulDataLoader, 0), (StatefulDataLoader, 2), (DataLoader, 2)])
+def test_epochs_of_lightning_that_end_early_are_other_samples_or_are_not_silent(
+    loader: Any, workers: int, sets_epoch: bool
+) -> None:
+    """Its loader workers have prefetched more, and end with the epoch."""
+    lightning = importlib.import_module("lightning")  # slow to import, and without types
+    taken: list[tuple[int | None, ...]] = []
+
+    class Module(lightning.LightningModule):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = torch.nn.Conv2d(2, 1, 1)
+
+        def on_train_epoch_start(self) -> None:
+            if sets_epoch:
+                stream.set_epoch(self.current_epoch)
+
+        def training_step(self, batch: Batch, _number: int) -> torch.Tensor:
+            taken.append((batch.epoch, *batch.indices))
+            return self.network(batch.arrays["voxels"].flatten(0, 1).float()).mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), 1e-3)
+
+    trainer = lightning.Trainer(
+        max_epochs=2, limit_train_batches=8, accelerator="cpu", logger=False, enable_progress_bar=False,
+        enable_model_summary=False, enable_checkpointing=False,
+    )  # fmt: skip
+    said = nullcontext() if sets_epoch else pytest.raises((RepeatedSamplesWarning, UsageError), match="set_epoch")
+    with FakeServer(sequences=103, credit=8) as server, said:
+        stream = dataset(server)
+        trainer.fit(Module(), loader(stream, batch_size=None, num_workers=workers))
+    assert taken == [(epoch, *range(4 * n, 4 * n + 4)) for epoch in range(1 + sets_epoch) for n in range(8)]
 
 
 def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
