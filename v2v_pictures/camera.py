@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,6 +15,11 @@ from v2v_protocol.sample import Provenance
 
 _SETTLED_SHARE = 0.1
 """Moments are chosen behind this share of a clip: at its beginning every pixel still waits for its first event."""
+_MOSTLY = 0.5
+_FEWEST_EVENTS = 1e-3
+"""Events a pixel and voxel grid below which a camera without noise counts as blind: 16 of a crop of 128 x 128."""
+_STILL_QUANTILE, _STILL_LEVELS = 0.995, 8
+"""Grey levels that a codec changes by itself where nothing moves."""
 
 
 def check_drawable(arrays: Collection[str]) -> None:
@@ -40,7 +45,7 @@ class Camera:
         frames_per_bin: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
-        noise_share: share of the clip's events that the same draw without noise does not have, or None: not measured.
+        quiet: as ``rates``, of the same draw without noise, or None: not measured.
     """
 
     voxels: npt.NDArray[Any]
@@ -51,7 +56,7 @@ class Camera:
     frames_per_bin: int = 1
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
-    noise_share: float | None = None
+    quiet: npt.NDArray[np.float64] | None = None
 
     @classmethod
     def of(
@@ -113,19 +118,44 @@ class Camera:
         liveliest bin counts nothing either: a cut of the film is a flash of one bin, and no motion."""
         bins = self.voxels.shape[1]
         moving = ~self.paused.reshape(-1, bins)
-        each = self.rates.sum(axis=0).reshape(-1, bins) * moving
+        each = (self.rates if self.quiet is None else self.quiet).sum(axis=0).reshape(-1, bins) * moving
         activity = (each.sum(axis=1) - (each.max(axis=1) if bins > 1 else 0.0)) * moving.mean(axis=1)
         first = min(round(len(activity) * _SETTLED_SHARE), len(activity) - 1)
         edges = np.linspace(first, len(activity), min(count, len(activity) - first) + 1).round().astype(int)
         return [int(start + np.argmax(activity[start:end])) for start, end in pairwise(edges)]
 
+    def noise_share(self, grids: Sequence[int]) -> float | None:
+        """Return which share of the events of these voxel grids is noise: 0 to 1, or None where it is not known."""
+        if self.quiet is None:
+            return None
+        events, quiet = (self._in_grids(rates, grids) for rates in (self.rates, self.quiet))
+        return max(0.0, 1.0 - quiet / events) if events else 0.0
+
+    def warning(self, grids: Sequence[int]) -> str:
+        """Say why most of what these voxel grids show is no motion; "" where motion makes most events."""
+        share = self.noise_share(grids)
+        if self.quiet is None or share is None:
+            return ""
+        if self._in_grids(self.quiet, grids) / len(grids) < _FEWEST_EVENTS:
+            why = "nothing moves here" if self._is_still(grids) else "no motion reaches the thresholds"
+            return f"{why}: all events are noise" if share > _MOSTLY else why
+        return f"mostly noise: {share:.0%} of the events shown" if share > _MOSTLY else ""
+
+    def _in_grids(self, rates: npt.NDArray[np.float64], grids: Sequence[int]) -> float:
+        return float(rates.sum(axis=0).reshape(len(self.voxels), -1)[list(grids)].sum())
+
+    def _is_still(self, grids: Sequence[int]) -> bool:
+        """Whether no frame differs from the one of the voxel grid before it."""
+        for grid in grids:
+            before, now = self.frames[max(0, grid - 1)].astype(np.int16), self.frames[grid]
+            if np.quantile(np.abs(now - before), _STILL_QUANTILE) > _STILL_LEVELS:
+                return False
+        return True
+
     def describe(self) -> str:
-        """The draw in one line: what is nothing is left out."""
+        """Return the draw in one line, without what is zero."""
         params = self.provenance.params
-        parts = []
-        if self.noise_share is not None and self.noise_share > 0.5:
-            parts.append(f"mostly noise: {self.noise_share:.0%} of the events")
-        parts.append(f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}")
+        parts = [f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}"]
         if params.noise_sigma:
             parts.append(f"noise {params.noise_sigma:.3f}")
         if params.hot_pixel_count:

@@ -23,6 +23,7 @@ MARK: Colour = (173, 96, 0)
 PAUSED: Colour = (196, 199, 207)
 
 TITLE_PT, HEADING_PT, TEXT_PT = 26, 20, 16
+MARGIN_PX, GAP_PX = 28, 8
 
 
 @cache
@@ -132,3 +133,9 @@ def shortened(text: str, width_px: float, size: int = TEXT_PT) -> str:
     while text and text_width("..." + text, size) > width_px:
         text = text[1:]
     return "..." + text
+
+
+def label(page: Canvas, x: int, y: int, text: str, colour: Colour = INK) -> None:
+    """Write text on a ground of its own, so that the panel below does not hide it."""
+    page.box(x, y, x + text_width(text) + 10, y + 24, PAPER)
+    page.text(x + 5, y + 2, text, colour=colour)

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import Canvas
+from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
 from v2v_pictures.colours import Image, draw_events, draw_grey
-from v2v_pictures.sheet import GAP_PX, MARGIN_PX, Scale, events_heading, flow_panel, label
+from v2v_pictures.sheet import Scale, events_heading, flow_panel
 from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
 _TITLE_PX, _STRIP_PX = 58, 50

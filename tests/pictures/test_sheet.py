@@ -22,7 +22,8 @@ from v2v_pictures.canvas import INK, MARK, PAUSED, Canvas, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
-from v2v_pictures.sheet import draw_sheet, flow_panel, whole_panel
+from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
+from v2v_pictures.sheet import draw_sheet, flow_panel
 from v2v_pictures.strip import draw_strip
 from v2v_protocol.errors import UsageError
 
@@ -201,7 +202,7 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
     voxels[:, :, :5] = 1  # half an event a pixel in each bin
     voxels[10, 0] = 1  # twice as many
     voxels[20, 0, :5] = 0
-    voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5
+    voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5: a bar of the square root of 0.4
     written: list[str] = []
     write = Canvas.text
 
@@ -215,7 +216,7 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
     assert "full bar: 0.5 or more a pixel and bin" in written
     image = page.image()
     bars = [has(image[40:121, 50 + 5 * number + 2][None], BRIGHTER) for number in (0, 50, 100)]
-    assert bars == pytest.approx([40, 40, 16], abs=2)
+    assert bars == pytest.approx([40, 40, 25], abs=2)
 
 
 @pytest.mark.parametrize("draw", [draw_sheet, lambda cameras, title: list(draw_film(cameras, title))])
@@ -244,11 +245,54 @@ def test_a_drawn_dark_floor_is_described() -> None:
     assert "dark floor 0.125" in floor.describe()
 
 
-def test_a_camera_of_mostly_noise_says_so() -> None:
-    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
-    assert "mostly noise" not in shown.describe()
-    assert "mostly noise: 83% of the events" in dataclasses.replace(shown, noise_share=0.83).describe()
-    assert "mostly noise" not in dataclasses.replace(shown, noise_share=0.4).describe()
+def without_noise(shown: Camera, quiet: npt.NDArray[Any]) -> Camera:
+    return dataclasses.replace(shown, quiet=dataclasses.replace(shown, voxels=quiet).rates)
+
+
+def test_the_noise_share_is_that_of_the_voxel_grids_that_are_shown() -> None:
+    loud = np.ones((4, 2, 16, 16), np.int8)
+    quiet = loud.copy()
+    quiet[1, :, :12] = 0
+    quiet[2] = 0
+    shown = without_noise(camera(loud), quiet)
+    assert shown.noise_share([0]) == 0.0
+    assert shown.noise_share([1]) == 0.75
+    assert shown.noise_share([0, 1, 2]) == pytest.approx(1.75 / 3)
+    assert shown.warning([0]) == ""
+    assert shown.warning([1]) == "mostly noise: 75% of the events shown"
+    assert shown.warning([0, 2]) == ""
+    assert camera(loud).noise_share([1]) is None
+    assert camera(loud).warning([1]) == ""
+
+
+def test_a_camera_without_motion_says_why() -> None:
+    loud, frames = np.ones((3, 2, 16, 16), np.int8), np.full((3, 16, 16), 90, np.uint8)
+    shown = without_noise(dataclasses.replace(camera(loud), frames=frames), 0 * loud)
+    assert shown.warning([2]) == "nothing moves here: all events are noise"
+    frames = frames.copy()
+    frames[2, 4:8] = 140
+    moving = dataclasses.replace(shown, frames=frames)
+    assert moving.warning([1]) == "nothing moves here: all events are noise"
+    assert moving.warning([2]) == "no motion reaches the thresholds: all events are noise"
+    assert without_noise(camera(0 * loud), 0 * loud).warning([0]) == "nothing moves here"
+
+
+def test_moments_show_motion_instead_of_noise() -> None:
+    loud, quiet = np.zeros((2, 20, 5, 4, 4), np.int8)
+    loud[7], loud[12], quiet[12] = 5, 3, 3
+    assert camera(loud).moments(1) == [7]
+    assert without_noise(camera(loud), quiet).moments(1) == [12]
+
+
+def test_bars_of_noise_are_pale() -> None:
+    loud, quiet = np.ones((4, 2, 8, 8), np.int8), np.zeros((4, 2, 8, 8), np.int8)
+    quiet[:2] = 1
+    page = Canvas(500, 160)
+    draw_strip(page, without_noise(camera(loud), quiet), 50, 40, 400, 80, 1.0)
+    image = page.image()[60]
+    assert tuple(image[60]) == BRIGHTER
+    assert tuple(image[440]) not in (BRIGHTER, WHITE)
+    assert image[440, 0] > image[440, 1]  # reddish
 
 
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:
@@ -264,6 +308,28 @@ def test_the_whole_picture_has_a_box_around_the_crop() -> None:
     before = page.image()
     whole_panel(page, shown, 0, 0, 160, 120)
     assert np.array_equal(page.image(), before)
+
+
+def test_the_overview_marks_the_cameras_of_its_clip_only() -> None:
+    voxels = np.zeros((2, 2, 30, 40), np.int8)
+    whole = dataclasses.replace(camera(voxels), title="all of it")
+    params = dataclasses.replace(PARAMS, scale=1.0, crop_left_px=10, crop_top_px=5)
+    seen = dataclasses.replace(PROVENANCE, params=params)
+    looks = dataclasses.replace(camera(voxels[..., :16, :16]), provenance=seen, whole=np.zeros((30, 40), np.uint8))
+    other = dataclasses.replace(looks, provenance=dataclasses.replace(seen, start_frame=seen.start_frame + 1))
+
+    def marked(cameras: list[Camera]) -> tuple[int, int]:
+        page = Canvas(overview_width(80), 300)
+        draw_overview(page, whole, cameras, 10, 80, 1.0, 1.0)
+        image = page.image()
+        return has(image[:, :190], MARK), has(image[:, 200:370], MARK)
+
+    nothing, _ = marked([other])
+    assert nothing == 0
+    frame, events = marked([looks])
+    assert frame > events > 0  # the number stands in one of both
+    sheet = draw_sheet([looks, other], "t", whole=whole)
+    assert sheet.shape[0] - draw_sheet([looks, other], "t").shape[0] == overview_height(whole, 192)
 
 
 def test_arrows_of_flow_point_where_pixels_move() -> None:

@@ -1,7 +1,8 @@
 """`v2v-preview`: what a recipe makes of a video, to look at, without a server.
 
-One clip for each virtual camera, made by the very functions that a server's worker uses, so what is shown is what a
-trainer gets. A video too short or too small for the recipe is shown with shorter clips or smaller crops, and said so.
+The whole picture without noise comes first. Then one clip for each virtual camera, made by the functions that a
+server's worker uses, so what is shown is what a trainer gets. A video too short or too small for the recipe is shown
+with shorter clips or smaller crops, and the output says so.
 """
 
 from __future__ import annotations
@@ -25,14 +26,17 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.offline.remake import open_shown, remake
+from v2v_server.cloud.copies import lent
+from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
+from v2v_server.offline.remake import Remaker, open_shown
+from v2v_server.schedule.sequences import Sequence as Clip
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.decode import decode_luma
+from v2v_server.store.clips import clips_of
+from v2v_server.video.collect import Cut
 
 KINDS = (".png", ".mp4", ".gif", ".html")
 _TOLD_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
-_NOISE = ("noise_sigma", "hot_pixel_share", "shot_noise_hz", "leak_hz")
 _GIF_EVERY = 2  # every other bin: half the size
 
 
@@ -41,7 +45,7 @@ class Shot:
     """One camera of a preview.
 
     Attributes:
-        title: written beside it.
+        title: written beside it; "" writes the seed.
         recipe: fields or a preset's name.
         seed: of the sample.
     """
@@ -58,6 +62,7 @@ def preview(
     spec: Mapping[str, Any],
     *,
     title: str,
+    find_motion: bool = False,
     list_file: str | None = None,
     rows: str = "full",
     with_flow: bool = True,
@@ -65,7 +70,7 @@ def preview(
     cache_dir: str | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Makes the cameras' clips, draws them, writes the file.
+    """Make the cameras' clips, draw them, and write the file.
 
     Args:
         source, list_file, rows: the corpus, as for a server.
@@ -73,6 +78,7 @@ def preview(
         looks: the cameras.
         spec: other fields of the StreamSpec; None in any takes the default.
         title: of the page.
+        find_motion: take other seeds than those of ``looks``, whose crops show motion. Equal seeds stay equal.
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
@@ -92,18 +98,42 @@ def preview(
     notes: dict[str, list[str]] = {}
     told: _Told | None = None
     try:
+        first = _fitted_stream(catalogue, spec, looks[0].recipe)
+        wholes = WholePictures(catalogue, first)
+        if find_motion:
+            looks, note = _moving(looks, Remaker(catalogue, first), wholes)
+            say(note)
         for look in looks:
             cameras.append(_camera(catalogue, look, spec, with_flow, notes))
             if told is None:  # the first may have waited for kernels to be compiled, and says nothing of the others
                 told = _Told(say, "cameras", len(looks), done=1)
             else:
                 told.one_more()
+        whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
-    write(out, _content(out.suffix, cameras, title, moments, say))
+    write(out, _content(out.suffix, whole, cameras, title, moments, say))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
+
+
+def _moving(looks: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
+    """The same cameras with seeds that show motion, and what to tell the user."""
+    asked = sorted({look.seed for look in looks})
+    chosen, moving = moving_seeds(remaker, wholes, len(asked))
+    seeds = dict(zip(asked, chosen, strict=True))
+    names = f"seed{'s' if len(chosen) > 1 else ''} {', '.join(map(str, chosen))}"
+    if moving == len(chosen):
+        note = f"{names}: chosen because their crops show motion; --seed 0 takes what chance gives"
+    else:
+        note = f"{names}: {moving} of {len(chosen)} crops show more motion than noise, no more were found"
+    return [dataclasses.replace(look, seed=seeds[look.seed]) for look in looks], note
+
+
+def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> Clip:
+    (video,) = (video for video in catalogue.videos if video.id == provenance.video)
+    return Clip(video, provenance.start_frame)
 
 
 class _Told:
@@ -123,9 +153,11 @@ class _Told:
             self._say(f"{self._done} of {self._total} {self._things}, {rate}, {left * each:.0f} s left")
 
 
-def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]) -> bytes | str:
+def _content(
+    kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]
+) -> bytes | str:
     if kind == ".png":
-        return png_bytes(draw_sheet(cameras, title, moments=moments))
+        return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
     told, film = _Told(say, "pictures of the film", grids * bins), []
     for picture in draw_film(cameras, title):
@@ -135,47 +167,47 @@ def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int, say
         return mp4_bytes(film, FRAMES_PER_SECOND)
     if kind == ".gif":
         return gif_bytes(film[::_GIF_EVERY], FRAMES_PER_SECOND / _GIF_EVERY)
-    return html_page(title, draw_sheet(cameras, title, moments=moments), film, FRAMES_PER_SECOND)
+    return html_page(title, draw_sheet(cameras, title, moments=moments, whole=whole), film, FRAMES_PER_SECOND)
 
 
 def _camera(
     catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> Camera:
     """One camera's clip; what is to be said of it goes to ``notes``, by the text, because many may share it."""
-    stream = StreamSpec.from_dict({**spec, "recipe": look.recipe})
-    fitted = _fitted(catalogue, stream)
-    if fitted != stream.recipe:
+    title = look.title or f"seed {look.seed}"
+    asked, stream = StreamSpec.from_dict({**spec, "recipe": look.recipe}), _fitted_stream(catalogue, spec, look.recipe)
+    if stream != asked:
+        fitted, recipe = stream.recipe, asked.recipe
         note = (
             f"shown with {fitted.voxels_per_clip} voxel grids of {fitted.crop_width_px} x "
-            f"{fitted.crop_height_px} instead of {stream.recipe.voxels_per_clip} of {stream.recipe.crop_width_px} x "
-            f"{stream.recipe.crop_height_px}: no video here is long and large enough for more"
+            f"{fitted.crop_height_px} instead of {recipe.voxels_per_clip} of {recipe.crop_width_px} x "
+            f"{recipe.crop_height_px}: no video here is long and large enough for more"
         )
-        notes.setdefault(note, []).append(look.title)
-        stream = StreamSpec.from_dict({**spec, "recipe": fitted})
+        notes.setdefault(note, []).append(title)
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
-    sample = remake(catalogue, stream, seed=look.seed, epoch=0, index=0, arrays=arrays)
-    whole = _whole_picture(catalogue, sample.provenance)
-    camera = Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin, whole)
-    quiet_recipe = stream.recipe.replace(**dict.fromkeys(_NOISE, (0.0, 0.0)))
-    quiet_stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": quiet_recipe})
-    quiet = remake(catalogue, quiet_stream, seed=look.seed, epoch=0, index=0, arrays=("voxels", "frames"))
-    without = Camera.of(quiet.arrays, quiet.provenance, look.title)
-    events = float(camera.rates.sum())
-    share = max(0.0, 1.0 - float(without.rates.sum()) / events) if events else 0.0
-    return dataclasses.replace(camera, noise_share=share)
+    made = Remaker(catalogue, stream, arrays).made(look.seed, 0, 0)
+    provenance, frames_per_bin = made.sample.provenance, stream.recipe.frames_per_bin
+    whole = _whole_picture(catalogue, provenance)
+    camera = Camera.of(made.sample.arrays, provenance, title, frames_per_bin, whole)
+    quiet = dataclasses.replace(camera, voxels=quiet_voxels(made)[camera.lead_voxels :])
+    return dataclasses.replace(camera, quiet=quiet.rates)
 
 
-def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8] | None:
-    """The video's rows at the clip's first frame, or None: a prepared folder has files that are no videos."""
-    if catalogue.prepared is not None:
-        return None
+def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:
+    """The video's rows at the clip's first frame, [rows, columns]."""
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
-    rows = (top, 0, bottom - top, index.width_px)
-    picture: npt.NDArray[np.uint8] = decode_luma(
-        catalogue.path(provenance.video), index, provenance.start_frame, 1, rows
-    ).frames[0]
+    cut = Cut(1, (top, 0, bottom - top, index.width_px))
+    with lent(catalogue.root, provenance.video, provenance.fingerprint) as path:
+        (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
+    picture: npt.NDArray[np.uint8] = clip.frames[0]
     return picture
+
+
+def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:
+    """The stream of a recipe that :func:`_fitted` has made fit."""
+    stream = StreamSpec.from_dict({**spec, "recipe": recipe})
+    return StreamSpec.from_dict({**spec, "recipe": _fitted(catalogue, stream)})
 
 
 def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from v2v_pictures.camera import Camera, check_drawable
 from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -25,13 +27,22 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.sequences import Sequence, SequenceTable
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, make_sample
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A sample, the lease it was made for, and the frames it was made of."""
+
+    lease: Lease
+    decoded: Decoded
+    sample: Sample
 
 
 class Remaker:
@@ -68,8 +79,16 @@ class Remaker:
         self._schedule = Schedule.of(table, spec)
         self.count = self._schedule.count
 
+    def sequence(self, seed: int, epoch: int, index: int) -> Sequence:
+        """Return what the sample of this name is made from, unless that cannot be read."""
+        return self._schedule.candidate(seed, epoch, index, 0)
+
     def sample(self, seed: int, epoch: int, index: int) -> Sample:
-        """The sample of this name, candidates and refusals included.
+        """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
+        return self.made(seed, epoch, index).sample
+
+    def made(self, seed: int, epoch: int, index: int) -> Made:
+        """Make the sample of this name, and return what it was made of too.
 
         Raises:
             UsageError: an index outside the epoch.
@@ -95,7 +114,8 @@ class Remaker:
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
             try:
-                return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+                decoded = decode_for(lease, lease.indices, catalogue.root)[0]
+                return Made(lease, decoded, make_sample(lease, decoded))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise
