@@ -164,12 +164,15 @@ class WholePictures:
         )  # fmt: skip
         left, top = params.crop_left_px / params.scale, params.crop_top_px / params.scale
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
-        voxels = self.camera(sequence).voxels
-        scale = voxels.shape[-1] / video.width_px
+        whole = self.camera(sequence).voxels
+        bins = whole.reshape(-1, *whole.shape[2:])
+        seen = int(params.source_index(recipe.steps)[-1]) // recipe.frames_per_bin  # pauses leave the rest out
+        scale = bins.shape[-1] / video.width_px
         rows, columns = (
             slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))
         )
-        events = float(np.abs(voxels[..., rows, columns], dtype=np.float32).mean()) / recipe.frames_per_bin
+        crop = bins[:, rows, columns]
+        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / crop.size / recipe.frames_per_bin
         seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
         return View(
             (video.id, sequence.start_frame),
@@ -224,7 +227,7 @@ def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[l
     for seed in lively:
         if not any(views[seed].overlaps(views[other]) for other in apart):
             apart.append(seed)
-    rest = sorted(views, key=lambda seed: (seed not in lively, not views[seed].moves, seed))
+    rest = sorted(views, key=lambda seed: (not views[seed].moves, -views[seed].motion))
     chosen = list(dict.fromkeys([*apart, *rest, *range(count)]))[:count]
     return sorted(chosen), sum(seed in views and views[seed].moves for seed in chosen)
 
