@@ -26,7 +26,7 @@ _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2
 _SHOWN = 4
 _VOXELS_PER_CLIP = 10
-_CONFIGURATION = "tiny-cpu"
+_CONFIGURATION = "finetune-cpu"
 _HELD_OUT = "bikes.mp4"
 """No clip that the shipped network was trained on."""
 

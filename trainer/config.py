@@ -32,7 +32,8 @@ class NetworkConfig:
     Attributes:
         name: see :data:`trainer.models.NETWORKS`.
         options: arguments of its constructor; ``bins`` comes from the recipe.
-        weights: checkpoint to take the first weights from; empty: random.
+        weights: checkpoint to take the first weights from; ``shipped``: the network that comes with this package;
+            empty: random.
     """
 
     name: str = chosen("e2vid", NETWORKS)

@@ -120,15 +120,16 @@ class KeyReport:
 
 
 def read_weights(path: str | Path, *, ema: bool = False) -> WeightFile:
-    """A published or own file of weights; nothing of it is executed.
+    """Read a published or own file of weights; nothing of it is executed.
 
     Args:
-        path: a file of ``torch.save``.
+        path: a file of ``torch.save``, or ``shipped``: the network that comes with this package (:data:`SHIPPED`).
         ema: take the averaged weights of one of our own checkpoints.
 
     Raises:
         UsageError: no such file, not one of PyTorch, or without a state dict.
     """
+    path = SHIPPED if str(path) == "shipped" else path
     content = read_torch_file(path)
     trained = content.get("config") if isinstance(content, Mapping) else None
     network = trained.get("network") if isinstance(trained, Mapping) else None

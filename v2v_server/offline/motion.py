@@ -21,7 +21,7 @@ from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.cloud.copies import lent
 from v2v_server.flow import view_part
-from v2v_server.offline.remake import Made, Remaker
+from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import Sequence
 from v2v_server.simulation.draw import draw
 from v2v_server.store.format import is_store_file
@@ -50,7 +50,7 @@ def noise_free(recipe: Recipe) -> Recipe:
     return recipe.replace(**dict.fromkeys(_NOISE, (0.0, 0.0)))
 
 
-def quiet_voxels(made: Made) -> npt.NDArray[Any]:
+def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
     """Simulate a sample's frames again, with the same draw but without noise.
 
     Returns:
@@ -73,7 +73,7 @@ def quiet_voxels(made: Made) -> npt.NDArray[Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CropEstimate:
     """What the camera of a seed is estimated to see.
 
     Attributes:
@@ -92,7 +92,7 @@ class View:
         """Whether motion makes more events than noise."""
         return self.motion > self.noise
 
-    def overlaps(self, other: View) -> bool:
+    def overlaps(self, other: CropEstimate) -> bool:
         """Whether a camera of the same clip sees the same place."""
         (left, top, width, height), (x, y, *_) = self.box, other.box
         return self.clip == other.clip and abs(left - x) < width and abs(top - y) < height
@@ -150,7 +150,7 @@ class WholePictures:
         sample = make_sample(lease, Decoded(draft_of(lease, 0), clip))
         return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe.frames_per_bin)
 
-    def estimate(self, sequence: Sequence, seed: int) -> View:
+    def estimate(self, sequence: Sequence, seed: int) -> CropEstimate:
         """Estimate what the camera of a seed sees of a sequence.
 
         Raises:
@@ -174,7 +174,7 @@ class WholePictures:
         crop = bins[:, rows, columns]
         events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / crop.size / recipe.frames_per_bin
         seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
-        return View(
+        return CropEstimate(
             (video.id, sequence.start_frame),
             (left, top, width, height),
             events * THRESHOLD / max(params.threshold_pos, params.threshold_neg),
@@ -208,7 +208,7 @@ def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[l
         ``count`` different seeds, ascending, the first ones of all where no video can be read; and how many of them
         are estimated to see more motion than noise.
     """
-    views: dict[int, View] = {}
+    views: dict[int, CropEstimate] = {}
     clips: dict[tuple[str, int], bool] = {}
     for seed in range(max(CANDIDATES, 2 * count)):
         sequence = remaker.sequence(seed, 0, 0)

@@ -37,7 +37,7 @@ _MOMENTS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class RemadeSample:
     """A sample, the lease it was made for, and the frames it was made of."""
 
     lease: Lease
@@ -87,7 +87,7 @@ class Remaker:
         """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
         return self.made(seed, epoch, index).sample
 
-    def made(self, seed: int, epoch: int, index: int) -> Made:
+    def made(self, seed: int, epoch: int, index: int) -> RemadeSample:
         """Make the sample of this name, and return what it was made of too.
 
         Raises:
@@ -115,7 +115,7 @@ class Remaker:
             )
             try:
                 decoded = decode_for(lease, lease.indices, catalogue.root)[0]
-                return Made(lease, decoded, make_sample(lease, decoded))
+                return RemadeSample(lease, decoded, make_sample(lease, decoded))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise
