@@ -1,4 +1,4 @@
-"""One simulated clip as its virtual camera saw it: what to write beside it, when much happened, when it stood still."""
+"""One simulated clip as its virtual camera saw it: a description, its activity over time, its pauses."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _STILL_QUANTILE, _STILL_LEVELS = 0.995, 8
 
 
 def check_drawable(arrays: Collection[str]) -> None:
-    """Refuses arrays that a picture cannot be made of.
+    """Check that a picture can be made of these arrays.
 
     Raises:
-        UsageError: voxels or frames are not among them.
+        UsageError: voxels or frames are missing.
     """
     if not {"voxels", "frames"} <= set(arrays):
         raise UsageError("a picture needs both arrays: voxels,frames")
@@ -40,7 +40,7 @@ class Camera:
         voxels: [T, bins, H, W], signed event counts.
         frames: [T, H, W] uint8; frame t closes voxel grid t.
         flow: [T, 2, H, W], px, or None.
-        title: for instance the recipe's name.
+        title: written beside the camera, for instance the recipe's name.
         provenance: where the clip came from, and the draw.
         frames_per_bin: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
@@ -67,10 +67,10 @@ class Camera:
         frames_per_bin: int = 1,
         whole: npt.NDArray[np.uint8] | None = None,
     ) -> Camera:
-        """From the arrays of one sample. Lead frames and lead voxels, which stand in front, are left out.
+        """Create a camera from the arrays of one sample, without lead frames and lead voxels.
 
         Raises:
-            UsageError: voxels or frames are not among the arrays.
+            UsageError: voxels or frames are missing.
         """
         check_drawable(arrays)
         voxels, frames, flow = arrays["voxels"], arrays["frames"][:, 0], arrays.get("flow")
@@ -88,7 +88,7 @@ class Camera:
 
     @property
     def crop(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of what the camera sees, px of the whole picture."""
+        """Left, top, right and bottom of the crop, px of the whole picture."""
         params = self.provenance.params
         height, width = self.frames.shape[1:]
         left, top, scale = params.crop_left_px, params.crop_top_px, params.scale
@@ -96,7 +96,7 @@ class Camera:
 
     @property
     def rates(self) -> npt.NDArray[np.float64]:
-        """[2, T * bins]: events a pixel in each bin, brighter and darker. A signed bin counts with its sign alone."""
+        """[2, T * bins] float64: brighter and darker events a pixel of each bin, from the signed counts."""
         flat = self.voxels.reshape(-1, *self.voxels.shape[2:])
         brighter = [np.maximum(each, 0).mean(dtype=np.float64) for each in flat]
         darker = [np.maximum(-each.astype(np.float32), 0).mean(dtype=np.float64) for each in flat]
@@ -104,7 +104,7 @@ class Camera:
 
     @property
     def paused(self) -> npt.NDArray[np.bool_]:
-        """[T * bins]: whether the camera stood still: every frame of the bin repeats the one before."""
+        """[T * bins] bool: True where every frame of the bin repeats the one before."""
         grids, bins = self.voxels.shape[:2]
         still = np.zeros(((self.lead_voxels + grids) * bins, self.frames_per_bin), np.bool_)
         for first, length in self.provenance.params.pauses:
@@ -113,9 +113,14 @@ class Camera:
         return still_bins[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
-        """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled. Paused
-        bins, in which only noise fires, count nothing, and the more of them a grid has the less it is worth. Its
-        liveliest bin counts nothing either: a cut of the film is a flash of one bin, and no motion."""
+        """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.
+
+        Noise does not count where it is known, paused bins never do. The most active bin of a grid does not count
+        either, because a cut of the film is a flash of one bin.
+
+        Returns:
+            At most ``count`` numbers of voxel grids, ascending.
+        """
         bins = self.voxels.shape[1]
         moving = ~self.paused.reshape(-1, bins)
         each = (self.rates if self.quiet is None else self.quiet).sum(axis=0).reshape(-1, bins) * moving
@@ -182,7 +187,7 @@ _UNITS = {"_hz": (1.0, " Hz"), "_seconds": (1e3, " ms"), "_share": (100.0, " %")
 
 
 def _with_unit(name: str, value: float) -> str:
-    """``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
+    """Write ``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
     for ending, (factor, unit) in _UNITS.items():
         if name.endswith(ending):
             return f"{name.removesuffix(ending).replace('_', ' ')} {factor * value:.2g}{unit}"

@@ -18,10 +18,10 @@ FRAMES_PER_SECOND = 20.0
 
 
 def draw_film(cameras: Sequence[Camera], title: str, *, tile_px: int = 256) -> Iterator[Image]:
-    """One picture for each bin.
+    """Draw one picture for each bin.
 
     Args:
-        cameras: at least one, all with as many voxel grids and bins, all or none with flow.
+        cameras: at least one, all with equally many voxel grids and bins, all or none with flow.
         title: of the film.
         tile_px: side of a panel.
 
@@ -42,7 +42,7 @@ def draw_film(cameras: Sequence[Camera], title: str, *, tile_px: int = 256) -> I
 
 
 def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int, scale: Scale, tile_px: int) -> None:
-    """One camera at one bin of its clip."""
+    """Draw one camera at one bin of its clip."""
     grid, bin_ = divmod(number, camera.voxels.shape[1])
     width = page.width_px - 2 * MARGIN_PX
     x = page.text(MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)

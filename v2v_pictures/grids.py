@@ -1,4 +1,4 @@
-"""Voxel grids of which nothing else is known: what a call of ``simulate`` gave."""
+"""A picture of voxel grids alone, as ``simulate`` returns them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_GRIDS = 4
 
 
 def draw_grids(voxels: npt.NDArray[Any], *, tile_px: int = 192) -> Image:
-    """A row of bins for each of up to four grids, evenly spaced over the clip.
+    """Draw a row of bins for each of up to four grids, evenly spaced over the clip.
 
     Args:
         voxels: [T, bins, H, W], signed event counts, T at least 1.

@@ -33,7 +33,6 @@ def draw_overview(
     """Draw the video's frame with a numbered box for each camera, the events beside it, and the activity.
 
     Args:
-        page: to draw on.
         whole: a camera that sees the whole picture.
         cameras: those of the page; a box shows each one that looks at the same frames.
         top: first row of the overview, px.

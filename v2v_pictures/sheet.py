@@ -1,7 +1,6 @@
-"""A page of virtual cameras: for each its draw, its activity over time, and moments of it: frame, bins, flow.
+"""A page of virtual cameras: for each its draw, its activity over time, and frame, bins and flow of some moments.
 
-The page explains itself: headings over the columns, an arrow for time, pauses hatched and named, one scale of colour
-for all panels, a legend below.
+Headings over the columns, an arrow for time, named pauses, and a legend below explain it. All panels share one scale.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _BETWEEN_PX = 26
 _LEAST_SOURCE_PX = 120
 MOST_BINS = 8
 _ARROWS = 4
-"""Arrows along a side of a panel of flow: colours alone are not told apart by everybody."""
+"""Arrows along a side of a panel of flow, for readers who cannot tell the colours apart."""
 _STILL = 0.15
 """Flow below this share of the largest gets no arrow."""
 
@@ -47,7 +46,7 @@ class Scale:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Scale:
-        """For these cameras, from the moments that a sheet shows of them."""
+        """Return the scale for these cameras, from the moments that a sheet shows of them."""
         shown = [camera.voxels[moment] for camera in cameras for moment in camera.moments(3)]
         flows = [camera.flow.astype(np.float32) for camera in cameras if camera.flow is not None]
         longest = max((float(np.quantile(np.hypot(flow[:, 0], flow[:, 1]), 0.99)) for flow in flows), default=1.0)
@@ -61,7 +60,7 @@ def draw_sheet(
     """Draw the page.
 
     Args:
-        cameras: at least one; all with as many bins, and all or none with flow.
+        cameras: at least one; all with equally many bins, and all or none with flow.
         title: of the page.
         moments: how many voxel grids to show of each camera.
         tile_px: side of a panel.
@@ -125,7 +124,7 @@ def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px
 
 
 def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> None:
-    """The bins' numbers over their panels, and arrows of time between them."""
+    """Write the bins' numbers over their panels, with arrows of time between them."""
     for number, x in enumerate(left):
         x_end = page.text(x, y, f"bin {number + 1}", colour=canvas.SOFT)
         if number + 1 < len(left):
@@ -137,14 +136,14 @@ def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> Non
 
 
 def events_heading(page: Canvas, x: float, y: float, what: str = "simulated events:") -> None:
-    """What red and blue are, in red and blue."""
+    """Write the heading of events, with what red and blue mean."""
     x = page.text(x, y, what, size=canvas.HEADING_PT)
     x = page.text(x + 10, y, "brighter", size=canvas.HEADING_PT, colour=BRIGHTER)
     page.text(x + 10, y, "darker", size=canvas.HEADING_PT, colour=DARKER)
 
 
 def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], largest_px: float, tile_px: int) -> None:
-    """Flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
+    """Draw flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
     page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
     height, width = flow.shape[1:]
     scale = min(tile_px / width, tile_px / height)
@@ -211,7 +210,7 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
 
 
 def draw_scale(page: Canvas, full: float, x: int, y: int) -> None:
-    """The scale of events, SCALE_PX wide: which colour is how many of which sign."""
+    """Draw the colour scale of events, SCALE_PX wide."""
     ramp = np.linspace(-full, full, SCALE_PX, dtype=np.float32)[None].repeat(20, axis=0)
     page.text(x + SCALE_PX / 2, y, "events a pixel and bin", anchor="ma")
     page.panel(x, y + 26, draw_events(ramp, full), SCALE_PX, 20)

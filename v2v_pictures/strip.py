@@ -29,11 +29,9 @@ def draw_strip(
     picks: Sequence[int] = (),
     cursor: int | None = None,
 ) -> None:
-    """The strip, LABEL_PX of text above it and TICKS_PX below it.
+    """Draw the strip, with LABEL_PX of text above it and TICKS_PX below it.
 
     Args:
-        page: to draw on.
-        camera: whose activity.
         left, top, width, height: of the strip itself, px.
         highest: events a pixel and bin of a full bar, which reaches from the middle to the edge; above 0, written above
             the strip. Higher rates are cut there. One value for all strips of a page makes them comparable. A bar's
@@ -75,7 +73,7 @@ def draw_strip(
 
 
 def _ticks(page: Canvas, grids: int, left: int, width: int, top: int, picks: Sequence[int]) -> None:
-    """The number of each pick in the middle of its place; the first and the last grid where there is room for them."""
+    """Write the number of each pick below it, and those of the first and last grid where they fit."""
     free_from, free_to = float(left), float(left + width)
     for place, pick in enumerate(picks):
         text = f"{pick + 1}" if len(picks) > 1 else f"voxel grid {pick + 1}"

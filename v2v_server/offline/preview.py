@@ -35,7 +35,7 @@ from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
 
 KINDS = (".png", ".mp4", ".gif", ".html")
-_TOLD_SECONDS = 2.0
+_REPORT_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
 
@@ -45,7 +45,7 @@ class Shot:
     """One camera of a preview.
 
     Attributes:
-        title: written beside it; "" writes the seed.
+        title: written beside the camera; "" writes the seed.
         recipe: fields or a preset's name.
         seed: of the sample.
     """
@@ -58,7 +58,7 @@ class Shot:
 def preview(
     source: str,
     out: Path,
-    looks: Sequence[Shot],
+    shots: Sequence[Shot],
     spec: Mapping[str, Any],
     *,
     title: str,
@@ -75,52 +75,52 @@ def preview(
     Args:
         source, list_file, rows: the corpus, as for a server.
         out: .png (a sheet), .mp4 or .gif (a film), or .html (both in one file).
-        looks: the cameras.
+        shots: the cameras.
         spec: other fields of the StreamSpec; None in any takes the default.
         title: of the page.
-        find_motion: take other seeds than those of ``looks``, whose crops show motion. Equal seeds stay equal.
+        find_motion: take other seeds than those of ``shots``, whose crops show motion. Equal seeds stay equal.
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
-        say: takes each line for the user.
+        say: called with each line for the user.
 
     Raises:
-        UsageError: an ending that is none of these, a wrong recipe, or a file that cannot be written.
+        UsageError: unknown ending, wrong recipe, or a file that cannot be written.
         CorpusError: no video can be used, even with short clips and small crops.
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
     if out.suffix not in KINDS:
-        raise UsageError(f"--out {out}: give a name that ends in {', '.join(KINDS)}")
+        raise UsageError(f"--out {out}: unknown ending; give a name that ends in {', '.join(KINDS)}")
     if not out.parent.is_dir():  # before any work
-        raise UsageError(f"--out {out}: there is no folder {out.parent}")
+        raise UsageError(f"--out {out}: there is no folder {out.parent}; create it first")
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
     notes: dict[str, list[str]] = {}
-    told: _Told | None = None
+    progress: _Progress | None = None
     try:
-        first = _fitted_stream(catalogue, spec, looks[0].recipe)
+        first = _fitted_stream(catalogue, spec, shots[0].recipe)
         wholes = WholePictures(catalogue, first)
         if find_motion:
-            looks, note = _moving(looks, Remaker(catalogue, first), wholes)
+            shots, note = _moving(shots, Remaker(catalogue, first), wholes)
             say(note)
-        for look in looks:
-            cameras.append(_camera(catalogue, look, spec, with_flow, notes))
-            if told is None:  # the first may have waited for kernels to be compiled, and says nothing of the others
-                told = _Told(say, "cameras", len(looks), done=1)
+        for shot in shots:
+            cameras.append(_camera(catalogue, shot, spec, with_flow, notes))
+            if progress is None:  # the first may include compiling, so it is no estimate for the others
+                progress = _Progress(say, "cameras", len(shots), done=1)
             else:
-                told.one_more()
+                progress.step()
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
     for note, titles in notes.items():
-        say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
+        say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     write(out, _content(out.suffix, whole, cameras, title, moments, say))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
-def _moving(looks: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
-    """The same cameras with seeds that show motion, and what to tell the user."""
-    asked = sorted({look.seed for look in looks})
+def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
+    """Return the same cameras with seeds that show motion, and a note for the user."""
+    asked = sorted({shot.seed for shot in shots})
     chosen, moving = moving_seeds(remaker, wholes, len(asked))
     seeds = dict(zip(asked, chosen, strict=True))
     names = f"seed{'s' if len(chosen) > 1 else ''} {', '.join(map(str, chosen))}"
@@ -128,7 +128,7 @@ def _moving(looks: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> t
         note = f"{names}: chosen because their crops show motion; --seed 0 takes what chance gives"
     else:
         note = f"{names}: {moving} of {len(chosen)} crops show more motion than noise, no more were found"
-    return [dataclasses.replace(look, seed=seeds[look.seed]) for look in looks], note
+    return [dataclasses.replace(shot, seed=seeds[shot.seed]) for shot in shots], note
 
 
 def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> Clip:
@@ -136,18 +136,18 @@ def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> Clip:
     return Clip(video, provenance.start_frame)
 
 
-class _Told:
-    """Says now and then how many of so many things are done, how fast that goes, and how long it will take."""
+class _Progress:
+    """Report from time to time how many of the things are done, how fast, and the time left."""
 
     def __init__(self, say: Callable[[str], None], things: str, total: int, done: int = 0) -> None:
         self._say, self._things, self._total = say, things, total
         self._done = self._first = done
         self._began = self._told = time.monotonic()
 
-    def one_more(self) -> None:
+    def step(self) -> None:
         self._done += 1
         now, left = time.monotonic(), self._total - self._done
-        if left and now - self._told > _TOLD_SECONDS:
+        if left and now - self._told > _REPORT_SECONDS:
             self._told, each = now, (now - self._began) / (self._done - self._first)
             rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
             self._say(f"{self._done} of {self._total} {self._things}, {rate}, {left * each:.0f} s left")
@@ -159,10 +159,10 @@ def _content(
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
-    told, film = _Told(say, "pictures of the film", grids * bins), []
+    progress, film = _Progress(say, "pictures of the film", grids * bins), []
     for picture in draw_film(cameras, title):
         film.append(picture)
-        told.one_more()
+        progress.step()
     if kind == ".mp4":
         return mp4_bytes(film, FRAMES_PER_SECOND)
     if kind == ".gif":
@@ -171,11 +171,11 @@ def _content(
 
 
 def _camera(
-    catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
+    catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> Camera:
-    """One camera's clip; what is to be said of it goes to ``notes``, by the text, because many may share it."""
-    title = look.title or f"seed {look.seed}"
-    asked, stream = StreamSpec.from_dict({**spec, "recipe": look.recipe}), _fitted_stream(catalogue, spec, look.recipe)
+    """Make one camera's clip; add the titles of the cameras that a note is about to ``notes``, by its text."""
+    title = shot.title or f"seed {shot.seed}"
+    asked, stream = StreamSpec.from_dict({**spec, "recipe": shot.recipe}), _fitted_stream(catalogue, spec, shot.recipe)
     if stream != asked:
         fitted, recipe = stream.recipe, asked.recipe
         note = (
@@ -185,7 +185,7 @@ def _camera(
         )
         notes.setdefault(note, []).append(title)
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
-    made = Remaker(catalogue, stream, arrays).made(look.seed, 0, 0)
+    made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance, frames_per_bin = made.sample.provenance, stream.recipe.frames_per_bin
     whole = _whole_picture(catalogue, provenance)
     camera = Camera.of(made.sample.arrays, provenance, title, frames_per_bin, whole)
@@ -194,7 +194,7 @@ def _camera(
 
 
 def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:
-    """The video's rows at the clip's first frame, [rows, columns]."""
+    """Read the video's rows at the clip's first frame: [rows, columns] uint8."""
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
@@ -205,13 +205,13 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[
 
 
 def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:
-    """The stream of a recipe that :func:`_fitted` has made fit."""
+    """Return the stream of a recipe that :func:`_fitted` has made fit."""
     stream = StreamSpec.from_dict({**spec, "recipe": recipe})
     return StreamSpec.from_dict({**spec, "recipe": _fitted(catalogue, stream)})
 
 
 def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
-    """The recipe, with clips as long and crops as large as the videos admit, if they admit less."""
+    """Return the recipe, with shorter clips or smaller crops if the videos admit no others."""
     recipe = stream.recipe
     while True:
         table = SequenceTable(catalogue.videos, catalogue.rows, stream)

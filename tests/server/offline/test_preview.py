@@ -97,7 +97,7 @@ def test_the_command_compares_recipes_on_one_clip(
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--out", "p.bmp"], "--out p.bmp: give a name that ends in .png, .mp4, .gif, .html"),
+        (["--out", "p.bmp"], "--out p.bmp: unknown ending; give a name that ends in .png, .mp4, .gif, .html"),
         (["--out", "p.png", "--seeds", "0"], "--seeds 0: give 1 to 32"),
         (["--out", "p.png", "--moments", "99"], "--moments 99: give 1 to 32"),
         (["--out", "nowhere/p.png"], "--out nowhere/p.png: there is no folder nowhere"),
@@ -125,7 +125,7 @@ def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
 
 
 def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("v2v_server.offline.preview._TOLD_SECONDS", 0.0)
+    monkeypatch.setattr("v2v_server.offline.preview._REPORT_SECONDS", 0.0)
     said: list[str] = []
     shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
     preview(
