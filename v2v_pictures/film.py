@@ -1,4 +1,4 @@
-"""Cameras as a film: frame, events bin by bin, flow, and where in the clip the film is."""
+"""Cameras as a film: the whole picture, then each camera's frame, events bin by bin, flow and place in the clip."""
 
 from __future__ import annotations
 
@@ -17,28 +17,54 @@ _LEAST_WIDTH_PX = 620
 FRAMES_PER_SECOND = 20.0
 
 
-def draw_film(cameras: Sequence[Camera], title: str, *, tile_px: int = 256) -> Iterator[Image]:
+def draw_film(
+    cameras: Sequence[Camera], title: str, *, tile_px: int = 256, whole: Camera | None = None
+) -> Iterator[Image]:
     """Draw one picture for each bin.
 
     Args:
         cameras: at least one, all with equally many voxel grids and bins, all or none with flow.
         title: of the film.
         tile_px: side of a panel.
+        whole: a camera that sees the whole picture, as long as the others, to show first; None leaves it out.
 
     Yields:
         [height, width, 3] uint8 RGB, all of one size.
     """
-    scale = Scale.of(cameras)
+    scale = Scale.of(cameras if whole is None else [whole, *cameras])
     columns = 2 + (cameras[0].flow is not None)
     width = max(2 * MARGIN_PX + columns * (tile_px + GAP_PX) - GAP_PX, 2 * MARGIN_PX + _LEAST_WIDTH_PX)
     block = _CAMERA_PX + _NAMES_PX + tile_px + GAP_PX + LABEL_PX + _STRIP_PX + TICKS_PX + _BETWEEN_PX
     grids, bins = cameras[0].voxels.shape[:2]
+    first = _TITLE_PX
+    if whole is not None:
+        first += _NAMES_PX + _whole_size(whole, width, tile_px)[1] + _BETWEEN_PX
     for number in range(grids * bins):
-        page = Canvas(width, _TITLE_PX + len(cameras) * block)
+        page = Canvas(width, first + len(cameras) * block)
         page.title(MARGIN_PX, 16, title)
+        if whole is not None:
+            _draw_whole(page, whole, number, scale, tile_px)
         for place, camera in enumerate(cameras):
-            _draw_camera(page, camera, place, _TITLE_PX + place * block, number, scale, tile_px)
+            _draw_camera(page, camera, place, first + place * block, number, scale, tile_px)
         yield page.image()
+
+
+def _whole_size(whole: Camera, page_px: int, tile_px: int) -> tuple[int, int]:
+    """Width and height of a panel of the whole picture, px: two beside each other."""
+    height, width = whole.frames.shape[1:]
+    scale = min((page_px - 2 * MARGIN_PX - GAP_PX) / 2 / width, 1.25 * tile_px / height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _draw_whole(page: Canvas, whole: Camera, number: int, scale: Scale, tile_px: int) -> None:
+    """Draw the whole picture at one bin of the clip."""
+    grid, bin_ = divmod(min(number, len(whole.paused) - 1), whole.voxels.shape[1])
+    width, height = _whole_size(whole, page.width_px, tile_px)
+    left, top = (MARGIN_PX, MARGIN_PX + width + GAP_PX), _TITLE_PX
+    page.text(left[0], top, "The whole picture", size=canvas.HEADING_PT)
+    page.text(left[1], top, f"its events: {whole.title}", size=canvas.HEADING_PT)
+    page.panel(left[0], top + _NAMES_PX, draw_grey(whole.frames[grid]), width, height)
+    page.panel(left[1], top + _NAMES_PX, draw_events(whole.voxels[grid, bin_], scale.full), width, height)
 
 
 def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int, scale: Scale, tile_px: int) -> None:

@@ -367,6 +367,17 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert busiest.index(max(busiest)) == 3
 
 
+def test_a_film_begins_with_the_whole_picture() -> None:
+    quiet = camera(np.zeros((3, 2, 16, 16), np.int8))
+    voxels = np.zeros((3, 2, 30, 40), np.int8)
+    voxels[2, 0] = 1
+    film = list(draw_film([quiet], "t", tile_px=32, whole=camera(voxels)))
+    assert len(film) == 6
+    red = [has(picture, BRIGHTER) for picture in film]
+    assert red.index(max(red)) == 4
+    assert film[0].shape[0] > next(draw_film([quiet], "t", tile_px=32)).shape[0]
+
+
 def test_nothing_at_all_is_drawn_without_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

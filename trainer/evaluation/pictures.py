@@ -1,4 +1,4 @@
-"""What a network sees, what it makes of it, and what the camera saw.
+"""Draw a network's input, its reconstruction and the camera's picture side by side.
 
 One line of panels for each window, with headings above and a legend below. Panels from left to right: the events of
 the window (positive red, negative blue on white), the reconstruction, the picture of the camera.
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from trainer.evaluation.reconstruct import Step
-from trainer.pictures import EVENTS, GAP_PX, Image, draw_events, draw_grey, headed
+from trainer.pictures import EVENTS, GAP_PX, Image, add_header, draw_events, draw_grey
 from v2v_pictures import colours
 from v2v_pictures.canvas import SOFT, Canvas
 
@@ -23,12 +23,12 @@ _LEGEND_PX, _LEGEND_WIDTH_PX, _RAMP_PX = 96, 560, 120
 
 
 def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) -> Image:
-    """The panels side by side with a line of text below.
+    """Draw the panels side by side, with a line of text below each.
 
     Args:
-        step: to draw.
-        origin_seconds: what times in the text count from.
-        with_camera: draw the third panel, white where there is no picture yet; False for recordings without pictures.
+        origin_seconds: origin of the times in the text.
+        with_camera: whether to draw the third panel, white before the first picture; False for recordings without
+            pictures.
     """
     height, width = step.prediction.shape
     camera = np.ones((height, width)) if step.camera is None else step.camera / 255
@@ -47,8 +47,8 @@ def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) ->
     return np.hstack(tiles)
 
 
-def chosen_steps(count: int, rows: int) -> frozenset[int]:
-    """``rows`` of ``count`` steps, evenly spaced; the last one among them, the first (the network starts blind) not."""
+def choose_steps(count: int, rows: int) -> frozenset[int]:
+    """Choose ``rows`` of ``count`` evenly spaced steps: with the last, without the first (memory is empty there)."""
     rows = min(rows, count)
     return frozenset(int(step) for step in np.linspace(count / rows, count, rows).round() - 1)
 
@@ -66,7 +66,7 @@ def draw_recording(rows: Sequence[Image], name: str, windows_seconds: Sequence[f
         [height, width, 3] uint8.
     """
     panels = (EVENTS, "reconstruction", "camera")[: 3 if with_camera else 2]
-    sheet = headed(np.vstack(rows), panels, name, time_runs_down=True)
+    sheet = add_header(np.vstack(rows), panels, name, time_runs_down=True)
     legend = Canvas(max(sheet.shape[1], _LEGEND_WIDTH_PX), _LEGEND_PX)
     ramp = np.linspace(0.0, 1.0, _RAMP_PX)[None].repeat(14, axis=0)
     for y, image, text in (

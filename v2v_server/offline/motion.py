@@ -19,10 +19,10 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.cloud.copies import lent
+from v2v_server.cloud.copies import open_local
 from v2v_server.flow import view_part
 from v2v_server.offline.remake import RemadeSample, Remaker
-from v2v_server.schedule.sequences import Sequence
+from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.draw import draw
 from v2v_server.store.format import is_store_file
 from v2v_server.store.reader import StoreFile
@@ -30,7 +30,7 @@ from v2v_server.system.opencv import cv2
 from v2v_server.video.decode import DecodedClip, stream_luma
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
-from v2v_server.worker.produce import Decoded, draft_of, make_sample
+from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 
 LONGEST_SIDE_PX = 384
 """The whole picture is simulated at this size: a clip of 201 frames of 1920 x 1080 would take 400 MiB."""
@@ -56,19 +56,19 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
     Returns:
         [lead voxels + T, bins, H, W], signed event counts.
     """
-    draft, clip, lease = made.decoded.draft, made.decoded.clip, made.lease
-    if draft.flow is not None:
-        frames = view_part(clip.frames, draft.params, draft.spec.recipe, draft.flow.margin_px)
+    plan, clip, lease = made.decoded.plan, made.decoded.clip, made.lease
+    if plan.flow is not None:
+        frames = view_part(clip.frames, plan.params, plan.spec.recipe, plan.flow.margin_px)
         clip = replace(clip, frames=frames)
-    spec = StreamSpec.from_dict({**draft.spec.to_dict(), "recipe": noise_free(draft.spec.recipe)})
+    spec = StreamSpec.from_dict({**plan.spec.to_dict(), "recipe": noise_free(plan.spec.recipe)})
     lease = replace(lease, spec=spec.canonical(), spec_digest=spec.digest, arrays=("voxels",))
     params = replace(
-        draft.params,
+        plan.params,
         noise_sigma=0.0,
         hot_pixel_count=0,
-        effects={name: value for name, value in draft.params.effects.items() if name not in _NOISE},
+        effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
     )
-    quiet = Decoded(replace(draft, spec=spec, params=params, flow=None), clip)
+    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), clip)
     return make_sample(lease, quiet).arrays["voxels"]
 
 
@@ -110,7 +110,7 @@ class WholePictures:
         self._catalogue, self._stream = catalogue, stream
         self._made: dict[tuple[str, int], Camera] = {}
 
-    def camera(self, sequence: Sequence) -> Camera:
+    def camera(self, sequence: VideoSequence) -> Camera:
         """Return the whole picture of a sequence as a camera sees it that has no noise.
 
         Raises:
@@ -121,7 +121,7 @@ class WholePictures:
             self._made[key] = self._simulated(sequence)
         return self._made[key]
 
-    def _simulated(self, sequence: Sequence) -> Camera:
+    def _simulated(self, sequence: VideoSequence) -> Camera:
         catalogue, video = self._catalogue, sequence.video
         top, bottom = catalogue.rows.bounds(video.height_px)
         scale = min(1.0, LONGEST_SIDE_PX / max(bottom - top, video.width_px))
@@ -140,17 +140,17 @@ class WholePictures:
         lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
         frames = np.empty((recipe.steps + 1, height, width), np.uint8)
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
-        with lent(catalogue.root, video.id, video.fingerprint) as path:
+        with open_local(catalogue.root, video.id, video.fingerprint) as path:
             window = (top, 0, bottom - top, video.width_px)
             taken = _pictures(path, index, sequence.start_frame, recipe.frames_needed, window)
             for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):
                 cv2.resize(picture, (width, height), frame, interpolation=cv2.INTER_AREA)
         seconds = index.seconds(sequence.start_frame, recipe.frames_needed)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False)
-        sample = make_sample(lease, Decoded(draft_of(lease, 0), clip))
+        sample = make_sample(lease, Decoded(plan_sample(lease, 0), clip))
         return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe.frames_per_bin)
 
-    def estimate(self, sequence: Sequence, seed: int) -> CropEstimate:
+    def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
         """Estimate what the camera of a seed sees of a sequence.
 
         Raises:

@@ -26,11 +26,10 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.cloud.copies import lent
+from v2v_server.cloud.copies import open_local
 from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
-from v2v_server.schedule.sequences import Sequence as Clip
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
 
@@ -131,9 +130,9 @@ def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> t
     return [dataclasses.replace(shot, seed=seeds[shot.seed]) for shot in shots], note
 
 
-def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> Clip:
+def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
     (video,) = (video for video in catalogue.videos if video.id == provenance.video)
-    return Clip(video, provenance.start_frame)
+    return VideoSequence(video, provenance.start_frame)
 
 
 class _Progress:
@@ -160,7 +159,7 @@ def _content(
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
     progress, film = _Progress(say, "pictures of the film", grids * bins), []
-    for picture in draw_film(cameras, title):
+    for picture in draw_film(cameras, title, whole=whole):
         film.append(picture)
         progress.step()
     if kind == ".mp4":
@@ -198,7 +197,7 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
-    with lent(catalogue.root, provenance.video, provenance.fingerprint) as path:
+    with open_local(catalogue.root, provenance.video, provenance.fingerprint) as path:
         (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
     picture: npt.NDArray[np.uint8] = clip.frames[0]
     return picture

@@ -26,7 +26,7 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import Sequence, SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
@@ -78,7 +78,7 @@ class Remaker:
         self._schedule = Schedule.of(table, spec)
         self.count = self._schedule.count
 
-    def sequence(self, seed: int, epoch: int, index: int) -> Sequence:
+    def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:
         """Return the sequence that the sample of this name is made from if it can be read."""
         return self._schedule.candidate(seed, epoch, index, 0)
 
@@ -212,7 +212,7 @@ def simulate_to_file(
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
-    quarantine.verdicts(snapshot)  # before any work: whether there is such a snapshot
+    quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
         print(f"cannot be used: {refusal}")
     sample = remake(
