@@ -144,7 +144,7 @@ class Camera:
         if self._in_grids(self.quiet, grids) / len(grids) < _FEWEST_EVENTS:
             why = "nothing moves here" if self._is_still(grids) else "no motion reaches the thresholds"
             return f"{why}: all events are noise" if share > _MOSTLY else why
-        return f"mostly noise: {share:.0%} of the events shown" if share > _MOSTLY else ""
+        return f"mostly noise: {share:.0%} of the events" if share > _MOSTLY else ""
 
     def _in_grids(self, rates: npt.NDArray[np.float64], grids: Sequence[int]) -> float:
         return float(rates.sum(axis=0).reshape(len(self.voxels), -1)[list(grids)].sum())

@@ -73,7 +73,10 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     width = page.width_px - 2 * MARGIN_PX
     x = page.text(MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)
     page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
-    page.text(MARGIN_PX, top + 27, canvas.shortened(camera.describe(), width), colour=canvas.SOFT)
+    x = float(MARGIN_PX)
+    if warning := camera.warning(range(len(camera.voxels))):
+        x = page.text(x, top + 27, warning) + 18
+    page.text(x, top + 27, canvas.shortened(camera.describe(), width + MARGIN_PX - x), colour=canvas.SOFT)
     left = [MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
     top += _CAMERA_PX
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)

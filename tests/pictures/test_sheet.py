@@ -259,7 +259,7 @@ def test_the_noise_share_is_that_of_the_voxel_grids_that_are_shown() -> None:
     assert shown.noise_share([1]) == 0.75
     assert shown.noise_share([0, 1, 2]) == pytest.approx(1.75 / 3)
     assert shown.warning([0]) == ""
-    assert shown.warning([1]) == "mostly noise: 75% of the events shown"
+    assert shown.warning([1]) == "mostly noise: 75% of the events"
     assert shown.warning([0, 2]) == ""
     assert camera(loud).noise_share([1]) is None
     assert camera(loud).warning([1]) == ""
@@ -365,6 +365,21 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert len({picture.shape for picture in film}) == 1
     busiest = [has(picture, BRIGHTER) for picture in film]
     assert busiest.index(max(busiest)) == 3
+
+
+def test_a_camera_of_mostly_noise_says_so_in_a_film_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    loud, quiet = np.ones((3, 2, 16, 16), np.int8), np.zeros((3, 2, 16, 16), np.int8)
+    quiet[:, :, :4] = 1
+    written: list[str] = []
+    write = Canvas.text
+
+    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
+        written.append(text)
+        return write(page, x, y, text, **style)
+
+    monkeypatch.setattr(Canvas, "text", listen)
+    next(draw_film([without_noise(camera(loud), quiet)], "t"))
+    assert "mostly noise: 75% of the events" in written
 
 
 def test_a_film_begins_with_the_whole_picture() -> None:
