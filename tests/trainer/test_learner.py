@@ -17,6 +17,7 @@ from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import Work
+from trainer.weights import SHIPPED, load_network
 from v2v_protocol.errors import UsageError
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -37,6 +38,14 @@ def step(trained: Learner) -> None:
     trained.optimizer.zero_grad()
     (prediction - 0.5).square().mean().backward()
     trained.optimizer.step()
+
+
+def test_a_training_begins_with_the_shipped_weights() -> None:
+    """By their name, which means the same on every host and in every folder."""
+    network = build(obeying_weights(load_config("finetune-cpu")), ALONE).network
+    shipped, _ = load_network(SHIPPED)
+    for name, tensor in shipped.state_dict().items():
+        assert torch.equal(network.state_dict()[name], tensor)
 
 
 @pytest.mark.parametrize("fused", [False, True], ids=["to a CPU", "to a GPU"])

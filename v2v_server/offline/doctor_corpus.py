@@ -1,4 +1,4 @@
-"""A look at a corpus for `v2v-doctor`: what can be used, what cannot and why, and whether it suits a recipe."""
+"""The corpus check of `v2v-doctor`: which videos can be used, why others cannot, and whether they suit a recipe."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Line = tuple[str, str, str, str]
 
 
 def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, shown: int) -> Iterator[Line]:
-    """Lines of the report.
+    """Check a corpus and yield lines of the report.
 
     Args:
         videos, rows, cache_dir: as of :func:`v2v_server.catalogue.catalogue.open_catalogue`.
         recipe: name of a preset, or a YAML file.
-        shown: of many refusals of a kind, how many to name.
+        shown: how many refusals of a kind to name.
 
     Raises:
-        UsageError: the recipe or the rows say nothing.
+        UsageError: wrong recipe or rows.
     """
     spec = StreamSpec.from_dict({"recipe": recipe_setting(recipe, [])})
     Rows.parse(rows)  # before any work
@@ -54,7 +54,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         few = "; ".join(map(str, catalogue.refusals[:shown]))
         more = len(catalogue.refusals) - shown
         text = f"{len(catalogue.refusals)} files cannot be used: {few}" + (f"; and {more} more" if more > 0 else "")
-        change = "they are passed over: repair those that matter, or leave them out of --videos"
+        change = "they are skipped: repair them, or leave them out of --videos"
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
         yield "note", "corpus", text, change
@@ -76,14 +76,14 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         began = time.perf_counter()
         remaker.sample(0, 0, min(1, remaker.count - 1))
     except V2VError as error:
-        yield "bad", "corpus", f"a sample could not be made: {error}", "see what v2v-simulate says of that video"
+        yield "bad", "corpus", f"a sample could not be made: {error}", "run v2v-simulate on that video"
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
 
 
 def _remedy(longest: int, wanted: int) -> str:
-    """What to do about videos that are too short; empty where no clip length admits them.
+    """Say what to do about videos that are too short; "" if no clip length admits them.
 
     Args:
         longest: ``voxels_per_clip`` that admits all of them; 0: none does.

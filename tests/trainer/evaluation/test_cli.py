@@ -26,6 +26,8 @@ from trainer.evaluation.reconstruct import Step
 from trainer.models import FireNet
 
 DAVIS = WEIGHTS.parent / "events" / "davis346_aestream.aedat4"
+TOP_PX, LEFT_PX = 82, 44
+"""Headings and the arrow of time, beside the panels of a picture."""
 
 
 @pytest.fixture
@@ -199,7 +201,8 @@ def test_pictures_and_video(tmp_path: Path, weights: Path) -> None:
     random_recording(tmp_path / "own" / "a.h5", size=(36, 41), images=6)
     evaluate("--weights", weights, "--data", tmp_path / "own", "--out", tmp_path / "out", "--rows", 2, "--video")
     picture = cv2.imread(str(tmp_path / "out" / "own" / "a.png"))
-    assert picture.shape == (2 * (36 + 18), 3 * (41 + 4), 3)
+    rows = picture[TOP_PX : TOP_PX + 2 * (36 + 18), LEFT_PX : LEFT_PX + 3 * (41 + 4)]
+    assert picture.shape[0] > TOP_PX + len(rows)  # headings above, a legend below
     video = cv2.VideoCapture(str(tmp_path / "out" / "own" / "a.mp4"))
     frames = []
     while (read := video.read())[0]:
@@ -209,7 +212,7 @@ def test_pictures_and_video(tmp_path: Path, weights: Path) -> None:
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(50, rel=0.01)
     video.release()
     # The last row of the picture is the last frame of the video, up to its compression.
-    difference = picture[54:, :135].astype(int) - frames[-1][:, :135]
+    difference = rows[54:].astype(int) - frames[-1][:, :135]
     assert np.abs(difference).mean() < 20
 
 
@@ -218,7 +221,8 @@ def test_recordings_without_pictures_need_a_rate(tmp_path: Path, weights: Path) 
     convert_cli.main([str(tmp_path / "own.raw"), "--out", str(tmp_path / "h5")])
     arguments = ("--fps", 100, "--rows", 1, "--out", tmp_path)
     (record, _) = evaluate("--weights", weights, "--data", tmp_path / "h5" / "own.h5", *arguments)
-    assert cv2.imread(str(tmp_path / "own" / "own.png")).shape[1] == 2 * (24 + 4)
+    picture = cv2.imread(str(tmp_path / "own" / "own.png"))
+    assert (picture[TOP_PX : TOP_PX + 24, LEFT_PX + 2 * (24 + 4) :] == 255).all()  # two panels
     assert (record["frames"], record["reconstruction_hz"]) == (3, 100)
     assert "mse" not in record
 
@@ -290,7 +294,8 @@ def test_published_firenet_shows_the_scene_of_a_real_recording(tmp_path: Path, p
         "--data", tmp_path / "davis346_aestream.h5", "--out", tmp_path / "out", "--rows", 1,
     )  # fmt: skip
     drawn = cv2.imread(str(tmp_path / "out/davis346_aestream/davis346_aestream.png"), cv2.IMREAD_GRAYSCALE)
-    reconstruction, camera = drawn[:260, 350:696].astype(float), drawn[:260, 700:1046].astype(float)
+    drawn = drawn[TOP_PX:, LEFT_PX:].astype(float)
+    reconstruction, camera = drawn[:260, 350:696], drawn[:260, 700:1046]
     panel, board = (slice(40, 125), slice(85, 170)), (slice(40, 125), slice(200, 290))
     lamps = camera > 250
     for picture in (reconstruction, camera):

@@ -31,7 +31,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
 }  # fmt: skip
-QUICK = ("e2vid", "firenet-cpu", "tiny-cpu")
+QUICK = ("e2vid", "finetune-cpu", "firenet-cpu", "tiny-cpu")
 """RAFT and E-RAFT have no reduced size, and most kinds of E2VID differ in a number."""
 SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in shipped()]
 SIDES_PX = {"alex": 33}
@@ -74,7 +74,7 @@ def reduced(name: str, weights: Path) -> TrainConfig:
     settings = {
         "stream.recipe": {"preset": preset, **recipe}, "stream.batch_size": 2, "stream.loader_workers": 0,
         "stream.spec": {},
-        "network.options": NETWORKS[config.network.name], "compute.device": "cpu",
+        "network.options": NETWORKS[config.network.name], "network.weights": "", "compute.device": "cpu",
     }  # fmt: skip
     loss = config.loss
     if getattr(loss, "lpips_weight", 0):
