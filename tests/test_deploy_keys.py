@@ -103,7 +103,7 @@ def test_a_server_and_a_worker_use_the_keys_in_their_pods(tmp_path: Path, monkey
                 mounted(where, found[by_volume[mount["name"]]])
             else:
                 where.mkdir(parents=True, exist_ok=True)
-        with pytest.raises(KeyRefused, match="others may have it"):  # why there is a copy
+        with pytest.raises(KeyRefused, match="other users may have read it"):  # why there is a copy
             read_key(place / "secret" / key)
         here = [str(place / part.removeprefix("/")) if part.startswith("/") else part for part in init["command"]]
         subprocess.run(here, check=True)

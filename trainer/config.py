@@ -32,11 +32,7 @@ class NetworkConfig:
     Attributes:
         name: see :data:`trainer.models.NETWORKS`.
         options: arguments of its constructor; ``bins`` comes from the recipe.
-<<<<<<< HEAD
-        weights: checkpoint to start from; empty: random weights.
-=======
         weights: checkpoint to start from; ``shipped``: the network that comes with this package; empty: random weights.
->>>>>>> people
     """
 
     name: str = chosen("e2vid", NETWORKS)

@@ -117,8 +117,8 @@ class RemoteError(V2VError):
 
     def __init__(self, code: str, text: str | None = None) -> None:
         if text is None:
-            # PyTorch builds an exception of a loader worker again from one text: the trace of the worker, at whose end
-            # the message stands.
+            # PyTorch rebuilds an exception of a loader worker from one text: the worker's traceback, which ends with
+            # the message.
             text, code = _taken_apart(code)
         self.code = code
         self.text = text

@@ -79,87 +79,6 @@ def test_grey_is_shown_as_it_is() -> None:
     assert draw_grey(np.array([[-1.0, 2.0]])).tolist() == [[[0, 0, 0], [255, 255, 255]]]
 
 
-<<<<<<< HEAD
-def test_rates_are_events_a_pixel_of_each_sign() -> None:
-    voxels = np.zeros((2, 3, 4, 5), np.int8)
-    voxels[1, 2, 0, :] = 2
-    voxels[0, 1, 0, 0] = -128
-    rates = camera(voxels).rates
-    assert rates.shape == (2, 6)
-    assert rates[0].tolist() == [0, 0, 0, 0, 0, 0.5]
-    assert rates[1].tolist() == [0, 6.4, 0, 0, 0, 0]
-
-
-@given(st.data())
-def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> None:
-    """Compare with the definition, frame by frame, from the draw's pauses."""
-    grids, bins, per_bin, lead = (data.draw(st.integers(low, 4)) for low in (1, 1, 1, 0))
-    steps = (grids + lead) * bins * per_bin
-    still = data.draw(st.lists(st.booleans(), min_size=steps, max_size=steps))
-    edges = np.flatnonzero(np.diff([False, *still, False]))
-    pauses = tuple((int(start) + 1, int(end - start)) for start, end in zip(edges[::2], edges[1::2], strict=True))
-    shown = dataclasses.replace(
-        camera(np.zeros((grids + lead, bins, 2, 2), np.int8), pauses=pauses, lead=lead), frames_per_bin=per_bin
-    )
-    source = shown.provenance.params.source_index(steps)
-    expected = [
-        all(source[step + 1] == source[step] for step in range(first, first + per_bin))
-        for first in range(lead * bins * per_bin, steps, per_bin)
-    ]
-    assert shown.paused.tolist() == expected
-
-
-def test_moments_are_active_and_not_paused() -> None:
-    voxels = np.ones((20, 5, 4, 4), np.int8)
-    voxels[0] = 100  # the beginning, when every pixel waits for its first event
-    voxels[7], voxels[12] = 50, 40
-    chosen = camera(voxels, pauses=((7 * 5 + 1, 5),)).moments(1)
-    assert chosen == [12]
-    assert camera(voxels).moments(2) == [7, 12]
-    assert camera(voxels[:1]).moments(3) == [0]
-
-
-def test_a_half_paused_moment_is_preferred_to_pure_noise() -> None:
-    voxels = np.zeros((20, 5, 4, 4), np.int8)
-    voxels[:, :, 0, 0] = 1
-    voxels[9] = 30
-    assert camera(voxels, pauses=((9 * 5 + 1, 3), (15 * 5 + 1, 10))).moments(1) == [9]
-    voxels[12] = 30
-    assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
-
-
-def test_a_moment_never_spans_a_shot_boundary() -> None:
-    voxels = np.zeros((20, 5, 4, 4), np.int8)
-    voxels[7, 4], voxels[12] = 100, 3
-    assert camera(voxels).moments(1) == [12]
-    assert camera(voxels[:, 4:]).moments(1) == [7]  # of one bin each: nothing else is known
-
-
-@given(st.integers(1, 30), st.integers(1, 8))
-def test_moments_are_in_order_and_different(grids: int, count: int) -> None:
-    chosen = camera(np.ones((grids, 2, 2, 2), np.int8)).moments(count)
-    assert chosen == sorted(set(chosen))
-    assert 1 <= len(chosen) <= count
-    assert all(0 <= moment < grids for moment in chosen)
-
-
-def test_lead_frames_and_voxels_stand_in_front() -> None:
-    frames = (10 * np.arange(5, dtype=np.uint8))[:, None, None, None] * np.ones((1, 1, 4, 4), np.uint8)
-    voxels = np.arange(5, dtype=np.int8)[:, None, None, None] * np.ones((1, 2, 4, 4), np.int8)
-    for arrays in ({"frames": frames, "voxels": voxels[1:]}, {"frames": frames[1:], "voxels": voxels}):
-        shown = Camera.of(arrays, PROVENANCE, "")
-        assert shown.frames[:, 0, 0].tolist() == [10, 20, 30, 40]
-        assert shown.voxels[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("name", ["voxels", "frames"])
-def test_both_arrays_are_needed(name: str) -> None:
-    with pytest.raises(UsageError, match="voxels,frames"):
-        Camera.of({name: np.zeros((2, 1, 8, 8), np.uint8)}, PROVENANCE, "")
-
-
-=======
->>>>>>> people
 def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
     voxels = np.zeros((10, 3, 32, 32), np.int8)
     voxels[5, 0], voxels[5, 2] = 4, -4
@@ -221,22 +140,6 @@ def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.Monk
     assert {text for text in written if text.startswith("full bar")} == {"full bar: 1 or more a pixel and bin"}
 
 
-<<<<<<< HEAD
-def test_a_drawn_dark_floor_is_described() -> None:
-    """It is the only difference between the presets `sensor` and `paper`."""
-    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
-    params = dataclasses.replace(PARAMS, log_eps=0.125)
-    floor = dataclasses.replace(shown, provenance=dataclasses.replace(PROVENANCE, params=params))
-    assert "dark floor" not in shown.describe()
-    assert "dark floor 0.125" in floor.describe()
-
-
-def test_a_camera_of_mostly_noise_says_so() -> None:
-    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
-    assert "mostly noise" not in shown.describe()
-    assert "mostly noise: 83% of the events" in dataclasses.replace(shown, noise_share=0.83).describe()
-    assert "mostly noise" not in dataclasses.replace(shown, noise_share=0.4).describe()
-=======
 def test_bars_of_noise_are_pale() -> None:
     loud, quiet = np.ones((4, 2, 8, 8), np.int8), np.zeros((4, 2, 8, 8), np.int8)
     quiet[:2] = 1
@@ -246,7 +149,6 @@ def test_bars_of_noise_are_pale() -> None:
     assert tuple(image[60]) == BRIGHTER
     assert tuple(image[440]) not in (BRIGHTER, WHITE)
     assert image[440, 0] > image[440, 1]  # reddish
->>>>>>> people
 
 
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:
@@ -321,9 +223,6 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert busiest.index(max(busiest)) == 3
 
 
-<<<<<<< HEAD
-def test_empty_samples_are_drawn_without_warnings() -> None:
-=======
 def test_a_camera_of_mostly_noise_says_so_in_a_film_too(monkeypatch: pytest.MonkeyPatch) -> None:
     loud, quiet = np.ones((3, 2, 16, 16), np.int8), np.zeros((3, 2, 16, 16), np.int8)
     quiet[:, :, :4] = 1
@@ -351,7 +250,6 @@ def test_a_film_begins_with_the_whole_picture() -> None:
 
 
 def test_nothing_at_all_is_drawn_without_a_warning() -> None:
->>>>>>> people
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")

@@ -120,7 +120,7 @@ def test_a_record_that_cannot_be_written_is_said_and_the_server_goes_on(
     dispatcher = Scripted([RECORD])
     served(dispatcher, tmp_path)
     assert dispatcher.told == [("recorded", RECORD, [])]
-    assert "v.mp4 from frame 0: crash; it is passed over this once and comes again" in capsys.readouterr().err
+    assert "v.mp4 from frame 0: crash; the sequence is skipped once and will be tried again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("found", [True, False])
@@ -135,7 +135,7 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
     assert dispatcher.told == [("looked for", missing, found)] * 2
     assert cast(Any, server)._catalogue.stale == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
-    assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
+    assert said.count("worker w failed on a.mp4, which is on this host as catalogued: cannot be read") == found
 
 
 def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,7 +146,7 @@ def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.Cap
         dispatcher.blocked_reason = reason
         now[0] += seconds
         server.turn(0.0)
-    assert capsys.readouterr().err.count("no sample is begun: locked") == 1
+    assert capsys.readouterr().err.count("no samples are started: locked") == 1
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.Captu
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == [("lost", b"toy1", Loss(Cause.CRASHED, "died"))]
     assert supervisor.workers == [b"toy2", b"toy3"]
-    assert "worker toy1 died; its work is given to others" in capsys.readouterr().err
+    assert "worker toy1 died; its leases go to other workers" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("watched", [True, False])

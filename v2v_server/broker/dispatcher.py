@@ -350,7 +350,7 @@ class Dispatcher:
 
         Args:
             missing: the action.
-            found: whether this host has the video as it was catalogued.
+            found: whether this host has the video as catalogued.
             now: monotonic time, seconds.
         """
         if not found:

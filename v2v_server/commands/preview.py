@@ -16,10 +16,10 @@ _MOST_CAMERAS = 32
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-preview", "VIDEO|DIR --out FILE [flags]",
-        "Show what a recipe makes of your videos: frames, events, flow, activity.",
+        "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
             "v2v-preview clips/ --out sheet.png --recipe davis346",
             "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="seed of the first camera; the others count on (default: seeds whose crops show motion)",
     )  # fmt: skip
     cameras.add_argument(
-        "--compare", nargs="+", metavar="NAME", help="the same clip under these recipes instead, one camera each"
+        "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
     )
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
@@ -43,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     out = parser.group("Output")
     out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
-    out.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
+    out.add_argument(
+        "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
+    )
     out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
 

@@ -15,7 +15,7 @@ from v2v_server.system.log import Log
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-serve", "--videos DIR [flags]", "Decode videos, simulate event voxels, stream samples to trainers.",
         [
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
-    # Without --recipe the fields of --set are changed in what the file says.
+    # Without --recipe, --set changes fields of the file's recipe.
     settings = arguments.set if arguments.recipe is None else []
     if arguments.recipe is not None:
         flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
@@ -41,7 +41,7 @@ def _run(arguments: argparse.Namespace) -> None:
     try:
         serve(config)
     except V2VError as error:
-        if config.log_format == "json":  # besides the last line, which every command has for people
+        if config.log_format == "json":  # in addition to the last line, which every command prints for people
             Log(is_json=True).say(str(error), "error")
         raise
 

@@ -1,4 +1,4 @@
-"""Lines for whoever runs a service: plain text for people, or one JSON object a line for what collects logs."""
+"""Log lines of a service: plain text for people, or one JSON object per line for log collectors."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ Level = Literal["info", "warning", "error"]
 
 
 def write(stream: TextIO, text: str) -> None:
-    """Say something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
-    and there is nowhere left to say so."""
+    """Write to a log stream, ignoring errors. A full disk or a closed terminal must not end a service, and there is no
+    other place to report it.
+    """
     with suppress(OSError):
         stream.write(text)
         stream.flush()
 
 
 class Log:
-    """Writes to standard error.
+    """Log on standard error.
 
     Args:
-        is_json: one JSON object a line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and what else is known of
-            what the line is about.
-        wall_clock: gives the time.
+        is_json: one JSON object per line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and fields that describe
+            the subject of the line.
+        wall_clock: returns the time.
     """
 
     def __init__(self, *, is_json: bool = False, wall_clock: Callable[[], str] | None = None) -> None:
@@ -35,12 +36,12 @@ class Log:
         self._wall_clock = wall_clock or _utc_now
 
     def say(self, text: str, level: Level = "info", **about: Any) -> None:
-        """One line.
+        """Write one line.
 
         Args:
             text: for people.
-            level: how much it matters.
-            about: plain values for programs; left out of plain text, which says the same in words.
+            level: severity.
+            about: plain values for programs; left out of plain text, which states the same in words.
         """
         if self.is_json:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)

@@ -269,7 +269,7 @@ def test_a_file_that_was_replaced_gives_no_number_twice(tmp_path: Path, keep: in
     file.unlink()
     write(file, *[verdict("a.mp4")][:keep], verdict("other.mp4"))
     before = file.read_bytes()
-    with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, and not the 2 known here"):
+    with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, which do not start with the 2 lines read before"):
         write_entry(file, verdict("c.mp4"), known)
     assert file.read_bytes() == before
 

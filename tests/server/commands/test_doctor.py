@@ -1,4 +1,4 @@
-"""`v2v-doctor` finds what is in the way, says what to change, and its status tells."""
+"""`v2v-doctor` finds problems, says what to change, and reports them in its exit status."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_nothing_is_in_the_way_where_tests_run(capsys: pytest.CaptureFixture[str
     assert status == 0
     assert "is free" in said
     assert f"\n{BAD} " not in said
-    assert said.endswith("nothing is in the way\n")
+    assert said.endswith("no problems found\n")
 
 
 def test_a_port_that_is_taken_is_worth_a_note(capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,7 +111,7 @@ def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys
     status, said = told(capsys, "--port", str(free_port()))
     assert status == 0
     assert "torch" not in said
-    assert "nothing is in the way" in said
+    assert "no problems found" in said
 
 
 @pytest.mark.parametrize(("longest", "said"), [(0, ""), (1, "leave the short ones out"), (30, "voxels_per_clip=30")])

@@ -280,10 +280,10 @@ def test_refused_places(source: Path, prepared: tuple[Path, Report], tmp_path: P
     corpus.mkdir()
     shutil.copy(source / "b.mp4", corpus)
     for target in (corpus, corpus / "inside", tmp_path):
-        with pytest.raises(CorpusError, match="in one another"):
+        with pytest.raises(CorpusError, match="overlap; choose a destination outside the source"):
             run(corpus, target)
     (tmp_path / "alias").symlink_to(corpus)
-    with pytest.raises(CorpusError, match="in one another"):
+    with pytest.raises(CorpusError, match="overlap; choose a destination outside the source"):
         run(corpus, tmp_path / "alias" / "inside")
     assert sorted(path.name for path in corpus.rglob("*")) == ["b.mp4"]
     (tmp_path / "foreign").mkdir()
@@ -314,7 +314,7 @@ def test_one_video_may_be_prepared_in_its_own_folder(
     (films / "list.txt").write_text("b.mp4\n")
     for place, target in ((films / "b.mp4", films), (films / "b.mp4", tmp_path), (films / "list.txt", films / "more")):
         assert prepare_main([str(place), str(target), *more]) == 2
-        assert "in one another" in capsys.readouterr().err
+        assert "overlap; choose a destination outside the source" in capsys.readouterr().err
     (films / "list.txt").unlink()
     assert snapshot(films) == before
     with pytest.raises(CorpusError, match="prepared is a prepared folder"):  # and the whole is no corpus unnoticed
@@ -345,7 +345,7 @@ def test_other_settings_need_another_folder(source: Path, prepared: tuple[Path, 
     for encoding, rows in ((Encoding.of("h264", quality=20, gop=12), "top:0.54"), (H264, "full")):
         with pytest.raises(
             CorpusError,
-            match=r"was prepared with .*which its 4 prepared videos are not; choose another folder, or delete",
+            match=r"holds 4 videos prepared with .* is requested; choose another folder, or delete",
         ):
             run(source, prepared[0], encoding, rows)
 

@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Test which steps are drawn."""
-=======
 """Which steps are drawn, and what is written beside them."""
->>>>>>> people
 
 from __future__ import annotations
 
