@@ -27,7 +27,7 @@ from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
-from v2v_server.broker.worker_registry import REST_SECONDS
+from v2v_server.broker.worker_registry import REST_SECONDS, shown
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
@@ -229,8 +229,8 @@ class Server:
         now = self._clock()
         for arrival in arrivals:
             match arrival:
-                case FromWorker(identity, frames):
-                    self._carry_out(self._dispatcher.from_worker(identity, frames, now))
+                case FromWorker(identity, frames, user):
+                    self._carry_out(self._dispatcher.from_worker(identity, frames, now, user))
                 case FromConsumer(identity, frames, user):
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now, user))
                 case ConsumerGone(identity):
@@ -240,12 +240,12 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, withheld in self._supervisor.withheld(now).items():
-                self._dispatcher.worker_withheld(identity, withheld)
+            for name, withheld in self._supervisor.withheld(now).items():
+                self._dispatcher.worker_withheld(self._route(name), withheld)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
-                self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
+                self._carry_out(self._dispatcher.worker_lost(self._route(death.identity), death.loss, now))
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
@@ -285,7 +285,7 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
-                    if not self._transport.send(message) and not self._supervisor.watches(message.identity):
+                    if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case CutOff(identity):
                     self._transport.cut(identity)
@@ -303,12 +303,21 @@ class Server:
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """Ends the process of a worker that hangs, if it is one of ours."""
-        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
+        name = self._name(hopeless.identity)
+        loss = self._supervisor.give_up(name, hopeless.reason) or Loss(
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
-        name = hopeless.identity.decode(errors="replace")
-        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
+        text = f"worker {shown(name.decode())} {hopeless.reason}: {loss.text}; its work is given to others"
+        self._say(text, "warning")
         return loss
+
+    def _name(self, identity: bytes) -> bytes:
+        """Return the name by which the supervisor knows a worker; empty if it has not said hello."""
+        return self._dispatcher.registry.name_of(identity).encode()
+
+    def _route(self, name: bytes) -> bytes:
+        """Return the routing id of a worker of the supervisor; empty if it has not said hello."""
+        return self._dispatcher.registry.named(name.decode()) or b""
 
     def _record(self, record: Condemn) -> list[Verdict]:
         """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
@@ -345,7 +354,7 @@ class Server:
         now = time.monotonic()
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
-            name = missing.identity.decode(errors="replace")
+            name = shown(self._name(missing.identity).decode())
             is_local = not isinstance(self._catalogue.root, Copies)
             self._say(
                 f"worker {name} failed on {missing.video}, which "

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.messages import Result
+from v2v_protocol.messages import Result, WorkerHello
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.counters import WorkDone
 from v2v_server.broker.leases import LeaseBook
@@ -29,18 +29,24 @@ class Member:
     """A worker that said hello.
 
     Attributes:
+        name: as it says hello, and as its supervisor knows it.
         credit: leases it takes at a time.
         liveness: when it was last heard.
         host: where it says it is.
+        user: name of the key that its connection has; empty without keys, and for a worker of this host.
+        owner: digest of that and of the secret of its hello; empty without a secret.
         given_up: it hangs or is silent, and gets no more work.
         unreadable: what its host could not read last; empty since it has done anything.
         work: what its samples took that were waited for.
         memory_bytes: of its process when it last said so; 0: not known.
     """
 
+    name: str
     credit: int
     liveness: Liveness
     host: str = ""
+    user: str = ""
+    owner: bytes = b""
     given_up: bool = False
     unreadable: str = ""
     work: WorkDone = field(default_factory=WorkDone)
@@ -62,6 +68,7 @@ class Workers:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, Member] = {}
+        self._names: dict[str, bytes] = {}
         self._resting: dict[bytes, float] = {}  # until when
         # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
         self._changed: set[bytes] = set()
@@ -83,19 +90,32 @@ class Workers:
         """All of them, and what is known of each."""
         return self._workers
 
+    def name_of(self, identity: bytes) -> str:
+        """Return the name of a worker; empty if it has not said hello."""
+        worker = self._workers.get(identity)
+        return "" if worker is None else worker.name
+
+    def named(self, name: str) -> bytes | None:
+        """Return the routing id of the worker of that name; None if there is none."""
+        return self._names.get(name)
+
     def is_resting(self, identity: bytes) -> bool:
         """Whether it gets no work for a while."""
         return identity in self._resting
 
-    def add(self, identity: bytes, credit: int, now: float, host: str = "") -> None:
-        """A worker said hello."""
-        room = max(1, min(credit, MOST_WORKER_CREDIT))
-        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), shown(host))
+    def add(self, identity: bytes, hello: WorkerHello, now: float, user: str = "", owner: bytes = b"") -> None:
+        """Add a worker that said hello; none of that routing id or name is there."""
+        room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
+        liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
+        self._workers[identity] = Member(hello.name, room, liveness, shown(hello.host), user, owner)
+        self._names[hello.name] = identity
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
         """It is gone."""
-        self._workers.pop(identity, None)
+        worker = self._workers.pop(identity, None)
+        if worker is not None:
+            del self._names[worker.name]
         self._resting.pop(identity, None)
         self._changed.add(identity)
 

@@ -44,6 +44,7 @@ from v2v_server.worker.conversation import (
     Listen,
     Load,
     Make,
+    Reconnect,
     Say,
     Send,
     Spent,
@@ -64,7 +65,7 @@ LONGEST_LEASE_SECONDS = 3600.0
 """Of processor time, for one lease. The server gives up its own workers sooner, by the clock; one elsewhere would go on
 for ever."""
 MOST_NAME_BYTES = 200
-"""What an operator may call a worker; a routing identity has 255 at most."""
+"""What an operator may call a worker; with what is added to it a name has 255 at most."""
 _MORE = int(zmq.SNDMORE)
 """A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
 
@@ -77,7 +78,7 @@ class Worker:
     that quietly lacks samples.
 
     Args:
-        name: unique name, also its routing identity.
+        name: unique name.
         root: the corpus folder on this host, or the copies of what is in object storage.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
@@ -112,7 +113,7 @@ class Worker:
         self._handover_seconds = 0.0  # that no result has named yet
         self._memory_bytes, self._weigh_at = 0, -math.inf
         self._conversation = WorkerConversation(
-            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
+            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname(), secrets.token_bytes(32)),
             address,
             Tools(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
@@ -124,27 +125,39 @@ class Worker:
             ),
             is_watched=logbook is not None,
         )
+        self._address, self._key = address, key
+        self._handshakes = Handshakes(address, key, "worker")
         self._context = zmq.Context()
+        try:
+            self._connect()
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+
+    def _connect(self) -> None:
+        """Open a socket under a new routing id, which no other peer knows."""
         self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        self._socket.setsockopt(zmq.ROUTING_ID, b"\x01" + secrets.token_bytes(15))  # a first byte of 0 is ZeroMQ's own
         self._socket.setsockopt(zmq.LINGER, 5000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
         # Leases bound what is queued: at most CREDIT samples in either direction.
         self._socket.setsockopt(zmq.SNDHWM, 0)
         self._socket.setsockopt(zmq.RCVHWM, 0)
-        self._socket.setsockopt(zmq.IPV6, int("[" in address))
-        if key is not None:
-            key.secure(self._socket)
-        self._handshakes = Handshakes(address, key, "worker")
+        self._socket.setsockopt(zmq.IPV6, int("[" in self._address))
+        if self._key is not None:
+            self._key.secure(self._socket)
         self._monitor = self._socket.get_monitor_socket(HANDSHAKE_EVENTS)
-        try:
-            self._socket.connect(address)
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+        self._handshakes.begin()
+        self._socket.connect(self._address)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._monitor, zmq.POLLIN)
+
+    def _reconnect(self) -> None:
+        before = self._socket, self._monitor
+        self._connect()  # before the old ones are closed: the address of a monitor is made from a descriptor
+        for each in before:
+            each.close(linger=0)
 
     def stop(self) -> None:
         """Finishes the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
@@ -176,6 +189,8 @@ class Worker:
                 self._socket.send(frame, _MORE, copy=False)
             self._socket.send(last, copy=False)
             self._handover_seconds += time.monotonic() - began
+        elif isinstance(action, Reconnect):
+            self._reconnect()
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -290,14 +305,14 @@ class Worker:
 
 
 def unshared_name(beginning: str | None) -> str:
-    """A name that no other worker has: of two of one name the server would hear one, and the other wait for ever.
+    """Return a name that no other worker has: the server refuses the second worker of a name.
 
     Args:
         beginning: what its operator calls it, and perhaps others too; None: host and process id, which in containers
             may be the same for all.
 
     Raises:
-        UsageError: it is too long to be a routing identity with what is added to it.
+        UsageError: it is too long with what is added to it.
     """
     if beginning is not None and len(beginning.encode()) > MOST_NAME_BYTES:
         raise UsageError(f"--name has {len(beginning.encode())} bytes: give at most {MOST_NAME_BYTES}")
