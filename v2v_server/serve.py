@@ -55,6 +55,8 @@ _TURN_SECONDS = 0.1
 """Of the loop without any message; also from one look at deadlines and deaths to the next."""
 _SOON_SECONDS = 5.0
 """What keeps everybody waiting for longer is said."""
+_RECORD_SECONDS = 2.0
+"""How long a verdict is tried to be written while another process writes to the quarantine."""
 _GIVE_BACK_SECONDS = 12.0
 """From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
 
@@ -217,6 +219,7 @@ class Server:
         self._missing_told = -math.inf
         self._held_up_due: float | None = None
         self._give_back_at = math.inf
+        self._unrecorded: list[tuple[Condemn, float]] = []  # until when each is tried
 
     def turn(self, longest_wait_seconds: float) -> None:
         """Takes what has come, and does what is due. Waits for a message if none is there.
@@ -242,6 +245,9 @@ class Server:
             self._next_tick = now + _TURN_SECONDS
             for name, withheld in self._supervisor.withheld(now).items():
                 self._dispatcher.worker_withheld(self._route(name), withheld)
+            unrecorded, self._unrecorded = self._unrecorded, []
+            for record, until in unrecorded:
+                self._carry_out(self._record(record, until))
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
@@ -293,7 +299,7 @@ class Server:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case Condemn() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record), now())))
+                    todo.extendleft(reversed(self._record(record, now() + _RECORD_SECONDS)))
                 case LookFor() as missing:
                     todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
                 case PassOver(refusal, request):
@@ -319,16 +325,24 @@ class Server:
         """Return the routing id of a worker of the supervisor; empty if it has not said hello."""
         return self._dispatcher.registry.named(name.decode()) or b""
 
-    def _record(self, record: Condemn) -> list[Verdict]:
-        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
+    def _record(self, record: Condemn, until: float) -> list[Action]:
+        """Write a verdict down. A server that cannot write goes on: its operator is told what that costs.
+
+        Args:
+            record: the verdict.
+            until: while another process writes, and this time has not come, the next turns try again.
 
         Returns:
-            the lines that the quarantine has more now.
+            what the dispatcher does about it; nothing yet while it is tried again.
         """
-        verdict = record.verdict
+        verdict, now = record.verdict, self._clock()
+        written: list[Verdict] = []
         try:
-            written = write_verdict(self._quarantine_file, verdict, self._quarantine)
+            written = write_verdict(self._quarantine_file, verdict, self._quarantine, wait_seconds=0.0)
         except (OSError, CorpusError) as error:
+            if isinstance(error, BlockingIOError) and now < until:
+                self._unrecorded.append((record, until))
+                return []
             self._say(
                 f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
                 f"again, because the quarantine cannot be written: {error}",
@@ -336,10 +350,9 @@ class Server:
                 record.request,
                 video=verdict.path,
             )
-            return []
         for line in written:
             self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
-        return written
+        return self._dispatcher.recorded(record, written, now)
 
     def _look_for(self, missing: LookFor) -> bool:
         """Whether the video is here as it was catalogued. If so, the operator is told of the host that has it not,

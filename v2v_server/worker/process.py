@@ -106,6 +106,9 @@ class Worker:
         self._log = log or Log()
         self._logbook = logbook
         self._clips = Clips(root, cache)
+        self._at = IDLE  # the lease in work
+        if cache is not None:
+            cache.on_wait = self._note_wait
         self._copies = root if isinstance(root, Copies) else None
         self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be had
         self._is_remote = leaves_host(address)
@@ -211,7 +214,8 @@ class Worker:
                 if not self._clips.has(lease):
                     give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
                 limit_processor_time(LONGEST_LEASE_SECONDS)
-                note(self._logbook, lease.lease, decodes=True)
+                self._at = lease.lease
+                note(self._logbook, self._at, decodes=True)
                 try:
                     made: tuple[Frames, Spent] | VideoError = self._made(lease)
                 except VideoError as error:
@@ -224,6 +228,10 @@ class Worker:
                 return conversation.made(frames, now, spent)
             case _:
                 return []  # Leave
+
+    def _note_wait(self, waits: bool) -> None:
+        """Note that a wait for other processes, inside of decoding, is no decoding."""
+        note(self._logbook, self._at, decodes=not waits)
 
     def _has_video(self, lease: Lease) -> bool:
         """Whether there is nothing to wait for: its video is on this host, or could not be had, which is to be said."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -146,13 +147,10 @@ def test_a_full_disk_costs_the_copy_and_nothing_else(
 
 
 def test_a_folder_that_takes_no_copy_is_no_fault(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(path: Path, *more: object, **options: object) -> None:
+    def refused(path: Path, flags: int) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), path)
 
-    opened = Path.open
-    monkeypatch.setattr(
-        Path, "open", lambda path, mode="r", **more: refused(path) if "w" in mode else opened(path, mode, **more)
-    )
+    monkeypatch.setattr(copy_module, "open_private", refused)
     assert len(facts(corpus.open())[1]) == 40
     assert sorted(os.listdir(corpus.cache)) == [corpus.index.name]
 
@@ -221,6 +219,13 @@ def test_a_small_index_has_no_copy(corpus: Corpus, tmp_path: Path) -> None:
     small = Corpus(tmp_path / "small", count=29)
     small.open().close()
     assert sorted(os.listdir(small.cache)) == [small.index.name]
+
+
+def test_other_users_cannot_lock_an_index_or_its_copy(corpus: Corpus) -> None:
+    corpus.index.chmod(0o644)
+    corpus.open().close()
+    assert copy_path(corpus.index, "columns").exists()
+    assert {stat.S_IMODE(path.stat().st_mode) for path in corpus.cache.iterdir()} == {0o600}
 
 
 def test_a_mark_names_a_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from v2v_server.system.private import make_private
+
 SCHEMA_VERSION = 4
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
 _REFUSED_MORE = 3
@@ -103,6 +105,7 @@ class Store:
     def __init__(self, path: Path | None) -> None:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            make_private(path)  # SQLite gives its other files the mode of this one
         self.path = path
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
