@@ -325,6 +325,7 @@ class Dispatcher:
 
     def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
         """Extend the deadlines of a worker by the time in which it could not run."""
+        self.counters.queued_seconds += stalled.queued_seconds
         self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:

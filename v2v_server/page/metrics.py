@@ -41,8 +41,8 @@ _GAUGES = {
     "v2v_unusable_videos": ("unusable_count", "Files that cannot be used at all."),
     "v2v_quarantined_sequences": ("quarantined", "Verdicts of the quarantine in force."),
 }
-_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover")
-PARTS = ("nobody", "start", "workers", "consumers", "decode", "simulate", "handover", "broker", "way", "even")
+_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover", "queued")
+PARTS = ("nobody", "start", "workers", "consumers", "cores", "decode", "simulate", "handover", "broker", "way", "even")
 _WORKER_STATES = ("working", "idle", "resting", "lost")
 _CONSUMER_STATES = ("stalled", "taking", "idle", "gone")
 _OF_CONSUMERS = {
@@ -110,7 +110,7 @@ def exposition(state: _State | None, accept: str = "") -> tuple[bytes, str]:
 def _of_waiting(waiting: _State) -> Iterator[Metric]:
     shares = GaugeMetricFamily(
         "v2v_time_ratio",
-        "Of the last ten seconds: consumers waited, workers were idle, the broker was busy, workers did what.",
+        "Of the last ten seconds: consumers waited, workers were idle, the broker was busy, workers did what or had no core.",
         labels=("part",),
     )
     for part in _SHARES:
