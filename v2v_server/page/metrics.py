@@ -110,7 +110,7 @@ def exposition(state: _State | None, accept: str = "") -> tuple[bytes, str]:
 def _of_waiting(waiting: _State) -> Iterator[Metric]:
     shares = GaugeMetricFamily(
         "v2v_time_ratio",
-        "Of the last ten seconds: consumers waited, workers were idle, the broker was busy, workers did what or had no core.",
+        "Of the last ten seconds: consumers waited, workers were idle, the broker was busy, workers did what.",
         labels=("part",),
     )
     for part in _SHARES:
