@@ -68,7 +68,7 @@ def up_to_date(
     """
     try:
         return *_refreshed(path, root, ids, looking, processes, progress, notice), []
-    except (sqlite3.Error, OSError) as error:
+    except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
@@ -138,7 +138,7 @@ def _parts(store: Store, mark: str) -> Iterator[Part]:
 
 def _copy(store: Store, mark: str) -> None:
     """Leaves a copy behind of what the index has now, if that is not what it had."""
-    with suppress(sqlite3.Error, OSError), store.reading() as now:
+    with suppress(sqlite3.Error, OSError, UnicodeDecodeError), store.reading() as now:
         if now != mark:
             deque(_parts(store, now), maxlen=0)
 

@@ -106,7 +106,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
 
 def _raw_format(name: str) -> str | None:
     """Return FFmpeg's name of the container where its own guess is wrong: raw JPEG pictures, for it a still."""
-    with open(name, "rb") as file:
+    with open(os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         return "mjpeg" if file.read(len(_JPEG)) == _JPEG else None
 
 
