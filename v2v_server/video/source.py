@@ -20,8 +20,8 @@ from av.video.stream import VideoStream
 from v2v_protocol.errors import VideoError, VideoUnreadable
 
 FORMATS = (
-    "mov", "matroska", "avi", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264", "hevc",
-    "obu", "av1", "mjpeg", "yuv4mpegpipe",
+    "mov", "matroska", "avi", "dv", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264",
+    "hevc", "obu", "av1", "mjpeg", "yuv4mpegpipe",
 )  # fmt: skip
 """FFmpeg's names of the containers that are read ("mov" is mp4 as well, "matroska" webm). None of them names other
 files; playlists (concat, HLS, DASH), picture sequences and devices are not among them."""
