@@ -85,7 +85,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         tracks = [track for track in container.streams.video if not track.disposition & _STILL]
         if not tracks:
             raise VideoError(name, None, "has no video track")
-        stream = _chosen(name, tracks)
+        stream = _chosen(name, container, tracks)
         if stream.codec_context is None:
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
         decoder = stream.codec_context
@@ -111,12 +111,13 @@ def _open(name: str) -> InputContainer:
     return av.open(os.path.abspath(name), "r", format=_raw_format(name), options=_OPTIONS, metadata_errors="replace")
 
 
-def _chosen(name: str, tracks: Sequence[VideoStream]) -> VideoStream:
+def _chosen(name: str, container: InputContainer, tracks: Sequence[VideoStream]) -> VideoStream:
     """Return the track to serve, see :func:`opened`."""
     if len(tracks) == 1:
         return tracks[0]
     readable = [track for track in tracks if track.codec_context and track.codec_context.codec.name in CODECS]
-    frames = {track.index: track.frames for track in readable}
+    is_listed = "mov" in container.format.name.split(",")  # the counts of other containers are estimates, or missing
+    frames = {track.index: track.frames if is_listed else 0 for track in readable}
     if len(readable) > 1 and 0 in frames.values():
         frames |= _frames_at_the_beginning(name, [index for index, count in frames.items() if not count])
     moving = [track for track in readable if frames[track.index] > 1]
@@ -126,7 +127,7 @@ def _chosen(name: str, tracks: Sequence[VideoStream]) -> VideoStream:
 
 
 def _frames_at_the_beginning(name: str, indexes: Sequence[int]) -> Counter[int]:
-    """Return how many packets of each track come early, by index: up to two, where the container states no number."""
+    """Return how many packets of each track come early, by index, until each has two."""
     found = Counter[int]()
     with closing(_open(name)) as container, suppress(av.FFmpegError):
         for packet in islice(container.demux(*(container.streams[at] for at in indexes)), _PACKETS_LOOKED_AT):

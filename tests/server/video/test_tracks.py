@@ -69,6 +69,13 @@ def test_which_track_is_the_video(
     assert probe(path).height_px == height
 
 
+def test_a_still_in_avi(tmp_path: Path, parts: dict[str, Path]) -> None:
+    """Its header states more frames than there are."""
+    moving = write_clip(tmp_path / "moving.avi", panned_luma(20, 48), codec="mpeg4")
+    path = with_tracks(tmp_path / "clip.avi", [(parts["still"], NONE), (moving, NONE)])
+    assert probe(path).height_px == 48
+
+
 def test_a_track_that_is_not_read_is_not_the_video(tmp_path: Path, parts: dict[str, Path]) -> None:
     unread = write_clip(tmp_path / "unread.avi", panned_luma(20, 80), codec="cinepak", pixel_format="rgb24")
     path = with_tracks(tmp_path / "clip.mov", [(unread, DEFAULT), (parts["first"], NONE)])
