@@ -20,7 +20,7 @@ from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.source import opened, packets
 
-_FIRST_FRAMES = 16
+_FIRST_FRAMES = 8
 _LONGEST_LAST_GROUP = 64
 _MOST_LOST = 0.1
 """Share of the frames that may be lost without an error of the decoder."""

@@ -64,6 +64,8 @@ class PacketSigns:
         """Read the next packet in stored order."""
         if packet.is_keyframe:
             self.picture_changes |= self._states_another(packet, content)
+        elif self._codec == "vp9":
+            self.picture_changes |= is_scaled(content)
         elif packet.pts is not None and may_be_not_coded(self._codec, content):
             self.empty_pts.append(packet.pts)
         self._begun = True
@@ -89,12 +91,28 @@ class PacketSigns:
         return found[1] if found else b""
 
 
+def is_scaled(packet: memoryview) -> bool:
+    """Return whether the first frame of a VP9 packet refers to frames of other sizes only: 6.2 and 7.2.5."""
+    head = "".join(f"{byte:08b}" for byte in packet[:8])
+    at = 5 if head[2:4] == "11" else 4  # profile 3 has a reserved bit
+    shows_existing, is_inter, is_shown, is_resilient = (bit == "1" for bit in head[at : at + 4])
+    if shows_existing or not is_inter:
+        return False
+    at += 4
+    if not is_shown:
+        if head[at] == "1":
+            return False  # intra only
+        at += 1
+    at += 0 if is_resilient else 2
+    return head[at + 20 : at + 23] == "000"  # behind what it refreshes (8 bits) and its three references (4 each)
+
+
 def may_be_not_coded(codec: str, packet: memoryview) -> bool:
     """Return whether a packet is too short for a picture: MPEG-4 says so where nothing changed, and decodes to nothing.
 
-    VP8, VP9 and AV1 are left out: their shortest packets show a frame.
+    VP8 and AV1 are left out: their shortest packets show a frame.
     """
-    if codec in ("vp8", "vp9", "av1"):
+    if codec in ("vp8", "av1"):
         return False
     if codec == "mpeg4":
         return _VOP in bytes(packet[-(len(_VOP) + _NOT_CODED_BYTES) :])

@@ -16,7 +16,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.luma import range_table
 from v2v_server.video.probe import VideoFacts, probe
-from v2v_server.video.signs import may_be_not_coded, times_are_doubtful
+from v2v_server.video.signs import is_scaled, may_be_not_coded, times_are_doubtful
 
 Change = Callable[[av.Packet, int], av.Packet]
 """(packet, its number in stored order) -> what is stored instead."""
@@ -172,7 +172,26 @@ def test_short_packets() -> None:
     assert may_be_not_coded("mpeg4", memoryview(b"\0\0\1\xb3abc" + vop + b"\x57\x3f"))
     assert not may_be_not_coded("mpeg4", memoryview(vop + bytes(range(20))))
     assert may_be_not_coded("wmv3", memoryview(b"\0"))
-    assert not may_be_not_coded("vp9", memoryview(b"\x88"))
+    assert not may_be_not_coded("av1", memoryview(b"\x88"))
+
+
+@pytest.mark.parametrize(
+    ("head", "scaled"),
+    [
+        ("1000 0110 00 00000001 0000 0010 0100 1", False),
+        ("1000 0110 00 00000001 0000 0010 0100 001", False),
+        ("1000 0110 00 00000001 0000 0010 0100 000", True),
+        ("1000 0111 00000001 0000 0010 0100 000", True),  # resilient to errors: no bits of the context
+        ("1000 0100 0 00 00000001 0000 0010 0100 000", True),  # not shown
+        ("1000 0100 1 00 00000001 0000 0010 0100 000", False),  # intra only
+        ("1011 0 0110 00 00000001 0000 0010 0100 000", True),  # profile 3
+        ("1000 1000", False),  # shows an existing frame
+    ],
+)
+def test_vp9_that_refers_to_other_sizes(head: str, scaled: bool) -> None:
+    bits = head.replace(" ", "").ljust(64, "1")
+    assert is_scaled(memoryview(int(bits, 2).to_bytes(8, "big"))) == scaled
+    assert not is_scaled(memoryview(b"\x88"))
 
 
 @pytest.mark.parametrize(
