@@ -73,7 +73,7 @@ def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> Epoch:
         make_sample(lease, decoded)
         done = time.process_time()
         # Once more by itself: make_sample has it inside.
-        apply_view(decoded.clip.frames, decoded.draft.params, decoded.draft.spec.recipe)
+        apply_view(decoded.clip.frames, decoded.plan.params, decoded.plan.spec.recipe)
         view += time.process_time() - done
         read, made = read + came - began, made + done - came
     return Epoch(read, view, made - view)

@@ -63,11 +63,11 @@ def repeated(work: Iterator[object] | Callable[[], object], seconds: float) -> t
 
 def kernel(decoded: Decoded) -> object:
     """What a server worker does with a decoded clip (``v2v_server.worker.produce.make_sample``)."""
-    draft = decoded.draft
-    params, recipe = draft.params, draft.spec.recipe
+    plan = decoded.plan
+    params, recipe = plan.params, plan.spec.recipe
     view = apply_view(decoded.clip.frames, params, recipe)
-    voxels = simulate_clip(view, params, recipe, draft.spec.voxel_dtype)
-    return voxels, view[draft.source[list(recipe.target_steps)], None]
+    voxels = simulate_clip(view, params, recipe, plan.spec.voxel_dtype)
+    return voxels, view[plan.source[list(recipe.target_steps)], None]
 
 
 def made_alone(

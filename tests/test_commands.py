@@ -165,6 +165,8 @@ def _wrong_with_launched(words: list[str]) -> str:
         return ""
     if started == "pytest":
         return wrong_with(["pytest", *rest])
+    if started == "bench":
+        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
     module = started if started.removeprefix("bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
     return "nothing that can be started" if module is None else _refused(module, rest)
 
@@ -195,8 +197,8 @@ def test_what_is_wrong_with_a_line_is_seen() -> None:
     for line in (
         "v2v-serve --videos DIR --workers many", "v2v-serve --video DIR", "v2v-service", "make tests",
         "v2v-bench nothing", "v2v-bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
-        "python -m bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
-        "pytest tests/none.py",
+        "python -m bench.nothing", "python -m bench nothing", "uvx --from '.[server]' v2v-preview my.mp4",
+        "pip install '.[servers]'", "pytest tests/none.py",
     ):  # fmt: skip
         assert wrong_with(shlex.split(line)), line
 

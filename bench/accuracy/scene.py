@@ -161,10 +161,11 @@ def _measured(leases: Sequence[Lease], root: Path) -> Clip:
     voxels = np.linspace(0, len(before) - 1, _COMPARED_VOXELS).round().astype(int)
     truth = _flow(plain, _REFERENCE)[voxels].astype(np.float32)
     errors = [np.linalg.norm(flow[voxels] - truth, axis=1).ravel() for flow in (before, after)]
-    plan = chosen.draft.plan
+    flow_plan = chosen.plan.flow_plan
     return Clip(
-        leases[1].video, leases[1].start_frame, "" if plan is None else plan.reason, (plain_seconds, chosen_seconds),
-        simulation, (flow_off, flow_auto), (errors[0], errors[1]), () if plan is None else plan.methods,
+        leases[1].video, leases[1].start_frame, "" if flow_plan is None else flow_plan.reason,
+        (plain_seconds, chosen_seconds), simulation, (flow_off, flow_auto), (errors[0], errors[1]),
+        () if flow_plan is None else flow_plan.methods,
     )  # fmt: skip
 
 
@@ -180,22 +181,22 @@ def _decoded(lease: Lease, root: Path) -> Decoded:
 
 def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16]:
     """[T, 2, H, W] as the worker makes it, or all of it by one method."""
-    draft = decoded.draft
+    plan = decoded.plan
     settings = _settings(decoded) if method is None else replace(_settings(decoded), method=method)
-    plan = draft.plan.methods if draft.plan is not None and method is None else ()
-    return flow_for(decoded.clip.frames, draft.params, draft.spec.recipe, settings, plan=plan).flow
+    methods = plan.flow_plan.methods if plan.flow_plan is not None and method is None else ()
+    return flow_for(decoded.clip.frames, plan.params, plan.spec.recipe, settings, plan=methods).flow
 
 
 def _simulated(decoded: Decoded) -> object:
-    params, spec = decoded.draft.params, decoded.draft.spec
+    params, spec = decoded.plan.params, decoded.plan.spec
     view = view_part(decoded.clip.frames, params, spec.recipe, _settings(decoded).margin_px)
     return simulate_clip(apply_view(view, params, spec.recipe), params, spec.recipe, spec.voxel_dtype, None)
 
 
 def _settings(decoded: Decoded) -> FlowSettings:
-    if decoded.draft.flow is None:
+    if decoded.plan.flow is None:
         raise UsageError("the lease asks for no flow")
-    return decoded.draft.flow
+    return decoded.plan.flow
 
 
 def looking(catalogue: Catalogue) -> Record:

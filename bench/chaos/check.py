@@ -21,8 +21,7 @@ import argparse
 import json
 import random
 import sys
-from collections.abc import Iterable
-from collections.abc import Sequence as Several
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import Sequence, SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.worker.produce import decode_for, make_sample
 
 
@@ -63,7 +62,7 @@ class StreamOracle:
         self._schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, self._spec), self._spec)
         self.sequences = self._schedule.count
 
-    def sequence(self, epoch: int, index: int, candidate: int) -> Sequence:
+    def sequence(self, epoch: int, index: int, candidate: int) -> VideoSequence:
         """What a candidate of a sample is made from."""
         return self._schedule.candidate(self._asked.seed, epoch, index, candidate)
 
@@ -134,7 +133,7 @@ class Verdict:
         return summed | {name: getattr(self, name) for name in fields}
 
 
-def check(catalogue: Catalogue, logs: Several[tuple[Profile, Iterable[Line]]], *, remakes: int, seed: int) -> Verdict:
+def check(catalogue: Catalogue, logs: Sequence[tuple[Profile, Iterable[Line]]], *, remakes: int, seed: int) -> Verdict:
     """Checks the logs of all consumers.
 
     Args:
@@ -180,7 +179,7 @@ def check(catalogue: Catalogue, logs: Several[tuple[Profile, Iterable[Line]]], *
     )
 
 
-def main(arguments: Several[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command line. Returns the exit status: 0 checked (whatever was found), 2 it could not be."""
     first = (__doc__ or "").split("\n\n")[0]
     parser = argparse.ArgumentParser(prog="python -m bench.chaos.check", description=first)

@@ -221,7 +221,11 @@ def test_the_command(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
 def test_the_entry_knows_every_benchmark_that_the_documents_name() -> None:
     root = Path(cli.__file__).parent.parent
     texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "bench").rglob("*.py")]
-    named = {name for path in texts for name in re.findall(r"v2v-bench ([a-z][a-z_]*)", path.read_text("utf-8"))}
+    named = {
+        name
+        for path in texts
+        for name in re.findall(r"(?:v2v-bench|python -m bench) ([a-z][a-z_]*)", path.read_text("utf-8"))
+    }
     assert {"training_trade", "gpu_feed", "throughput"} <= set(cli.names())
     assert len(named) > 5
     assert named <= set(cli.names())
