@@ -55,6 +55,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
     text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
+    text += f"; {int(found.frames.sum())} frames that decode"
     yield "ok", "corpus", text, ""
     if catalogue.refusals:
         few = "; ".join(map(str, catalogue.refusals[:shown]))

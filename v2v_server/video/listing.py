@@ -1,7 +1,8 @@
 """Making sure that the frames of a file are those that its packets list.
 
-Decoding confirms the first frames, and the last group of frames where that is short. A sign that more of the list could
-be wrong (:mod:`v2v_server.video.signs`) has the whole file decoded once.
+Decoding confirms the first frames, those around the longest gaps in the time stamps, and the last group of frames where
+that is short. A sign that any of the list could be wrong (:mod:`v2v_server.video.signs`) has the whole file decoded
+once.
 """
 
 from __future__ import annotations
@@ -18,26 +19,32 @@ from av.video.frame import VideoFrame
 from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import LumaFormat
+from v2v_server.video.signs import steps_and_gaps
 from v2v_server.video.source import opened, packets
 
 _FIRST_FRAMES = 8
 _LONGEST_LAST_GROUP = 64
+_MOST_GAPS = 8
 _MOST_LOST = 0.1
 """Share of the frames that may be lost without an error of the decoder."""
 
 
 def is_confirmed(path: str, listed: FrameIndex) -> bool:
-    """Return whether the first frames, and the last ones where their group is short, decode as listed.
+    """Return whether frames decode as listed: the first, the last, and those around gaps.
 
     Args:
         path: the file.
         listed: all of its frames, seekable.
     """
-    if not decodes_as_listed(path, listed, 0, min(_FIRST_FRAMES, len(listed))):
-        return False
+    places = [(0, min(_FIRST_FRAMES, len(listed)))]
+    if len(listed) > 1:
+        steps, are_gaps = steps_and_gaps(listed.pts)
+        longest = np.argsort(steps)[::-1][:_MOST_GAPS]
+        places += [(int(before), 2) for before in longest if are_gaps[before]]
     last = int(listed.keyframes[-1]) if len(listed.keyframes) else 0
-    count = len(listed) - last
-    return count > _LONGEST_LAST_GROUP or decodes_as_listed(path, listed, last, count)
+    if len(listed) - last <= _LONGEST_LAST_GROUP:
+        places.append((last, len(listed) - last))
+    return all(decodes_as_listed(path, listed, *place) for place in places)
 
 
 @dataclass(slots=True)

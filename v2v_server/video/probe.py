@@ -23,7 +23,7 @@ from v2v_server.video.listing import Delivered, is_confirmed
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, is_hidden
-from v2v_server.video.signs import GAP_STEPS, PacketSigns, times_are_doubtful
+from v2v_server.video.signs import PacketSigns, steps_and_gaps, times_are_doubtful
 from v2v_server.video.source import opened, packets, reason, time_base
 
 LONGEST_CPU_SECONDS = 1200.0
@@ -229,7 +229,7 @@ def _rate(index: FrameIndex, stated: Fraction | None) -> float:
     """Return frames per second: the average without gaps, else what the container states."""
     if index.seekable and len(index) > 1:
         numerator, denominator = index.time_base
-        steps = np.diff(index.pts)
-        steps = steps[steps <= GAP_STEPS * np.median(steps)]
+        steps, are_gaps = steps_and_gaps(index.pts)
+        steps = steps[~are_gaps]
         return len(steps) * denominator / (int(steps.sum()) * numerator)
     return float(stated) if stated else float("nan")

@@ -20,7 +20,7 @@ from v2v_server.video.packets import behind_lengths
 
 _LONGEST_REORDERING = 16
 """Frames by which a decoder may move one: the largest picture buffer of H.264 and HEVC."""
-GAP_STEPS = 8
+_GAP_STEPS = 8
 """A step of more than this many median steps is a gap."""
 _HEAD_BYTES = 4096
 _NOT_CODED_BYTES = 8
@@ -127,7 +127,7 @@ def _nal_units(packet: memoryview, codec: str, extradata: bytes) -> Iterable[byt
 
 
 def times_are_doubtful(pts: npt.NDArray[np.int64], dts: npt.NDArray[np.int64], reorders: bool) -> bool:
-    """Return whether time stamps contradict each other, or hold a gap.
+    """Return whether time stamps contradict each other, or the decoder.
 
     Args:
         pts, dts: [n] int64 of the packets in stored order; a dts may be :data:`NO_TIMESTAMP`.
@@ -135,13 +135,16 @@ def times_are_doubtful(pts: npt.NDArray[np.int64], dts: npt.NDArray[np.int64], r
     """
     if len(pts) < 2:
         return False
-    order = np.argsort(pts, kind="stable")
-    displacement = np.abs(order - np.arange(len(pts)))
-    steps = np.diff(pts[order])
+    displacement = np.abs(np.argsort(pts, kind="stable") - np.arange(len(pts)))
     known = dts[dts != NO_TIMESTAMP]
     return bool(
         np.any(known[1:] < known[:-1])
         or displacement.max() > _LONGEST_REORDERING
         or (reorders and not displacement.any())
-        or steps.max() > GAP_STEPS * np.median(steps)
     )
+
+
+def steps_and_gaps(pts: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Return the steps between rising time stamps [n], at least two, and which of the n - 1 steps are gaps."""
+    steps = np.diff(pts)
+    return steps, steps > _GAP_STEPS * np.median(steps)

@@ -63,7 +63,7 @@ def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str
     flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe)]
     status, said = told(capsys, *flags)
     assert status == 0
-    assert "2 videos: 2 h264" in said
+    assert "2 videos: 2 h264; 33 frames that decode" in said
     assert "1 files cannot be used: broken.mp4" in said
     assert "1 videos give no sequence" in said
     assert "voxels_per_clip=2 admits" in said

@@ -13,7 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.clips import panned_luma, write_clip
-from v2v_server.video.decode import decode_luma
+from v2v_server.video import listing
+from v2v_server.video.decode import decode_luma, decodes_as_listed
+from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import range_table
 from v2v_server.video.probe import VideoFacts, probe
 from v2v_server.video.signs import is_scaled, may_be_not_coded, times_are_doubtful
@@ -167,6 +169,22 @@ def test_what_follows_a_change_of_size_is_not_counted(
     assert decode_luma(path, facts.index, 30, count - 30).frames.shape == (count - 30, 48, 64)
 
 
+def test_only_the_frames_around_a_gap_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = np.arange(120) * 40
+    times[50:] += 3_600_000
+    path = write_clip(tmp_path / "clip.mkv", panned_luma(120), pts=times.tolist(), gop=100)
+    places: list[tuple[int, int]] = []
+
+    def seen(path: str, index: FrameIndex, start: int, count: int) -> bool:
+        places.append((start, count))
+        return decodes_as_listed(path, index, start, count)
+
+    monkeypatch.setattr(listing, "decodes_as_listed", seen)
+    monkeypatch.setattr(listing.Delivered, "of", lambda *more: pytest.fail("the whole file was decoded"))
+    assert probe(path).frames == 120
+    assert places == [(0, 8), (49, 2), (100, 20)]
+
+
 def test_short_packets() -> None:
     vop = b"\0\0\1\xb6"
     assert may_be_not_coded("mpeg4", memoryview(b"\0\0\1\xb3abc" + vop + b"\x57\x3f"))
@@ -201,7 +219,7 @@ def test_vp9_that_refers_to_other_sizes(head: str, scaled: bool) -> None:
         ([0, 3, 1, 2], [-1, 0, 1, 2], True, False),
         ([0, 1, 2, 3], [0, 1, 2, 3], True, True),
         ([0, 1, 2, 3], [0, 2, 1, 3], False, True),
-        ([0, 1, 2, 90000, 90001], [0, 1, 2, 90000, 90001], False, True),
+        ([0, 1, 2, 90000, 90001], [0, 1, 2, 90000, 90001], False, False),
         ([*range(1, 40), 0], [*range(40)], False, True),
         ([0], [0], True, False),
     ],
