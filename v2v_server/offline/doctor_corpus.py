@@ -7,18 +7,24 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator
+from itertools import islice
 
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.cloud.copies import Copies
 from v2v_server.config import recipe_setting
+from v2v_server.offline.aperture import clean_aperture
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 
 Line = tuple[str, str, str, str]
 """(level, about, text, change)"""
+
+_VIDEOS_OPENED = 10_000
+"""Most videos of which more is read than their line of the index."""
 
 
 def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, shown: int) -> Iterator[Line]:
@@ -49,6 +55,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
     text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
+    text += f"; {int(found.frames.sum())} frames that decode"
     yield "ok", "corpus", text, ""
     if catalogue.refusals:
         few = "; ".join(map(str, catalogue.refusals[:shown]))
@@ -60,6 +67,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         yield "note", "corpus", text, change
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
+    yield from _how_videos_are_stored(catalogue)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
@@ -80,6 +88,30 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
+
+
+def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
+    if catalogue.prepared is not None:
+        return
+    ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
+    counted = [id for id in ids if not catalogue.frame_index(id).seekable]
+    if counted:
+        text = (
+            f"{len(counted)} videos have no time stamps that name their frames ({counted[0]}): every clip of them is "
+            "decoded from the beginning of its file"
+        )
+        yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
+    if isinstance(catalogue.root, Copies):
+        return
+    cropped = [(id, shown) for id in ids if (shown := clean_aperture(catalogue.path(id))) is not None]
+    if cropped:
+        id, (width, height) = cropped[0]
+        text = (
+            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show ({id}: "
+            f"{float(width):g}x{float(height):g} px): it is not applied, the whole stored picture is served"
+        )
+        change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
+        yield "note", "corpus", text, change
 
 
 def _remedy(longest: int, wanted: int) -> str:

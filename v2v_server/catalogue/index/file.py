@@ -19,10 +19,8 @@ from typing import Any
 from v2v_server.system.private import make_private
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
-_REFUSED_MORE = 3
-"""The version with the same table that refused videos which are read now: those are probed again, the others kept."""
 
 MARKED_FROM = 10_000
 """Records from which on it is worth knowing that nothing has changed."""
@@ -112,6 +110,7 @@ class Store:
 
     Attributes:
         path: that.
+        replaced_version: version of the index that lay there and could not be used; None if there was none.
 
     Raises:
         sqlite3.Error, OSError: the file cannot be made, opened or read.
@@ -124,6 +123,7 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
             make_private(path)  # SQLite gives its other files the mode of this one
         self.path = path
+        self.replaced_version: int | None = None
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
@@ -141,11 +141,9 @@ class Store:
             version = self._version()
             if version == SCHEMA_VERSION:  # another process was faster
                 return
-            if version == _REFUSED_MORE:
-                self._database.execute("DELETE FROM video WHERE problem IS NOT NULL")
-            else:
-                self._database.execute("DROP TABLE IF EXISTS video")
-                self._database.execute(_TABLE)
+            self.replaced_version = version or None
+            self._database.execute("DROP TABLE IF EXISTS video")
+            self._database.execute(_TABLE)
             self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _version(self) -> int:
