@@ -89,7 +89,7 @@ def sample_message(
 
 def pack(raw: Buffer) -> bytes:
     """An array's bytes as one zstd frame that states their number."""
-    # Level 1: a twelfth of the bytes is left, and higher levels take longer for little more (v2v-bench tradeoff).
+    # Level 1: a twelfth of the bytes is left, and higher levels take longer for little more (v2v-tradeoff).
     return zstandard.ZstdCompressor(level=1, write_checksum=False).compress(raw)
 
 
