@@ -52,7 +52,7 @@ def plot(records: Sequence[Record], file: Path) -> None:
     """Draw each measured figure as a share of its bound, where the bound is not 0."""
     shown = {r["row"]: max(r["measured"] / r["bound"], 1e-6) for r in reversed(records) if r["bound"] > 0}
     title = "Error of extreme settings against its bound (line)"
-    with panels(file, 1, title=title, height_inches=0.28 * len(shown) + 1) as (axes,):
+    with panels(file, 1, title=title, height_inches=0.28 * len(shown) + 1.5) as (axes,):
         axes.barh(list(shown), list(shown.values()))
         axes.axvline(1.0, color="black", lw=1)
         axes.set(xscale="log", xlim=(1e-6, 2), xlabel="measured / bound")

@@ -162,7 +162,7 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench.
 
     Raises:
-        SpecError: an unknown method.
+        UsageError: an unknown method.
         OSError: the folder cannot be read.
     """
     cv2.setNumThreads(1)

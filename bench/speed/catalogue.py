@@ -52,7 +52,7 @@ _PER_FOLDER = 1000
 _LINKS = 50_000
 """Hard links to one file; ext4 allows at most 65,000."""
 _COLUMNS: tuple[Column, ...] = (
-    ("videos", "videos", "{}", 1.0),
+    ("videos", "videos", "{}", 1),
     ("open_seconds", "open s", "{:.2f}", 1.0),
     ("open_cpu_seconds", "CPU s", "{:.2f}", 1.0),
     ("open_seconds_without_cache", "first s", "{:.2f}", 1.0),
