@@ -80,7 +80,8 @@ $(DOCS)/.ready: pyproject.toml constraints.txt
 
 # The pages' own tools, apart: they need no package of ours, and ours need none of them.
 docs: $(DOCS)/.ready
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+	REPOSITORY_URL=$$(git config remote.origin.url | sed -e 's|^git@\([^:]*\):|https://\1/|' -e 's|//[^/@]*@|//|' -e 's|\.git$$||' | grep ^https) \
+		NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 
 format: $(READY)
 	$(BIN)/ruff format .

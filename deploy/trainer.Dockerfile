@@ -1,7 +1,7 @@
 # The trainer: networks, losses, evaluation, and the client that takes the stream. torch comes with CUDA, some gigabytes.
 #   docker build -f deploy/trainer.Dockerfile -t v2v-trainer .
 #   docker run --rm --init --gpus all --network host -v /scratch/runs:/runs v2v-trainer e2vid --connect tcp://127.0.0.1:5555 --out /runs/e2vid
-# --init: see Dockerfile. A SIGTERM ends the run after the present step and saves it; --resume /runs/e2vid/last.pt goes on.
+# --init: see Dockerfile. SIGTERM ends the run after the present step and saves it; --resume /runs/e2vid/last.pt continues it.
 FROM python:3.11-slim
 
 RUN useradd --create-home --uid 1000 v2v && install -d -o v2v /runs

@@ -1,1 +1,1 @@
-"""Programs that show how the pieces are used together."""
+"""Show how the parts are used together, as programs."""

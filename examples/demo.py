@@ -1,5 +1,7 @@
-"""`make demo`: what a network trained on such a stream sees; then real clips through a server
-into a dataset, batches a second and a picture, and a minute of training.
+"""Run `make demo`.
+
+It draws a reconstruction by the shipped network, streams real clips through a server into a dataset, prints the batches
+per second, draws a batch, and trains for a minute.
 
 python -m examples.demo --videos DIR --picture out/demo.png
 """
@@ -28,24 +30,24 @@ _SHOWN = 4
 _VOXELS_PER_CLIP = 10
 _CONFIGURATION = "tiny-cpu"
 _HELD_OUT = "bikes.mp4"
-"""No clip that the shipped network was trained on."""
+"""A clip that the shipped network was not trained on."""
 
 
 def main() -> int:
-    """Runs the demo; returns 0, or 1 if the trained network is no better than a grey picture."""
+    """Run the demo. Return 0, or 1 if the trained network is no better than a grey picture."""
     parser = argparse.ArgumentParser(description="Stream real clips through a server into a dataset, then train.")
     parser.add_argument("--videos", required=True, metavar="DIR")
     parser.add_argument(
-        "--picture", required=True, metavar="FILE.png", help="training.png and training/ come beside it"
+        "--picture", required=True, metavar="FILE.png", help="PNG to write; training.png and training/ go next to it"
     )
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of streaming alone")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of streaming without training")
     parser.add_argument("--training-seconds", type=float, default=60.0)
     arguments = parser.parse_args()
     picture = Path(arguments.picture)
     picture.parent.mkdir(parents=True, exist_ok=True)
 
-    os.environ.pop("V2V_KEYS", None)  # a key for servers elsewhere; this one asks for none
+    os.environ.pop("V2V_KEYS", None)  # a key for other servers; this one needs no key
     reconstruct(Path(arguments.videos) / _HELD_OUT, picture.with_name("reconstruction.png"))
     with LocalServer(arguments.videos, workers=arguments.workers) as server:
         _stream(server.address, arguments.seconds, arguments.workers, picture)
@@ -80,11 +82,11 @@ def _stream(address: str, seconds: float, workers: int, picture: Path) -> None:
     print(
         f"{counted / elapsed:.2f} batches/s ({counted * _BATCH_SIZE / elapsed:.1f} samples/s) over {elapsed:.1f} s "
         f"with {workers} workers; batches of {_BATCH_SIZE} clips of {_VOXELS_PER_CLIP} voxel grids, "
-        f"first {_WARMUP_BATCHES} batches left out"
+        f"first {_WARMUP_BATCHES} batches not counted"
     )
     with_flow = V2VStreamDataset(address, _SHOWN, ("voxels", "frames", "flow"), recipe)
     cameras = _cameras(next(iter(with_flow)))
-    write_png(picture, draw_sheet(cameras, f"{len(cameras)} samples of the stream, each seen by a camera of its own"))
+    write_png(picture, draw_sheet(cameras, f"{len(cameras)} samples of the stream, each with its own virtual camera"))
     print(f"picture: {picture}")
 
 

@@ -1,4 +1,4 @@
-"""What the network that comes with this project makes of a clip that it was not trained on."""
+"""Reconstruct a clip with the shipped network, which was not trained on it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer.pictures import EVENTS, Video, contact_sheet, draw_events, draw_grey, headed, side_by_side, write_png
+from trainer.pictures import EVENTS, Video, add_header, contact_sheet, draw_events, draw_grey, side_by_side, write_png
 from trainer.weights import SHIPPED, load_network
 from v2v_client import V2VDataset
 
@@ -26,11 +26,11 @@ _FILM_HZ = 10.0
 
 
 def reconstruct(clip: Path, picture: Path) -> None:
-    """Draws events, camera and reconstruction side by side.
+    """Draw events, camera and reconstruction side by side.
 
     Args:
-        clip: a virtual camera makes its events.
-        picture: PNG of a few moments; the film of all of them comes beside it, as MP4.
+        clip: video from which a virtual camera makes the events.
+        picture: PNG of a few moments; the film of all moments is written next to it, as MP4.
     """
     network, _ = load_network(SHIPPED)
     sample = V2VDataset(clip, recipe=_RECIPE)[0].arrays
@@ -39,8 +39,8 @@ def reconstruct(clip: Path, picture: Path) -> None:
     target = sample["frames"][:, 0].astype(np.float32) / 255.0
     film = side_by_side([draw_events(sample["voxels"]), draw_grey(target), draw_grey(seen)])
     title = "Reconstructed from events by the shipped network"
-    write_png(picture, headed(contact_sheet(film, _ROWS), _PANELS, title, time_runs_down=True))
+    write_png(picture, add_header(contact_sheet(film, _ROWS), _PANELS, title, time_runs_down=True))
     with Video(picture.with_suffix(".mp4"), _FILM_HZ) as video:
         for image in film:
-            video.add(headed(image, _PANELS))
-    print(f"picture: {picture} (events, camera, what the shipped network made of the events; time runs down)")
+            video.add(add_header(image, _PANELS))
+    print(f"picture: {picture} (events, camera, reconstruction by the shipped network; time runs down)")

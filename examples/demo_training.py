@@ -1,4 +1,4 @@
-"""What the training of the demo came to: against the best grey picture, and to look at."""
+"""Compare the demo's trained network with the best grey picture, and draw its reconstructions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from trainer.config_file import load_config
 from trainer.models import NETWORKS
-from trainer.pictures import headed, write_png
+from trainer.pictures import add_header, write_png
 from trainer.run.checkpoint import LAST
 from trainer.tasks import Reconstruction
 from trainer.weights import load_into
@@ -20,23 +20,23 @@ _SEED = 1
 _SIDE_PX = 128
 _COLUMNS, _ROWS = 2, 5
 _FIRST_SHOWN = 4
-"""Before this step of a clip little has moved yet, and the network cannot know the scene."""
+"""First step of a clip to draw. Earlier, little has moved, so the network cannot know the scene."""
 
 
 def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
     """Compare the trained network with a constant, on virtual cameras that it was not trained on.
 
-    The constant is the mean of the very frames it is judged on, which no predictor would know beforehand. Both errors
-    are mean absolute differences, the loss of the training.
+    The constant is the mean of the frames it is compared with, which a real predictor could not know. Both errors are
+    mean absolute differences, the training loss.
 
     Args:
-        address: of the server.
-        configuration: that the run was trained with.
+        address: the server's.
+        configuration: the configuration of the run.
         run: folder of the run.
-        picture: where to draw voxels, targets and reconstructions.
+        picture: PNG to write, with voxels, targets and reconstructions.
 
     Returns:
-        the network is the better one.
+        whether the network is better.
     """
     config = load_config(configuration)
     torch.set_num_threads(config.compute.threads)
@@ -61,6 +61,6 @@ def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
     shown = [film for batch in batches[:_COLUMNS] for film in task.judge(network, batch, _COLUMNS)[1]][:_COLUMNS]
     picks = np.linspace(_FIRST_SHOWN, len(shown[0]) - 1, _ROWS).round().astype(int)
     sheet = np.concatenate([np.concatenate(list(film[picks]), axis=0) for film in shown], axis=1)
-    write_png(picture, headed(sheet, task.panels * len(shown), "After a minute of training", time_runs_down=True))
+    write_png(picture, add_header(sheet, task.panels * len(shown), "After a minute of training", time_runs_down=True))
     print(f"picture: {picture} (events, target, reconstruction; time runs down)")
     return loss < constant

@@ -1,10 +1,10 @@
-"""Draws what a training run has logged: its loss, smoothed, and that of the batch that it is judged by.
+"""Draw the log of a training run: its smoothed loss, and the loss of the held-out batch.
 
     python examples/draw_curve.py runs/firenet-cpu curve.png
     python examples/draw_curve.py runs/a runs/b curve.png --of lpips
 
-Of several runs the steps are counted on, as where one began with the weights of another. A part of the loss, as
-`--of lpips`, is the same measure where runs weight it otherwise.
+Several runs are drawn one after another, as if each had started with the weights of the one before. A part of the loss,
+such as `--of lpips`, can be compared between runs that weight it differently.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 from trainer.run.reporting import METRICS, read_metrics
 
 SHARE = 0.05
-"""Of a new reading in the smoothed loss."""
+"""Weight of a new reading in the smoothed loss."""
 
 
 def curves(runs: Sequence[Path], part: str = "total") -> tuple[dict[float, float], dict[float, float]]:
-    """Smoothed training loss (or a part of it) and held-out loss, by step."""
+    """Return the smoothed training loss (or a part of it) and the held-out loss, by step."""
     training: dict[float, float] = {}
     held_out: dict[float, float] = {}
     begun, smooth = 0, 0.0
@@ -36,12 +36,12 @@ def curves(runs: Sequence[Path], part: str = "total") -> tuple[dict[float, float
             if f"held_out_{part}" in record:
                 held_out[step] = record[f"held_out_{part}"]
         begun += records[-1]["step"]
-        held_out[begun + 0.5] = math.nan  # a gap: the next run may be judged by another batch
+        held_out[begun + 0.5] = math.nan  # a gap: the next run may have another held-out batch
     return training, held_out
 
 
 def draw(training: Mapping[float, float], held_out: Mapping[float, float], path: Path, label: str = "loss") -> None:
-    """Both over the steps, as a PNG."""
+    """Draw both losses over the steps, as a PNG."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7, 3.5))
@@ -56,11 +56,13 @@ def draw(training: Mapping[float, float], held_out: Mapping[float, float], path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of v2v-train, in their order")
+    parser.add_argument("runs", nargs="+", type=Path, help="run folders of v2v-train, in order")
     parser.add_argument("picture", type=Path)
-    parser.add_argument("--of", default="total", metavar="PART", help="of the loss: total, lpips, l1 (default total)")
+    parser.add_argument(
+        "--of", default="total", metavar="PART", help="part of the loss: total, lpips, l1 (default total)"
+    )
     asked = parser.parse_args(arguments)
     training, held_out = curves(asked.runs, asked.of)
     if not training:

@@ -1,9 +1,9 @@
-"""Does every network learn? Each is trained on the same four clips again and again, and its loss is drawn.
+"""Check that every network learns: train each repeatedly on the same four clips, and draw its loss.
 
     python examples/overfit.py --videos .demo/videos --work /tmp/overfit --plot overfit.png
 
-The first four videos of the folder are shrunk to 32 x 32 pixels; a virtual camera without noise looks at all of each. A
-network that is built right can learn four clips by heart. Sizes are reduced to what a processor does in some minutes.
+The first four videos of the folder are shrunk to 32 x 32 pixels, and a noise-free virtual camera sees all of each.
+A correctly built network can overfit to four clips. The networks are small enough for some minutes on a processor.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ RUNS: dict[str, dict[str, Any]] = {
         "stream.recipe.voxels_per_clip": 2,
     },
 }  # fmt: skip
-"""What differs between the networks; the rest is the configuration ``tiny-cpu``."""
+"""Settings that differ between the networks; :data:`_TINY` and :func:`overfit` have the common ones."""
 
 
 def shrink(videos: Iterable[Path], folder: Path, clips: int) -> None:
-    """The middle squares of the first frames of so many videos, as lossless clips; each is one sequence."""
+    """Write the central squares of the first frames of ``clips`` videos as lossless clips of one sequence each."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in islice(videos, clips):
         with av.open(str(path)) as container, av.open(str(folder / f"{path.stem}.mkv"), "w") as written:
@@ -58,7 +58,7 @@ def shrink(videos: Iterable[Path], folder: Path, clips: int) -> None:
 
 
 def overfit(name: str, clips: Path, out: Path, **changes: Any) -> list[tuple[int, float]]:
-    """Train a network of :data:`RUNS`; returns step and loss of each reading."""
+    """Train a network of :data:`RUNS`, and return step and loss of each reading."""
     settings = {
         "network.name": name, "stream.batch_size": 4, "run.seconds": 0, "run.steps": 100, "run.log_every": 2,
         "run.judge_every": 0, "run.preview_every": 0, "stream.recipe.preset": "noise-free",
@@ -87,12 +87,12 @@ run: {{epochs: 100000}}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--videos", required=True, type=Path, help="folder with at least four videos")
-    parser.add_argument("--work", required=True, type=Path, help="folder for clips and runs; an empty one")
-    parser.add_argument("--plot", type=Path, help="where to draw the curves")
-    parser.add_argument("--networks", default=",".join(RUNS), help="of %(default)s")
+    parser.add_argument("--work", required=True, type=Path, help="empty folder for clips and runs")
+    parser.add_argument("--plot", type=Path, help="PNG to write with the curves")
+    parser.add_argument("--networks", default=",".join(RUNS), help="networks to train (default %(default)s)")
     asked = parser.parse_args(arguments)
     shrink(sorted(asked.videos.iterdir()), asked.work / "clips", 4)
     curves = {name: overfit(name, asked.work / "clips", asked.work / name) for name in asked.networks.split(",")}
@@ -105,13 +105,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def draw(curves: dict[str, list[tuple[int, float]]], path: Path) -> None:
-    """Loss over steps, as a part of the first reading."""
+    """Draw the loss over steps, relative to the first reading."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7, 3.5))
     for name, curve in curves.items():
         axes.plot([step for step, _ in curve], [loss / curve[0][1] for _, loss in curve], label=name, linewidth=1.2)
-    axes.set_title("Four clips again and again: does each network learn them?")
+    axes.set_title("Overfitting to four clips: does each network learn them?")
     axes.set_xlabel("optimiser step")
     axes.set_ylabel("loss / first loss")
     axes.set_ylim(0, 1.1)

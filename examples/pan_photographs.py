@@ -1,10 +1,10 @@
-"""Makes training clips from photographs: each is panned, turned and zoomed, with patches of others that move over it.
+"""Make training clips from photographs: each is panned, turned and zoomed, with moving patches of others in front.
 
     python examples/pan_photographs.py PHOTOGRAPHS OUT --clips 120
 
-A few dozen photographs give a network more scenes than a handful of films do. Motion is smooth and random, as that of a
-camera held by hand; a patch is an ellipse of another photograph with its own motion, so that edges cover each other.
-PNG files that are transparent in part are objects cut out: they are patches of their own shape, and no backgrounds.
+A few dozen photographs give a network more scenes than a handful of films do. Motion is smooth and random, like that of
+a hand-held camera. A patch is an ellipse of another photograph with its own motion, so that edges occlude each other.
+PNG files with transparent parts are objects without background: they become patches of their own shape.
 """
 
 import argparse
@@ -19,14 +19,14 @@ WIDTH, HEIGHT, FRAMES, RATE = 320, 240, 130, 30
 
 
 def smooth(random: np.random.Generator, step: float) -> np.ndarray:
-    """A path of shape (FRAMES,) float64 from 0, whose change per frame is about `step` and itself changes slowly."""
+    """Return a path (FRAMES,) float64 from 0, whose change per frame is about `step` and varies slowly."""
     knots = random.normal(0, step, 8)
     speed = np.interp(np.linspace(0, 7, FRAMES), np.arange(8), knots)
     return np.asarray(np.cumsum(speed) - speed[0])
 
 
 def motion(random: np.random.Generator, speed: float) -> np.ndarray:
-    """Homographies (FRAMES, 3, 3) float64 in pixels: pan by about `speed` pixels a frame, with turns, zoom and tilt."""
+    """Return homographies (FRAMES, 3, 3) float64 in px: pan by about `speed` px per frame, turns, zoom, tilt."""
     x, y = smooth(random, speed), smooth(random, speed)
     angle, zoom = smooth(random, 0.004 * speed), np.exp(smooth(random, 0.002 * speed))
     tilt = smooth(random, 4e-6 * speed), smooth(random, 4e-6 * speed)
@@ -38,8 +38,8 @@ def motion(random: np.random.Generator, speed: float) -> np.ndarray:
     return steps
 
 
-def reduced(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """A photograph (H, W, 3) uint8 at a random scale, the smallest of which fills the frame half as large again."""
+def downscale(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Downscale a photograph (H, W, 3) uint8 randomly, to at least 1.5 times the size of the frame."""
     fill = 1.5 * max(WIDTH / photograph.shape[1], HEIGHT / photograph.shape[0])
     scale = min(fill * random.uniform(1, 2.5), 1.0)
     smaller = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -47,8 +47,8 @@ def reduced(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
-    """A patch (HEIGHT, WIDTH, 4) uint8: an ellipse of a photograph somewhere in the frame, transparent around it."""
-    picture = reduced(photographs[random.integers(len(photographs))], random)
+    """Return a patch (HEIGHT, WIDTH, 4) uint8: an ellipse of a photograph at a random place, transparent elsewhere."""
+    picture = downscale(photographs[random.integers(len(photographs))], random)
     if picture.shape[0] < HEIGHT or picture.shape[1] < WIDTH:
         picture = cv2.resize(picture, (WIDTH, HEIGHT))
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -58,7 +58,7 @@ def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.nd
 
 
 def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
-    """A patch (HEIGHT, WIDTH, 4) uint8: an object 60 to 200 pixels high somewhere in the frame."""
+    """Return a patch (HEIGHT, WIDTH, 4) uint8: an object 60 to 200 px high at a random place."""
     thing = objects[random.integers(len(objects))]
     scale = random.uniform(60, 200) / thing.shape[0]
     thing = cv2.resize(thing, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[:, :: random.choice((-1, 1))]
@@ -68,9 +68,9 @@ def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarra
 
 
 def clip(photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
-    """Frames (FRAMES, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
+    """Return frames (FRAMES, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
     frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    background = reduced(photographs[random.integers(len(photographs))], random)
+    background = downscale(photographs[random.integers(len(photographs))], random)
     start = np.eye(3)
     start[:2, 2] = -random.integers(0, np.maximum(np.array(background.shape[1::-1]) - (WIDTH, HEIGHT), 1))
     for t, step in enumerate(motion(random, pace(random))):
@@ -85,18 +85,18 @@ def clip(photographs: list[np.ndarray], objects: list[np.ndarray], random: np.ra
 
 
 def pace(random: np.random.Generator) -> float:
-    """Pixels a frame, from 0.2 to 3, slow as often as fast."""
+    """Return a speed in px per frame, from 0.2 to 3, uniform in its logarithm."""
     return float(np.exp(random.uniform(np.log(0.2), np.log(3))))
 
 
 def tone(random: np.random.Generator) -> np.ndarray:
-    """A table (256,) uint8 of exposure: gamma 0.6 to 1.6, some contrast taken away."""
+    """Return a lookup table (256,) uint8 of exposure: gamma 0.6 to 1.6, with reduced contrast."""
     low, high = random.uniform(0, 40), random.uniform(180, 255)
     return np.rint(low + (high - low) * (np.arange(256) / 255) ** random.uniform(0.6, 1.6)).astype(np.uint8)
 
 
 def write(path: Path, frames: np.ndarray) -> None:
-    """Encodes frames (T, H, W, 3) uint8, BGR, as H.264 with hardly a loss."""
+    """Encode frames (T, H, W, 3) uint8, BGR, as nearly lossless H.264."""
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=Fraction(RATE), options={"crf": "10", "preset": "veryfast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
@@ -118,7 +118,7 @@ def main() -> None:
     objects = [p for p in pictures if p.shape[2] == 4 and p[..., 3].min() < 255]
     photographs = [p[..., :3] for p in pictures if p.shape[2] == 3 or p[..., 3].min() == 255]
     if not photographs:
-        raise SystemExit(f"no photograph (JPEG or PNG) in {args.photographs}: {len(files)} files looked at")
+        raise SystemExit(f"no photograph in {args.photographs} ({len(files)} image files): give JPEG or opaque PNG")
     args.out.mkdir(parents=True, exist_ok=True)
     for index in range(args.clips):
         random = np.random.default_rng((args.seed, index))

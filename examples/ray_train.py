@@ -1,10 +1,10 @@
-"""Ray Train with a v2v stream: Ray starts the ranks, and starts them again where one is lost.
+"""Train with Ray Train on a v2v stream: Ray starts the ranks, and restarts them if one is lost.
 
     python -m examples.ray_train --connect tcp://127.0.0.1:5555 --storage /tmp/ray-train --ranks 2
 
-Every rank makes its own ``V2VStreamDataset`` in the train function: it takes rank and world size from
-torch.distributed, which Ray Train has set up. ``batch.resume_state`` of any rank holds for all, so that of rank 0 goes
-into the checkpoint, and all go on from there.
+Every rank creates its own ``V2VStreamDataset`` in the train function: it takes rank and world size from
+torch.distributed, which Ray Train has set up. ``batch.resume_state`` of any rank is valid for all, so the checkpoint
+holds that of rank 0, and all ranks resume from it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from v2v_client import V2VStreamDataset
 
 STATE = "state.pt"
 BINS = 5
-"""Of a voxel grid, in every recipe that does not say otherwise."""
+"""Bins of a voxel grid, in every recipe that does not set them."""
 
 
 def train_rank(settings: dict[str, Any]) -> None:
-    """What each rank does."""
+    """Run one rank: train, and report checkpoints."""
     rank = train.get_context().get_world_rank()
     dataset = V2VStreamDataset(settings["connect"], batch_size=settings["batch_size"], recipe=settings["recipe"])
     torch.manual_seed(0)
@@ -71,17 +71,17 @@ def train_rank(settings: dict[str, Any]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(description="Train a small network in Ray Train on a v2v stream.")
-    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="of v2v-serve")
-    parser.add_argument("--storage", required=True, metavar="DIR", help="where checkpoints lie; all nodes reach it")
+    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="address of v2v-serve")
+    parser.add_argument("--storage", required=True, metavar="DIR", help="folder for checkpoints, shared by all nodes")
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--epochs", type=int, default=1)
     parser.add_argument("--batch-size", type=int, default=2)
-    parser.add_argument("--recipe", type=json.loads, metavar="JSON", help="fields of a recipe; else the server's")
-    parser.add_argument("--failures", type=int, default=3, help="how often ranks that are lost are started again")
+    parser.add_argument("--recipe", type=json.loads, metavar="JSON", help="fields of a recipe (default: the server's)")
+    parser.add_argument("--failures", type=int, default=3, help="maximum number of restarts of lost ranks (default 3)")
     parser.add_argument("--gpus", action="store_true")
-    parser.add_argument("--seen", metavar="DIR", help="each rank notes there which samples it trained on")
+    parser.add_argument("--seen", metavar="DIR", help="folder in which each rank logs the samples it trained on")
     settings = vars(parser.parse_args(argv))
     result = TorchTrainer(
         train_rank,

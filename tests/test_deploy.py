@@ -47,6 +47,7 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
     venv = service["ExecStart"].partition("/bin/")[0]
     assert f"-m venv {venv}\n" in notes
     assert re.search(rf"useradd .* {service['User']}\n", notes)
+    assert notes.index("install -d /etc/v2v\n") < notes.index("/etc/v2v/serve.yaml")
     state = f"/var/lib/{service['StateDirectory']}"
     assert service["Environment"] == f"V2V_CACHE_DIR={state}"
     assert f"v2v-quarantine --videos /data/webvid --cache-dir {state}\n" in notes

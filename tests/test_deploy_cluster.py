@@ -214,8 +214,11 @@ PROGRAMS = {
     + "exec sleep 600\n",
     "srun": SAYS + 'while [ "${1#--}" != "$1" ]; do shift; done\nexec "$@"\n',
     "v2v-worker": SAYS + "exec sleep 600\n",
-    "v2v-train": SAYS + "trap 'touch \"$OUT/last.pt\"; exit 143' TERM\n$TRAINING\n",
-    "scontrol": SAYS,
+    "v2v-train": SAYS
+    + 'save() { echo saving >> "$LOG"; until [ -e "$OUT/may-save" ]; do sleep 0.05; done\n'
+    + 'touch "$OUT/last.pt"; echo saved >> "$LOG"; exit 143; }\n'
+    + "trap save TERM\n$TRAINING\n",
+    "scontrol": SAYS + 'kill -TERM "$PPID"\n',  # as Slurm ends a job that it requeues
 }
 
 
@@ -258,13 +261,15 @@ def _is_empty(group: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_batch_job_whose_time_is_up_saves_and_goes_on_later(tmp_path: Path) -> None:
+def test_a_batch_job_that_is_terminated_twice_saves_before_it_is_requeued_and_continues(tmp_path: Path) -> None:
     job = start_batch(tmp_path, "while true; do sleep 0.1; done")
     until(lambda: any(line.startswith("v2v-train") for line in said(tmp_path)))
     until(lambda: any(line.startswith("v2v-worker") for line in said(tmp_path)))
     job.send_signal(signal.SIGTERM)
+    until(lambda: "saving" in said(tmp_path))
+    job.send_signal(signal.SIGTERM)
+    (tmp_path / "may-save").touch()
     assert job.wait(timeout=60) == 143
-    assert said(tmp_path)[-1] == "scontrol requeue 1234567"
-    assert (tmp_path / "last.pt").exists()
+    assert said(tmp_path)[-2:] == ["saved", "scontrol requeue 1234567"]
     assert start_batch(tmp_path, "exit 0").wait(timeout=60) == 0
     assert any(f"--out {tmp_path} --resume {tmp_path}/last.pt" in line for line in said(tmp_path))

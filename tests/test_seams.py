@@ -73,8 +73,8 @@ from v2v_server.worker.arrays import makes
 
 
 @makes("depth")
-def depth(making, out):
-    out[:, 0] = 255.0 - making.view[making.source[list(making.recipe.target_steps)]]
+def depth(context, out):
+    out[:, 0] = 255.0 - context.view[context.source[list(context.recipe.target_steps)]]
 '''
 ARRAY_LINES = (
     ("v2v_protocol/sample.py", '    "flow_valid": lambda',
@@ -159,7 +159,7 @@ def test_a_toy_array_reaches_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_array_that_may_be_asked_for_is_made() -> None:
-    assert arrays.MAKERS.keys() == sample.ARRAYS.keys()
+    assert arrays.ARRAY_BUILDERS.keys() == sample.ARRAYS.keys()
 
 
 def test_the_toys_themselves_are_what_they_say() -> None:

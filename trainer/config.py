@@ -21,7 +21,7 @@ from trainer.tasks.task import chosen, limited
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
-from v2v_protocol.settings import Setting, nearest, of_type, settings_of, shown
+from v2v_protocol.settings import Setting, format_value, nearest, of_type, settings_of
 from v2v_protocol.spec import StreamSpec
 
 
@@ -109,8 +109,10 @@ class ComputeConfig:
 
     Attributes:
         device: "auto" takes a GPU if there is one.
-        precision: "float32" is IEEE's also on a GPU; "tf32" allows its shorter products; "bfloat16" runs convolutions
-            under autocast, while weights, sums of gradients, losses and pictures stay float32.
+        precision: "float32" computes IEEE float32 on a GPU too; "tf32" allows TF32 in cuDNN convolutions, which is
+            PyTorch's default, and keeps matrix products IEEE; "bfloat16" runs convolutions under autocast, while
+            weights, sums of gradients, losses and pictures stay float32. Scores are IEEE float32 with all three.
+        cudnn_benchmark: let cuDNN time its convolution algorithms and use the fastest; shapes are constant in a run.
         pieces: a batch is computed in so many pieces whose gradients are added up: less memory, the same step.
         channels_last: memory format of the network.
         compile: through ``torch.compile``: "step" one turn of each loop over time or over updates, which takes seconds;
@@ -118,16 +120,19 @@ class ComputeConfig:
         cuda_graph: forward and backward of a step as one CUDA graph, see :mod:`trainer.captured`.
         threads: of PyTorch on the CPU; 0: its own choice. Leave cores to the server's workers.
         seed: of the first weights.
+        group_timeout_seconds: time that a rank waits for the others in one exchange before the run fails.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    cudnn_benchmark: bool = True
     pieces: int = limited(1, 1, 65_536)
     channels_last: bool = False
     compile: Literal["none", "step", "clip"] = "none"
     cuda_graph: bool = False
     threads: int = limited(0, 0, 1024)
     seed: int = limited(0, 0, 2**63 - 1)
+    group_timeout_seconds: float = limited(7200.0, 1, 1e7)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +153,8 @@ class RunConfig:
         preview_samples: how many of its samples they show.
         validate: recordings (as ``v2v-eval --data``) that are scored at the ends of epochs; the best network so far is
             kept as best.pt. Empty: none.
+        validate_config: YAML file of ``v2v-eval``, or the name of a shipped one, that says which data sets and cuts
+            under ``validate`` are scored, and with which voxel grids. Empty: all recordings of that folder.
         validate_every: epochs between two scorings.
     """
 
@@ -164,6 +171,7 @@ class RunConfig:
     preview_every: int = limited(500, 0, 10**9)
     preview_samples: int = limited(2, 1, 64)
     validate: str = ""
+    validate_config: str = ""
     validate_every: int = limited(1, 1, 1_000_000)
 
 
@@ -206,6 +214,11 @@ class TrainConfig:
         StreamSpec.from_dict(self.stream.spec)
         if "bins" in self.network.options:
             raise UsageError("network.options.bins: set stream.recipe.bins instead, the network follows it")
+        if self.run.validate_config and not self.run.validate:
+            raise UsageError(
+                f"run.validate_config = {self.run.validate_config}: run.validate is missing; give the folder of the "
+                "recordings"
+            )
         task.check(self.loss, self.stream.resolved_recipe)
 
     def with_network_options(self, options: Mapping[str, Any], **changes: Any) -> TrainConfig:
@@ -255,7 +268,7 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _section(kind: Any, name: str, content: Any) -> Any:
     if not isinstance(content, Mapping):
-        raise UsageError(f"{name} = {shown(content)}: it is a section, give keys and values")
+        raise UsageError(f"{name} = {format_value(content)}: it is a section, give keys and values")
     hints, stated = typing.get_type_hints(kind), settings_of(kind)
     for key in content:
         if key not in hints:
@@ -275,5 +288,5 @@ def setting_of(key: str, hint: Any, value: Any, stated: Setting | None = None) -
     if setting is not None:
         return setting.check(key, value)
     if hint == Mapping[str, Any] and not isinstance(value, Mapping):
-        raise UsageError(f"{key} = {shown(value)}: give keys and values")
+        raise UsageError(f"{key} = {format_value(value)}: give keys and values")
     return copy.deepcopy(value)

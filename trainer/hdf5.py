@@ -1,4 +1,4 @@
-"""Reading HDF5 files of strangers: a file may name other files, and what it names must not be read."""
+"""Check HDF5 files from untrusted sources: a file may refer to other files, which must not be read."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
 
     Args:
         file: the open file.
-        path: its name, for the message.
+        path: its path, for the error message.
 
     Raises:
         UsageError: it has an external link, a dataset with external storage or a virtual dataset.
-        OSError, RuntimeError, KeyError, ValueError: h5py's, of a damaged file.
+        OSError, RuntimeError, KeyError, ValueError: h5py's errors, if the file is damaged.
     """
     groups, seen = [file["/"]], set[int]()
     while groups:
@@ -26,8 +26,8 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
         for name in group:
             link = group.get(name, getlink=True)
             if isinstance(link, h5py.ExternalLink):
-                raise _names_another(path, f"{group.name}/{name}", f"links to {link.filename}")
-            if isinstance(link, h5py.SoftLink):  # of this file: what it leads to is checked in its own place
+                raise _external_error(path, f"{group.name}/{name}", f"links to {link.filename}")
+            if isinstance(link, h5py.SoftLink):  # within this file: its target is visited by itself
                 continue
             item = group[name]
             if isinstance(item, h5py.Group):
@@ -37,11 +37,11 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
                     groups.append(item)
             elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
                 kind = "a virtual dataset" if item.is_virtual else "a dataset with external storage"
-                raise _names_another(path, f"{group.name}/{name}", f"is {kind}")
+                raise _external_error(path, f"{group.name}/{name}", f"is {kind}")
 
 
-def _names_another(path: Path, name: str, what: str) -> UsageError:
+def _external_error(path: Path, name: str, what: str) -> UsageError:
     return UsageError(
-        f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make a file of its own with "
-        "h5repack or h5copy -f ext"
+        f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make the file "
+        "self-contained with h5repack or h5copy -f ext"
     )

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+from torch.torch_version import TorchVersion
 
 from trainer.captured import CapturedGradients
-from trainer.config import OptimizerConfig, RunConfig, TrainConfig, setting_of
+from trainer.config import ComputeConfig, OptimizerConfig, RunConfig, TrainConfig, setting_of
 from trainer.models import NETWORKS, VoxelNetwork
 from trainer.precision import bfloat16_products
 from trainer.run.checkpoint import Checkpoint
@@ -139,7 +140,12 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
         raise UsageError("compute.cuda_graph = true: there is no GPU here; leave it out")
     if compute.cuda_graph and ranks.world_size > 1:
         raise UsageError("compute.cuda_graph = true: on one rank only, ranks exchange gradients outside of a graph")
-    _set_numerics(compute.precision)
+    if compute.compile == "step" and TorchVersion(torch.__version__) < "2.7":
+        raise UsageError(
+            f"compute.compile = step: PyTorch is {torch.__version__}, and this needs 2.7 or later; update it, or take "
+            "clip, or none"
+        )
+    _set_numerics(compute)
     torch.manual_seed(compute.seed)
     network = _network(config)
     if compute.channels_last:
@@ -227,10 +233,11 @@ def _seed(seed: int, rank: int, step: int) -> int:
     return int.from_bytes(hashlib.blake2b(f"{seed} {rank} {step}".encode(), digest_size=8).digest(), "little")
 
 
-def _set_numerics(precision: str) -> None:
-    """float32 is IEEE's on a GPU as well, unless the configuration says "tf32" (10 bits of 23 in products)."""
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "tf32"
-    torch.backends.cudnn.benchmark = True  # shapes do not change within a run
+def _set_numerics(compute: ComputeConfig) -> None:
+    """Set how a GPU computes float32. TF32 keeps 10 of 23 bits of the factors in a product."""
+    torch.backends.cuda.matmul.allow_tf32 = False
+    torch.backends.cudnn.allow_tf32 = compute.precision == "tf32"
+    torch.backends.cudnn.benchmark = compute.cudnn_benchmark
 
 
 def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
@@ -279,7 +286,7 @@ def obeying_weights(config: TrainConfig) -> TrainConfig:
     if not config.network.weights:
         return config
     try:
-        found = read_weights(config.network.weights).recognised()
+        found = read_weights(config.network.weights).recognise()
     except UsageError as error:
         raise UsageError(f"network.weights: {error}") from error
     if found is None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from trainer.config import TrainConfig
 from trainer.feed import Feed, held_out_batch, stream
 from trainer.learner import Learner
-from trainer.run.checkpoint import BEST, LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint
+from trainer.run.checkpoint import BEST, LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint, unwritable
 from trainer.run.distributed import Ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import Meter, Reporter
+from trainer.run.validation import Validation
 from v2v_protocol.errors import UsageError, V2VError
 
 
@@ -58,10 +59,15 @@ def train(
         batches = islice(batches, max(0, run.steps - step))
     judges = ranks.first and (run.judge_every or run.preview_every)
     held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
-    validate = task.validator(learner.trained, Path(run.validate)) if run.validate and ranks.first else None
+    validation = Validation(task, learner.trained, run, ranks) if run.validate else None
+    # The first batch comes before anything is written: a server that refuses the run leaves its folder untouched.
+    taken = stop.until(batches)
+    first = list(islice(taken, 1))
+    if not first and ranks.any(stop.failure is not None):
+        raise stop.failure or UsageError("another rank got no data: see its message")
 
     meter = Meter(ranks)
-    begun, saved, judged = step, None, None
+    begun, saved, judged = step, None, step
 
     def look() -> None:
         """Read the meter: from time to time, and always before anything is saved."""
@@ -92,14 +98,36 @@ def train(
             return
         try:
             save_checkpoint(out / name, learner.checkpoint(step, position))
+            if name not in (LAST, BEST):
+                prune_epochs(out, run.keep_epochs)
         except OSError as error:
-            raise UsageError(
-                f"step {step} cannot be saved as {out / name}: {error.strerror}; what was saved before is as it was"
-            ) from error
+            raise UsageError(f"step {step} cannot be saved as {unwritable(out, name, error)}") from error
+
+    def validate(epochs: int) -> None:
+        """Score the network on recordings after ``epochs`` whole epochs, if that is due, and keep the best."""
+        nonlocal saved
+        if validation is None or epochs % run.validate_every != 0:
+            return
+        look()
+        if saved != step and step > begun:
+            save(LAST)  # validation may take long, and fail
+            saved = step
+        scores = validation(baseline=epochs == run.validate_every, stopping=lambda: stop.signal > 0)
+        if scores and reporter.validated(step, scores):
+            save(BEST)
 
     with Reporter(out, speaks=ranks.first, step=step) as reporter:
         reporter.configuration(config)
-        for batch in stop.until(batches):
+        if held_out is not None and first and step == 0:
+            judge(with_films=False)
+        if validation is not None and not ranks.from_first(step == 0 or reporter.is_validated(step)):
+            # A run that ended within a validation has it when it goes on.
+            if position is not None and position["position"] == 0:
+                validate(epoch)
+            if ranks.any(stop.wanted):
+                first.clear()
+        for batch in chain(first, taken):
+            first.clear()  # its memory is free once its step is done
             values = learner.step(task.prepare(batch, batch.epoch), step, batch.epoch)
             step, epoch, position = step + 1, batch.epoch, batch.resume_state
 
@@ -120,12 +148,8 @@ def train(
                 saved = step
             if keep:
                 save(epoch_name(epoch))
-                if ranks.first:
-                    prune_epochs(out, run.keep_epochs)
-            if validate is not None and ended and (epoch + 1) % run.validate_every == 0:
-                look()
-                if reporter.validated(step, validate()):
-                    save(BEST)
+            if ended:
+                validate(epoch + 1)
         # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
         if saved != step and (step > begun or stop.failure is None):
             look()

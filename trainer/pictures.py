@@ -1,6 +1,6 @@
-"""Films of events, grey pictures and flow side by side, as PNG and as video. Images are RGB.
+"""Draw films of events, grey pictures and flow side by side, as PNG and as video. Images are RGB.
 
-Events are drawn as the sum over the bins of a voxel grid, all in the colours of :mod:`v2v_pictures.colours`.
+Events are drawn as the sum over the bins of a voxel grid, in the colours of :mod:`v2v_pictures.colours`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from v2v_protocol.errors import UsageError
 GAP_PX = 4
 SMALLEST_TILE_PX = 128
 LEAST_COUNT = 1e-3
-"""Less is what rounding leaves of interpolated events that cancel."""
+"""Smaller sums are rounding errors of interpolated events that cancel, and are drawn as 0."""
 FULL_COLOUR_QUANTILE = 0.98
 CODEC = "vp09"
-"""VP9: the one codec of OpenCV's wheels that browsers show too."""
+"""VP9, the only codec in OpenCV's wheels that browsers also play."""
 
 EVENTS = "events"
 """The name of a panel of events."""
@@ -32,31 +32,31 @@ Image = npt.NDArray[np.uint8]
 
 
 def draw_events(voxels: npt.NDArray[np.generic]) -> Image:
-    """[..., bins, H, W] signed counts -> [..., H, W, 3], in one scale."""
+    """Draw signed counts [..., bins, H, W] as [..., H, W, 3], all in one scale."""
     counts = voxels.astype(np.float32).sum(axis=-3)
     counts[np.abs(counts) < LEAST_COUNT] = 0
     return colours.draw_events(counts, colours.full_colour([counts]))
 
 
 def draw_grey(pictures: npt.NDArray[np.floating]) -> Image:
-    """[..., H, W] in 0 .. 1 (clipped) -> [..., H, W, 3]."""
+    """Draw grey values [..., H, W] in 0 .. 1 (clipped) as [..., H, W, 3]."""
     return colours.draw_grey(pictures)
 
 
 def flow_scale(flow: npt.NDArray[np.floating]) -> float:
-    """The length in px, not 0, that is drawn in full colour."""
+    """Return the length that is drawn in full colour, in px, at least 0.1."""
     return max(float(np.quantile(np.hypot(flow[..., 0, :, :], flow[..., 1, :, :]), FULL_COLOUR_QUANTILE)), 0.1)
 
 
 def draw_flow(flow: npt.NDArray[np.floating], scale: float) -> Image:
-    """[..., 2, H, W] (x, y) px -> [..., H, W, 3]; full colour at ``scale``, darker beyond it."""
+    """Draw flow [..., 2, H, W] (x, y) px as [..., H, W, 3], with full colour at ``scale`` px and darker beyond it."""
     fields = flow.reshape(-1, *flow.shape[-3:])
     drawn = np.stack([colours.draw_flow(field, scale) for field in fields])
     return drawn.reshape(*flow.shape[:-3], *drawn.shape[1:])
 
 
 def side_by_side(panels: Sequence[Image]) -> Image:
-    """Films [T, H, W, 3] as one; small ones are enlarged by a whole factor."""
+    """Join films [T, H, W, 3] side by side. Small ones are enlarged by an integer factor."""
     factor = max(1, -(-SMALLEST_TILE_PX // min(panels[0].shape[1:3])))
     tiles = [panel.repeat(factor, axis=1).repeat(factor, axis=2) for panel in panels]
     edge = ((0, 0), (0, GAP_PX), (0, GAP_PX), (0, 0))
@@ -64,22 +64,26 @@ def side_by_side(panels: Sequence[Image]) -> Image:
 
 
 def contact_sheet(film: Image, steps: int = 5) -> Image:
-    """[T, height, width, 3] -> [steps * height, width, 3]: evenly spaced times below each other, the last included."""
+    """Stack ``steps`` evenly spaced frames of a film [T, height, width, 3] vertically, including the last.
+
+    Returns:
+        [steps * height, width, 3], or [T * height, width, 3] if the film has fewer frames.
+    """
     picks = np.unique(np.linspace(0, len(film) - 1, steps + 1).round().astype(int)[1:])
     return np.concatenate(list(film[picks]), axis=0)
 
 
-def headed(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_down: bool = False) -> Image:
-    """A picture of equally wide columns, with the name of each above it; red and blue are said in red and blue.
+def add_header(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_down: bool = False) -> Image:
+    """Add the names of a picture's equally wide columns above it, and a legend of the events' colours.
 
     Args:
-        picture: [height, width, 3], as :func:`side_by_side` and :func:`contact_sheet` give it.
-        panels: names of its columns; none leaves the picture as it is.
-        title: of the whole, or nothing.
-        time_runs_down: an arrow on the left says so.
+        picture: [height, width, 3], as returned by :func:`side_by_side` and :func:`contact_sheet`.
+        panels: names of its columns; if empty, the picture is returned unchanged.
+        title: title above the names; "" for none.
+        time_runs_down: whether to draw an arrow labelled "time" on the left.
 
     Returns:
-        [height + more, width + more, 3] uint8.
+        [height + header, width + margin, 3] uint8.
     """
     if not panels:
         return picture
@@ -103,7 +107,7 @@ def headed(picture: Image, panels: Sequence[str], title: str = "", *, time_runs_
 
 
 def write_png(path: Path, image: Image) -> None:
-    """As PNG; folders are made.
+    """Write an image as PNG and create missing folders.
 
     Raises:
         UsageError: the folder cannot be written to.
@@ -116,14 +120,11 @@ def write_png(path: Path, image: Image) -> None:
 
 
 class Video:
-    """An MP4 video (VP9), a frame at a time; a context manager.
+    """Write an MP4 video (VP9) frame by frame, as a context manager.
 
     Args:
-        path: to write to.
-        fps: frames a second.
-
-    Raises:
-        UsageError: the folder cannot be written to, or OpenCV was built without the codec.
+        path: file to write.
+        fps: frames per second.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -131,15 +132,19 @@ class Video:
         self._writer: cv2.VideoWriter | None = None
 
     def add(self, image: Image) -> None:
-        """[H, W, 3], every time the same size."""
-        # Colour is stored at half the size: the encoder wants even numbers.
+        """Append a frame [H, W, 3]. All frames must have the same size.
+
+        Raises:
+            UsageError: OpenCV cannot write the file, or was built without the codec.
+        """
+        # Colour is stored at half resolution, so the encoder needs even sizes.
         image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), constant_values=255)
         if self._writer is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             size = (image.shape[1], image.shape[0])
             self._writer = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*CODEC), self._fps, size)
             if not self._writer.isOpened():
-                raise UsageError(f"{self._path}: OpenCV cannot write a video ({CODEC}) there")
+                raise UsageError(f"{self._path}: OpenCV cannot write a video there with codec {CODEC}")
         self._writer.write(np.ascontiguousarray(image[..., ::-1]))
 
     def __enter__(self) -> Video:

@@ -146,7 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)
     if config.compute.threads:
         torch.set_num_threads(config.compute.threads)
-    with ranks(config.compute.device) as mine:
+    with ranks(config.compute.device, config.compute.group_timeout_seconds) as mine:
         if config.compute.precision == "bfloat16" and mine.device.type == "cpu" and _lacks_bfloat16():
             print(
                 "v2v-train: warning: this processor has bfloat16 in software only, nine times slower than float32: "

@@ -5,14 +5,15 @@ from v2v_client import V2VStreamDataset
 for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
     batch.voxels  # int8 [B, T, bins, H, W]
 
-The rooms:
+Modules and folders:
 
-    dataset     the dataset; its batch, delivery (samples to batches) and ordering; options: what may be asked for
-    session/    conversation (pure: states, messages, times), connection (holds it over a link), link (the socket)
-    memory/     arena (workers of this host may write there), slots (whose row is whose), buffers (used again)
-    position/   plan (which samples are whose), state (what is saved), position (of one copy), shared (of all copies)
-    loaders     what loaders and loops of others need; in_process: samples by index, without a server; look: pictures
-    tools/      the load test; local_server: a server of one's own
+    dataset     the dataset; its batch, delivery (samples to batches) and ordering; options: what a consumer may request
+    session/    conversation (pure: states, messages, times), connection (runs it over a link), link (the socket)
+    memory/     arena (workers of this host write there), slots (which sample has which row), buffers (reused)
+    position/   plan (who gets which samples), state (what is saved), position (of one copy), shared (of all copies)
+    loaders     adjustments for other loaders and training loops
+    in_process  samples by index, without a server; notebook: their pictures
+    tools/      the load test; local_server: a server as a subprocess
 """
 
 from v2v_client.batch import Batch

@@ -1,4 +1,4 @@
-"""One batch, as the trainer sees it."""
+"""Define the batch that a dataset yields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client import look
+from v2v_client import notebook
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
@@ -22,18 +22,18 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Batch:
-    """Samples of one batch, in the order of the epoch.
+    """Hold the samples of one batch, in the order of the epoch.
 
     Attributes:
-        arrays: the tensors that were asked for, by name; those of the next four names are at hand as attributes too.
+        arrays: the requested tensors by name. "voxels", "frames", "flow" and "flow_valid" are also attributes.
         indices: global index of each sample.
-        epoch: of the samples.
-        provenance: where each sample came from.
-        resume_state: the state after this batch, for :meth:`v2v_client.dataset.V2VStreamDataset.load_state_dict`:
-            save that of the last batch you trained on. It holds for any number of loader workers.
+        epoch: epoch of the samples.
+        provenance: origin of each sample.
+        resume_state: the state after this batch, for :meth:`v2v_client.dataset.V2VStreamDataset.load_state_dict`.
+            Save the state of the last batch you trained on. It is valid for any number of loader workers.
         wait_seconds: how long the consumer (with a DataLoader: the loader worker) waited for this batch.
         cpu_seconds: processor time that the server's workers spent on it.
-        decodes: clips that were decoded for it; fewer than its samples where siblings share one.
+        decodes: clips decoded for it; fewer than its samples if siblings share a decode.
     """
 
     arrays: Mapping[str, torch.Tensor]
@@ -49,24 +49,24 @@ class Batch:
         return len(self.indices)
 
     def keys(self) -> KeysView[str]:
-        """Names of the tensors; with these, ``dict(batch)`` and ``network(**batch)`` give them by name."""
+        """Return the names of the tensors. They make ``dict(batch)`` and ``network(**batch)`` work."""
         return self.arrays.keys()
 
     def __getitem__(self, name: str) -> torch.Tensor:
-        """The tensor of that name.
+        """Return the tensor called ``name``.
 
         Raises:
-            KeyError: this batch has none of that name.
+            KeyError: the batch has no tensor of that name.
         """
         if name not in self.arrays:
-            raise KeyError(f"{name!r}: this batch has {', '.join(self.arrays)}, each by its name")
+            raise KeyError(f"{name!r}: this batch has {', '.join(self.arrays)}; index it by one of these names")
         return self.arrays[name]
 
     def __contains__(self, name: object) -> bool:
         """Return whether the batch has a tensor of that name."""
         return name in self.arrays
 
-    __iter__ = None  # its length counts samples and its keys are tensors: neither can be what a loop over it means
+    __iter__ = None  # ambiguous: the length counts samples, the keys name tensors
 
     def __repr__(self) -> str:
         arrays = "".join(
@@ -77,18 +77,18 @@ class Batch:
         return f"Batch({arrays}epoch {self.epoch}, indices {some})"
 
     def show(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """The first samples as a picture, which a notebook displays.
+        """Draw the first 3 samples as a picture, which a notebook displays.
 
         Args:
-            path: a PNG to write too.
+            path: PNG file to write as well; None writes no file.
 
         Returns:
             A PIL image.
 
         Raises:
-            UsageError: voxels or frames were not asked for, or pillow or av is not installed.
+            UsageError: the batch has no voxels or no frames, or pillow or av is not installed.
         """
-        return look.shown(self._picture(), path)
+        return notebook.to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
         spec = self.resume_state.get("spec")
@@ -98,94 +98,95 @@ class Batch:
             ({name: tensor[place].cpu().numpy() for name, tensor in self.arrays.items()}, self.provenance[place])
             for place in range(count)
         ]
-        return look.picture(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
+        return notebook.draw_samples(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
     def _repr_png_(self) -> bytes | None:
-        return look.png_or_none(self._picture)
+        return notebook.try_png(self._picture)
 
     def _repr_html_(self) -> str:
         rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
-        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + look.img(self._repr_png_())
+        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + notebook.html_image(self._repr_png_())
 
     @property
     def voxels(self) -> torch.Tensor:
-        """[B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
+        """Return the voxel grids: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
 
         Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
 
         Raises:
-            UsageError: the dataset did not ask for this array.
+            UsageError: the dataset did not request this array.
         """
         return self._array("voxels")
 
     @property
     def frames(self) -> torch.Tensor:
-        """[B, T + lead_frames, 1, H, W] uint8, the pixels that were simulated.
+        """Return the simulated pixels: [B, T + lead_frames, 1, H, W] uint8.
 
         Raises:
-            UsageError: the dataset did not ask for this array.
+            UsageError: the dataset did not request this array.
         """
         return self._array("frames")
 
     @property
     def flow(self) -> torch.Tensor:
-        """[B, T, 2, H, W] float16, px in (x, y).
+        """Return the optical flow: [B, T, 2, H, W] float16, (x, y) in px.
 
         flow[:, t] belongs to voxel t of the target sequence and is zero before ``flow_from``.
 
         Raises:
-            UsageError: the dataset did not ask for this array.
+            UsageError: the dataset did not request this array.
         """
         return self._array("flow")
 
     @property
     def flow_valid(self) -> torch.Tensor:
-        """[B, T, 1, H, W] uint8, 1 where forward and backward flow agree.
+        """Return the validity of the flow: [B, T, 1, H, W] uint8, 1 where forward and backward flow agree.
 
         Raises:
-            UsageError: the dataset did not ask for this array.
+            UsageError: the dataset did not request this array.
         """
         return self._array("flow_valid")
 
     def _array(self, name: str) -> torch.Tensor:
         if name not in self.arrays:
             raise UsageError(
-                f"batch.{name}: this batch has only {', '.join(self.arrays)}; make the dataset with "
+                f"batch.{name}: this batch has only {', '.join(self.arrays)}; create the dataset with "
                 f"arrays={(*self.arrays, name)!r}, or check `{name!r} in batch` first"
             )
         return self.arrays[name]
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the tensors."""
+        """Return the size of all tensors in bytes."""
         return sum(tensor.nbytes for tensor in self.arrays.values())
 
     def pin_memory(self) -> Batch:
-        """A copy in page-locked memory; what ``DataLoader(pin_memory=True)`` calls."""
+        """Return a copy in page-locked memory. ``DataLoader(pin_memory=True)`` calls this."""
         return dataclasses.replace(self, arrays={name: tensor.pin_memory() for name, tensor in self.arrays.items()})
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Batch:
-        """This batch with its tensors on ``device``.
+        """Return this batch with its tensors on ``device``.
 
         Args:
             non_blocking: True returns before the copy is done, if this batch is in page-locked memory or on a device.
-                A copy from other memory is waited for: once this batch is dropped, samples are put there again.
+                A copy from other memory is always completed first, because that memory is reused for new samples once
+                this batch is dropped.
         """
 
-        def moved(item: torch.Tensor) -> torch.Tensor:
-            # PyTorch keeps page-locked memory until the copy is done; of ours it knows nothing.
+        def move(item: torch.Tensor) -> torch.Tensor:
+            # PyTorch keeps page-locked memory until the copy is done, but does not track this library's memory.
             safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
             return item.to(device, non_blocking=safe)
 
-        return dataclasses.replace(self, arrays={name: moved(item) for name, item in self.arrays.items()})
+        return dataclasses.replace(self, arrays={name: move(item) for name, item in self.arrays.items()})
 
 
 def _collate(batches: Any, *, collate_fn_map: Any) -> Any:
     raise UsageError(
-        "DataLoader puts samples together to batches, and V2VStreamDataset gives whole ones: "
-        "DataLoader(dataset, batch_size=None, ...), and the size to V2VStreamDataset(..., batch_size=...)"
+        "DataLoader collates samples, but V2VStreamDataset yields whole batches: use "
+        "DataLoader(dataset, batch_size=None, ...) and V2VStreamDataset(..., batch_size=...)"
     )
 
 
-# PyTorch's place for what its default collate function shall do with a type it does not know.
+# PyTorch's registry of collate functions for custom types.
 default_collate_fn_map[Batch] = _collate

@@ -1,4 +1,4 @@
-"""The stream as a PyTorch dataset."""
+"""Provide the stream as a PyTorch dataset."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from v2v_client.delivery import deliver
 from v2v_client.loaders import (
     end_with_parent,
     is_evaluated_by_lightning,
-    require_epoch_of_ours,
-    require_in_step_with_lightning,
+    refuse_epoch_of_accelerate,
+    require_lightning_epoch,
     send_before_exit,
 )
 from v2v_client.local_server import LocalServer, recipe_flags
@@ -47,83 +47,83 @@ from v2v_protocol.tables import html_table
 
 _log = logging.getLogger(__name__)
 _REPEATED = (
-    "the last pass was left before the end of epoch {epoch}, and this pass delivers the same samples again. To go on "
+    "the last pass was left before the end of epoch {epoch}, and this pass delivers the same samples again. To resume "
     "instead, call dataset.load_state_dict(batch.resume_state), with the last batch trained on, before each pass; for "
     "other samples, call dataset.set_epoch(n) with another n for each pass. To repeat them on purpose, call "
     "dataset.set_epoch({epoch}) before each pass"
 )
 _NOT_SHARED = (
-    "samples of one decode go to different ranks or loader workers here, so each is decoded for itself: the stream was "
-    "begun with another batch size, world size or number of loader workers. Its samples are the same all the same"
+    "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "
+    "begun with another batch size, world size or number of loader workers. The samples do not change"
 )
 
 
 class V2VStreamDataset(IterableDataset[Batch]):
-    """Whole batches of freshly simulated event-camera clips, from a v2v server.
+    """Stream batches of freshly simulated event-camera clips from a v2v server.
 
         for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
             batch.voxels  # int8 [B, T, bins, H, W]
 
     Iterate it directly, or through ``DataLoader(dataset, batch_size=None, num_workers=..., pin_memory=...)``. Each
-    loader worker opens a connection of its own and takes every num_workers-th batch; the batches and their order are
-    the same however many there are. With ``in_order=False`` the order is not, and no state is right: that of a batch
-    counts those before it in the epoch as delivered.
+    loader worker opens its own connection and takes every num_workers-th batch. The batches and their order do not
+    depend on the number of loader workers. Do not use ``in_order=False``: it changes the order and makes every state
+    wrong, because the state of a batch counts all earlier batches of the epoch as delivered.
 
-    One iteration is one epoch from its beginning. Finishing it advances the epoch; leaving it early and iterating again
-    repeats it, with a RepeatedSamplesWarning the first time (not after a look at one batch). After
-    :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples
-    and equally many batches; what does not fill a global batch at the end of an epoch is dropped.
+    One iteration is one epoch from its beginning. Finishing it advances the epoch. Leaving it early and iterating again
+    repeats it, with a RepeatedSamplesWarning the first time (not after inspecting a single batch). After
+    :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples and equally many
+    batches. Samples that do not fill a global batch at the end of an epoch are dropped.
 
     With loader workers, an epoch counts as finished once every worker has delivered its share, which is a few
-    prefetched batches before the training loop sees the last one. A loop that may leave that early calls
-    :meth:`set_epoch` before each iteration; with ``persistent_workers`` it always should.
+    prefetched batches before the training loop sees the last one. A loop that may leave an epoch during these batches
+    must call :meth:`set_epoch` before each iteration. With ``persistent_workers``, always call it.
 
     Args:
-        address: of the server, ``tcp://host:port``; or of several that serve the same videos, in a list or with commas
-            between them. Each rank takes from its own (:mod:`v2v_client.session.brokers`), and from another where that
-            is lost: no sample is lost thereby, and none comes twice.
-        batch_size: samples of one rank's batch.
-        arrays: which of "voxels", "frames", "flow" and "flow_valid" to receive. It never changes what they hold.
+        address: the server's ``tcp://host:port``, or those of several servers of the same videos, as a list or
+            separated by commas. Each rank uses its own server (:mod:`v2v_client.session.brokers`). If that one is lost,
+            it continues with another: no sample is lost or repeated.
+        batch_size: samples in one rank's batch.
+        arrays: which of "voxels", "frames", "flow" and "flow_valid" to receive. It does not affect their content.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
-        seed: of all random draws and of the order.
-        epoch: the first one.
-        rank: of this process; None: that of torch.distributed when it is initialised, else 0.
-        world_size: how many ranks share an epoch; None: that of torch.distributed, else 1.
-        shared_memory: whether server workers on this host may put samples into memory of this process, which saves
-            most of what moving them costs; where they cannot, samples come in messages by themselves.
-        compress: whether samples shall be compressed on their way here, which takes a server worker some 5 % of their
-            time; None: only from a server on another host.
-        keys: file of this consumer's key, see `v2v-keys`; None takes what ``V2V_KEYS`` names, which ranks and loader
-            workers inherit; "" takes none.
-        timeout_seconds: silence after which the server is taken for lost.
-        patience: the other times; None for the defaults. Its ``timeout_seconds`` is not used.
+        seed: determines all random draws and the order of the samples.
+        epoch: the first epoch.
+        rank: rank of this process; None: that of torch.distributed if it is initialised, else 0.
+        world_size: number of ranks that share an epoch; None: that of torch.distributed, else 1.
+        shared_memory: whether server workers on this host may write samples into memory of this process, which saves
+            most of the cost of moving them. Workers that cannot do so send samples in messages.
+        compress: whether samples are compressed for transport, which costs a server worker about 5 % of its time;
+            None: only if the server is on another host.
+        keys: path of this consumer's key file, see `v2v-keys`; None uses the file that ``V2V_KEYS`` names, which ranks
+            and loader workers inherit; "" uses no key.
+        timeout_seconds: silence after which the server counts as lost.
+        patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
         options: ``preset`` ("exact", "balanced" or "fast": speed, see :data:`v2v_protocol.spec.SPEED_PRESETS`) and
-            fields of :class:`v2v_protocol.spec.StreamSpec`, which may change what it sets; None takes the server's.
+            fields of :class:`v2v_protocol.spec.StreamSpec`, which override the preset; None takes the server's.
 
-    A sample is made once for the position it is asked for; what a crash or a cut swallows is asked for again. So each
-    sample comes once relative to the state that was saved, whichever process died in between.
+    Each sample is requested for its position in the order; samples that a crash or disconnect loses are requested
+    again. So each sample arrives exactly once relative to the saved state, whichever process died in between.
 
-    Memory of an iterating process (each loader worker is one), however slow its trainer, with S bytes in a sample, k
-    batches that the trainer itself still holds, and a credit of C samples. The server grants twice ``batch_size``, or
-    twice its number of workers if that is more; where K = ``samples_per_decode`` share a decode, a seventh more than
-    K (1 + ceil(2 workers / batch_size)) batches. It never grants more than 400 samples, nor more than its
-    ``--max-credit-bytes`` hold.
+    The memory of an iterating process (each loader worker is one) does not depend on the trainer's speed. Let S be the
+    bytes of a sample, k the batches that the trainer holds, and C the credit in samples. The server grants twice
+    ``batch_size``, or twice its number of workers if that is more. If K = ``samples_per_decode`` samples share a
+    decode, it grants a seventh more than K (1 + ceil(2 workers / batch_size)) batches. It never grants more than 400
+    samples, nor more than its ``--max-credit-bytes`` hold.
 
-        received, waiting              C S           (2 C S while everything is asked for again)
+        received, waiting              C S           (2 C S while all requests are sent again)
         batches being filled and held  (ceil(C / batch_size) + 2 + k) batch_size S
         at the server, not yet sent    C S
         between iterations             (ceil(C / batch_size) + 2) batch_size S: buffers, kept for the next
 
-    Where workers on this host put samples into memory of this process, the first and the third are next to nothing.
+    If workers on this host write samples into memory of this process, the first and the third are close to 0.
 
-    Iterating raises ServerLost (nothing heard for ``timeout_seconds``), RemoteError (the server refuses), KeyRefused
-    (it takes no such key), SampleUnavailable (a sample cannot be made), StateMismatch (the server offers another stream
-    than the one begun), ProtocolError (it is no v2v server), UsageError (the epoch holds no whole global batch). From a
-    loader worker they come out as the same kinds, with the worker's trace in their text; one that was killed is a
-    RuntimeError of PyTorch.
+    Iterating raises ServerLost (nothing received for ``timeout_seconds``), RemoteError (the server refuses), KeyRefused
+    (the server does not accept the key), SampleUnavailable (a sample cannot be made), StateMismatch (the server offers
+    another stream than the one begun), ProtocolError (the peer is not a v2v server) or UsageError (the epoch is smaller
+    than a global batch). Errors in a loader worker arrive as the same types, with the worker's traceback in their text.
+    PyTorch raises RuntimeError if a loader worker was killed.
 
     Raises:
-        UsageError: an argument outside its range.
+        UsageError: an argument is outside its range.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._ambient = _distributed() or (0, 1)
         self._position = Position(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
-        self._offered: StreamIdentity | None = None  # what the server said when it was only asked
+        self._offered: StreamIdentity | None = None  # the server's answer to len(), not pinned
         EpochPlan(0, self.world_size, self.rank, self._batch_size)
 
     @classmethod
@@ -178,16 +178,19 @@ class V2VStreamDataset(IterableDataset[Batch]):
         seed: int = 0,
         **options: Unpack[SpecOptions],
     ) -> V2VStreamDataset:
-        """A stream of a server of its own, which ends with the dataset or with this process, however that ends.
+        """Start a server on this host and return a dataset that streams from it.
+
+        The server stops with the dataset or with this process, even if the process is killed.
 
         Args:
             videos: folder or list, as for ``v2v-serve --videos``.
-            batch_size, arrays, recipe, seed, options: of the dataset.
-            workers: server workers.
+            batch_size, arrays, recipe, seed, options: as for the dataset.
+            workers: number of server workers.
             flags: more flags for ``v2v-serve``, for instance ``["--cache", "clips/"]``.
 
         Raises:
-            UsageError: what is wrong with the videos or flags; ServerLost: the server does not come up.
+            UsageError: the videos, flags or options are not valid; the message says why.
+            ServerLost: the server does not start.
         """
         require_arguments(cls.local, options)
         resolved = recipe if isinstance(recipe, Recipe) else StreamSpec.from_dict({"recipe": recipe}).recipe
@@ -195,7 +198,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         asked = [*recipe_flags(resolved), *(("--scene", scene) if scene else ()), *flags]
         server = LocalServer(videos, workers=workers, flags=asked).__enter__()
         try:
-            # V2V_KEYS may name a key for servers elsewhere.
+            # V2V_KEYS may name a key for other servers.
             dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, keys="", **options)
         except BaseException:
             server.stop()
@@ -204,7 +207,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return dataset
 
     def __getstate__(self) -> dict[str, Any]:
-        # A spawned loader worker knows nothing of the process group. A copy, even a shallow one, moves on by itself.
+        # A spawned loader worker has no process group. A copy, even a shallow one, gets its own position.
         own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers()}
         return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 
@@ -217,37 +220,37 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rows |= {"epoch": self.epoch, "rank": f"{self.rank} of {self.world_size}"}
         return html_table(f"V2VStreamDataset of {self._address}", rows)
 
-    # --- what it is ---------------------------------------------------------------------------------------------------
+    # --- properties ---------------------------------------------------------------------------------------------------
 
     @property
     def rank(self) -> int:
-        """Which of the ranks this is."""
+        """Return this process's rank, 0 .. world_size - 1."""
         return (self._explicit or _distributed() or self._ambient)[0]
 
     @property
     def world_size(self) -> int:
-        """How many ranks share an epoch."""
+        """Return the number of ranks that share an epoch."""
         return (self._explicit or _distributed() or self._ambient)[1]
 
     @property
     def epoch(self) -> int:
-        """The epoch that the next iteration delivers."""
+        """Return the epoch that the next iteration delivers."""
         return self._position.agreed().epoch
 
     @property
     def stream(self) -> StreamIdentity | None:
-        """What the samples are made of: resolved spec, digests, sequences per epoch; None before the first Welcome."""
+        """Return the stream's resolved spec, digests and sequences per epoch; None before the first connection."""
         return self._position.agreed().stream
 
     def describe(self) -> dict[str, Any]:
-        """The stream and this consumer's part in it as plain values, for a log.
+        """Return the stream's identity and this consumer's settings as plain values, for a log.
 
         Raises:
-            UsageError: nothing is known yet: no connection was opened.
+            UsageError: the stream is not known yet, because no connection was opened.
         """
         stream = self.stream
         if stream is None:
-            raise UsageError(f"{self._address} has not been asked yet: iterate first")
+            raise UsageError(f"the stream of {self._address} is not known yet: iterate first")
         return {field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)} | {
             "address": self._address,
             "arrays": list(self._arrays),
@@ -258,18 +261,20 @@ class V2VStreamDataset(IterableDataset[Batch]):
         }
 
     def __len__(self) -> int:
-        """Batches of a whole epoch, also where the next iteration goes on in the middle of one: loops that resume count
-        from its beginning. Before the first iteration, the server is asked.
+        """Return the number of batches in a whole epoch.
+
+        It is the same when the next iteration resumes in the middle of an epoch, because loops that resume count from
+        the epoch's beginning. Before the first iteration this connects to the server.
 
         Raises:
-            V2VError: no server answers, or it refuses: see iterating.
+            V2VError: the server does not answer, or refuses: see the errors of iterating.
         """
         agreed = self._position.agreed()
         stream = agreed.stream or self._offered
         if stream is None:
             with closing(self._connection(agreed.epoch)) as connection:
                 connection.open()
-                # Not pinned: the spacing of siblings is settled by how many loader workers iterate.
+                # Not pinned: the spacing of siblings depends on the number of loader workers that iterate.
                 stream = self._offered = connection.stream
         return self._consumer.plan(stream, None).batches
 
@@ -280,37 +285,37 @@ class V2VStreamDataset(IterableDataset[Batch]):
     # --- position -----------------------------------------------------------------------------------------------------
 
     def set_epoch(self, epoch: int) -> None:
-        """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded.
+        """Set the epoch of the next iteration. It starts at the beginning, unless a state of that epoch was loaded.
 
-        Under a larger batch size or more ranks, less than a global batch may be left of a loaded state's epoch. Then
-        the next iteration delivers the epoch after it, or nothing where the state's own epoch is set.
+        With a larger batch size or more ranks, less than a global batch may be left of a loaded state's epoch. Then
+        the next iteration delivers the epoch after it, or no batches if the state's own epoch is set here.
 
         Raises:
-            UsageError: no such epoch; or it is accelerate that sets it.
+            UsageError: the epoch is out of range, or accelerate sets it.
         """
-        require_epoch_of_ours()
+        refuse_epoch_of_accelerate()
         self._position.set_epoch(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
-        """The position after the last batch that this process took.
+        """Return the position after the last batch that this process took.
 
-        In a loader worker, the state is that of the worker, as ``torchdata.stateful_dataloader`` wants it.
+        In a loader worker, this is the worker's own state, as ``torchdata.stateful_dataloader`` requires.
 
         Raises:
-            UsageError: loader workers took the batches, so that this process does not know.
+            UsageError: loader workers took the batches, so this process does not know the position.
         """
         return self._position.state(self._consumer).to_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The next iteration begins where ``state`` was taken.
+        """Start the next iteration where ``state`` was taken.
 
         Args:
-            state: of :meth:`state_dict` or ``Batch.resume_state``; of any batch size, number of loader workers and
-                (for a rank's state) world size.
+            state: from :meth:`state_dict` or ``Batch.resume_state``, taken with any batch size, number of loader
+                workers and (for a rank's state) world size.
 
         Raises:
-            StateMismatch: it belongs to another seed or spec.
-            UsageError: not a state, or that of a loader worker somewhere else.
+            StateMismatch: the state belongs to another seed or spec.
+            UsageError: it is not a state, or a loader worker's state that this process cannot use.
         """
         loaded = ResumeState.from_dict(state)
         if loaded.seed != self._seed:
@@ -335,7 +340,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:
         consumer, epoch, state = self._consumer, begun.epoch, begun.state
         if state is None:
-            require_in_step_with_lightning(epoch)
+            require_lightning_epoch(epoch)
         pinned = self.stream
         with closing(self._connection(epoch, state, begun.workers)) as connection:
             connection.open()
@@ -373,16 +378,16 @@ class V2VStreamDataset(IterableDataset[Batch]):
         self._position.finish(begun, consumer)
 
     def _name(self, loader_workers: int) -> str:
-        """What people shall read of this consumer."""
+        """Return the name that status displays show for this consumer."""
         loader = get_worker_info()
         of_loader = "" if loader is None else f", loader worker {loader.id} of {loader_workers}"
         return f"rank {self.rank} of {self.world_size}{of_loader}"
 
     def _compare(self, connection: Connection, epoch: int) -> None:
-        """Every rank holds its broker to one other, the first that answers: that is the same one for nearly all.
+        """Compare this rank's broker with the first other broker that answers, which is the same for nearly all ranks.
 
         Raises:
-            StateMismatch: they offer different streams.
+            StateMismatch: the two brokers offer different streams.
         """
         patience = dataclasses.replace(self._patience, timeout_seconds=self._patience.takeover_seconds)
         for broker in self._brokers if len(self._brokers) > 1 else ():
@@ -393,7 +398,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
                     other.open()
                     connection.stream.require_same(other.stream, ours=connection.address, theirs=broker)
             except ServerLost as lost:
-                _log.warning("not compared with %s, which will be when it takes over: %s", connection.address, lost)
+                _log.warning("cannot compare %s with %s before it takes over: %s", connection.address, broker, lost)
                 continue
             return
 
@@ -432,12 +437,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
 
 def _distributed() -> tuple[int, int] | None:
-    """(rank, world size) of the default process group, if there is one."""
+    """Return (rank, world size) of the default process group; None if there is none."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return None
 
 
 def _stop_own(server: LocalServer, owner: int) -> None:
-    if os.getpid() == owner:  # a forked loader worker has a copy of the dataset, and its server is ours
+    if os.getpid() == owner:  # a forked loader worker holds a copy of the dataset, but must not stop the server
         server.stop()

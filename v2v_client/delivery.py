@@ -1,4 +1,4 @@
-"""From arrivals to batches: rows are filled in any order, batches leave in theirs."""
+"""Assemble samples into batches. Rows are filled in any order; batches leave in order."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from v2v_protocol.messages import SampleHeader
 
 
 @dataclass(slots=True)
-class _Draft:
-    """A batch being filled: its memory, and what was said of each sample that came."""
+class _PartialBatch:
+    """Hold a batch that is being filled: its memory, and the header of each sample received."""
 
     memory: BatchMemory
     headers: dict[int, SampleHeader] = field(default_factory=dict)  # by row
@@ -37,34 +37,34 @@ def deliver(
     shared_memory: bool = True,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Batch]:
-    """The batches of an open connection, in order.
+    """Yield the batches of an open connection, in order.
 
     Args:
-        plan: which samples make up a batch.
+        plan: defines which samples make up a batch.
         batches: numbers of the batches to deliver.
-        epoch: of the samples.
-        resume_state: the state after a batch, by its number and the newest quarantine snapshot seen up to it.
-        buffers: for the batches.
-        shared_memory: whether workers of this host may put samples into memory of this process.
+        resume_state: returns the state after a batch, given its number and the newest quarantine snapshot seen up to
+            it.
+        buffers: reusable memory for the batches.
+        shared_memory: whether workers on this host may write samples into memory of this process.
         clock: seconds, for ``Batch.wait_seconds``.
 
     Raises:
         see :meth:`Connection.receive`.
     """
     window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
-    most_drafts = -(-connection.credit // plan.batch_size) + 2
-    # And the one that the trainer has: all of them are free when an epoch ends.
-    buffers.shape(connection.layout, plan.batch_size, spare=most_drafts + 1)
-    drafts: dict[int, _Draft] = {}
+    most_partial = -(-connection.credit // plan.batch_size) + 2
+    # One more for the batch that the trainer holds: all of them are free when an epoch ends.
+    buffers.shape(connection.layout, plan.batch_size, spare=most_partial + 1)
+    partial: dict[int, _PartialBatch] = {}
     quarantine, lend = 0, shared_memory
 
     def ask() -> None:
         asked, slots = window.ask(), {}
         for index in asked:
             place = window.place(index)
-            if place.batch not in drafts:
-                drafts[place.batch] = _Draft(buffers.take(shared=lend))
-            slot = drafts[place.batch].memory.slot(place.row)
+            if place.batch not in partial:
+                partial[place.batch] = _PartialBatch(buffers.take(shared=lend))
+            slot = partial[place.batch].memory.slot(place.row)
             if slot is not None:
                 slots[index] = slot
         connection.want(asked, slots)
@@ -72,14 +72,15 @@ def deliver(
     def accept(sample: Arrival) -> None:
         place = window.receive(sample.header.index)
         if place is not None:
-            draft = drafts[place.batch]
-            draft.memory.fill(place.row, sample.arrays, slot_is_free=sample.slot_is_free)
-            draft.headers[place.row] = sample.header
+            batch = partial[place.batch]
+            batch.memory.fill(place.row, sample.arrays, slot_is_free=sample.slot_is_free)
+            batch.headers[place.row] = sample.header
 
     while not window.finished:
         began = clock()
         ask()
-        # What came while the trainer was busy; asking for more before it is busy again keeps the server at work.
+        # First take what arrived while the trainer was busy. Asking for more before it is busy again keeps the server
+        # working.
         while (sample := connection.receive(wait=False)) is not None:
             accept(sample)
             ask()
@@ -88,14 +89,14 @@ def deliver(
                 accept(sample)
                 ask()
         ask()
-        sample = None  # nothing of this batch may outlive it here, or its buffers and messages would not be freed
-        draft = drafts.pop(number)
-        # Workers elsewhere have no use for it, and a message is cheaper without.
-        lend = lend and (draft.memory.in_place > 0 or not draft.memory.lent)
-        headers = [draft.headers[row] for row in range(plan.batch_size)]
+        sample = None  # a reference kept here would keep the batch's buffers and messages alive
+        batch = partial.pop(number)
+        # Workers on other hosts cannot use slots, and a message without slots is cheaper.
+        lend = lend and (batch.memory.in_place > 0 or not batch.memory.has_slots)
+        headers = [batch.headers[row] for row in range(plan.batch_size)]
         provenance = tuple(connection.provenance(header) for header in headers)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
-        tensors = {name: torch.from_numpy(array) for name, array in draft.memory.whole().items()}
+        tensors = {name: torch.from_numpy(array) for name, array in batch.memory.finish().items()}
         yield Batch(
             arrays=tensors,
             indices=plan.indices(number),
@@ -106,4 +107,4 @@ def deliver(
             cpu_seconds=sum(header.cpu_seconds for header in headers),
             decodes=sum(header.decoded for header in headers),
         )
-        del draft, tensors
+        del batch, tensors

@@ -1,7 +1,7 @@
-"""The stream's samples without a server: any of them by its index, made in the process that asks.
+"""Make samples of a stream by index in the calling process, without a server.
 
-This is the one door from the client to the server's code. It opens when a dataset is made, and needs the extra
-``server``; nothing else of the client does.
+This is the only module of the client that uses the server's code. It imports that code when a dataset is created, and
+needs the extra ``server``; no other module of the client does.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client import look
+from v2v_client import notebook
 from v2v_client.batch import Batch
 from v2v_client.options import require_arguments
 from v2v_protocol.errors import UsageError
@@ -29,66 +29,66 @@ from v2v_protocol.tables import html_table
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ShownSample(Sample):
-    """A sample that shows itself in a notebook.
+    """Hold a sample that a notebook can display.
 
     Attributes:
-        frames_per_bin: of the recipe; a pause is a run of repeated frames.
-        title: of its picture.
+        frames_per_bin: the recipe's; needed to mark pauses, which are runs of repeated frames.
+        title: title of its picture.
     """
 
     frames_per_bin: int
     title: str
 
     def show(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """The sample as a picture, which a notebook displays.
+        """Draw the sample as a picture, which a notebook displays.
 
         Args:
-            path: a PNG to write too.
+            path: PNG file to write as well; None writes no file.
 
         Returns:
             A PIL image.
 
         Raises:
-            UsageError: voxels or frames were not asked for, the file cannot be written, or pillow or av is not
+            UsageError: voxels or frames were not requested, the file cannot be written, or pillow or av is not
                 installed.
         """
-        return look.shown(self._picture(), path)
+        return notebook.to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
-        return look.picture([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
+        return notebook.draw_samples([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
 
     def _repr_png_(self) -> bytes | None:
-        return look.png_or_none(self._picture)
+        return notebook.try_png(self._picture)
 
     def _repr_html_(self) -> str:
-        return Sample._repr_html_(self) + look.img(self._repr_png_())
+        return Sample._repr_html_(self) + notebook.html_image(self._repr_png_())
 
 
 class V2VDataset(Dataset[Sample]):
-    """One epoch of a stream, indexable: ``dataset[i]`` is the very sample that a server streams under index i.
+    """Give indexed access to one epoch of a stream: ``dataset[i]`` equals the sample that a server streams at index i.
 
         dataset = V2VDataset("my-videos/", recipe="paper")
         dataset[0].arrays["voxels"]  # int8 [T, bins, H, W]
         for batch in DataLoader(dataset, batch_size=12, num_workers=4):
-            batch.voxels  # a Batch, as from V2VStreamDataset, but for its resume_state, which is empty
+            batch.voxels  # a Batch, as from V2VStreamDataset, but with an empty resume_state
 
-    For looking, testing and small experiments. It decodes in the process that asks, so it is as slow as decoding is;
+    Use it for inspection, tests and small experiments. It decodes in the calling process, so it is as slow as decoding;
     for training use :class:`v2v_client.V2VStreamDataset`.
 
     Args:
         videos: folder tree of videos, a single video, or a list file.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe.
         arrays: which of "voxels", "frames", "flow" and "flow_valid" to make.
-        seed: of the stream.
-        epoch: of the stream.
+        seed: the stream's seed, which determines all draws and the order.
+        epoch: the stream's epoch, which selects other cameras and another order.
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
-        cache_dir: folder of the catalogue's index; None: the user's cache.
+        cache_dir: folder of the catalogue's index; None uses the user's cache.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
     Raises:
-        UsageError: an argument outside its range, or the extra ``server`` is not installed.
-        CorpusError: no video can be used, or none gives a sequence.
+        UsageError: an argument is outside its range, or the extra ``server`` is not installed.
+        CorpusError: no video can be used, or no video is long enough for a sequence.
     """
 
     def __init__(
@@ -111,27 +111,27 @@ class V2VDataset(Dataset[Sample]):
         self._source = (os.fspath(videos), rows, list_file, cache_dir)
         self._maker: Any = None
         self._process = 0
-        self._length = int(self._opened().count)
+        self._length = int(self._open().count)
 
     def __len__(self) -> int:
         return self._length
 
     def __getitem__(self, index: int) -> ShownSample:
-        """The sample of this index.
+        """Make the sample at ``index``; negative indices count from the end.
 
         Raises:
-            IndexError: outside 0 .. len - 1.
-            SampleUnavailable: no candidate could give it.
+            IndexError: ``index`` is outside -len .. len - 1.
+            SampleUnavailable: no candidate video could give it.
         """
         place = index + self._length if index < 0 else index
         if not 0 <= place < self._length:
             raise IndexError(f"index {index}: the epoch has {self._length} samples")
-        sample: Sample = self._opened().sample(self.seed, self.epoch, place)
+        sample: Sample = self._open().sample(self.seed, self.epoch, place)
         title = f"Sample {place} of {self._length}"
         return ShownSample(sample.arrays, sample.provenance, self.spec.recipe.frames_per_bin, title)
 
     def set_epoch(self, epoch: int) -> None:
-        """Chooses the epoch: other cameras and another order. Before a DataLoader starts its workers."""
+        """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers."""
         self.epoch = epoch
 
     def __repr__(self) -> str:
@@ -144,27 +144,28 @@ class V2VDataset(Dataset[Sample]):
         return html_table(f"V2VDataset of {self._source[0]}", rows | {"seed": self.seed, "epoch": self.epoch})
 
     def show(self, index: int = 0, path: str | os.PathLike[str] | None = None) -> Any:
-        """One sample as a picture, which a notebook displays: ``dataset[index].show(path)``."""
+        """Draw one sample as a picture, which a notebook displays: ``dataset[index].show(path)``."""
         return self[index].show(path)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}
 
-    def _opened(self) -> Any:
-        """The maker of samples, of this process's own: an index file that was open before a fork must not be read."""
+    def _open(self) -> Any:
+        """Return this process's own remaker: an index file that was opened before a fork must not be read."""
         if self._maker is None or self._process != os.getpid():
-            self._maker, self._process = _maker(*self._source, self.spec, self._arrays), os.getpid()
+            self._maker, self._process = _open_remaker(*self._source, self.spec, self._arrays), os.getpid()
         return self._maker
 
 
-def _maker(
+def _open_remaker(
     videos: str, rows: str, list_file: str | None, cache_dir: str | None, spec: StreamSpec, arrays: tuple[str, ...]
 ) -> Any:
     try:
         remake = importlib.import_module("v2v_server.offline.remake")
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"V2VDataset makes samples itself and needs the package {error.name}: pip install '.[server]' in a checkout"
+            f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install '.[server]' "
+            "in a checkout"
         ) from error
     return remake.open_remaker(videos, rows=rows, list_file=list_file, cache_dir=cache_dir, spec=spec, arrays=arrays)
 
@@ -185,5 +186,5 @@ def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
     )
 
 
-# PyTorch's place for what its default collate function shall do with a type it does not know.
+# PyTorch's registry of collate functions for custom types.
 default_collate_fn_map[Sample] = _collate

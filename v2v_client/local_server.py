@@ -1,4 +1,4 @@
-"""A server of one's own: started as a subprocess, stopped with everything it started."""
+"""Run a server as a subprocess, and stop it with every process it started."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LAST_LINES = 12
 
 
 class LocalServer:
-    """``python -m v2v_server`` with this interpreter, from ``with`` on.
+    """Run ``python -m v2v_server`` with this interpreter inside a ``with`` block.
 
         with LocalServer("webvid10k/", workers=2) as server:
             dataset = V2VStreamDataset(server.address)
@@ -33,15 +33,15 @@ class LocalServer:
         videos: folder or list of videos, as for ``v2v-serve --videos``.
         workers: server workers.
         flags: more flags for ``v2v-serve``; without ``--bind`` it listens on a free port of this host only.
-        start_seconds: how long it may be silent until it listens. To catalogue a large folder for the first time takes
-            longer, but then it says every few seconds how far it is.
-        stop_seconds: how long it may take to leave when asked, before it is killed.
+        start_seconds: how long the server may write nothing before it listens. Cataloguing a large folder for the first
+            time takes longer in total, but reports progress every few seconds.
+        stop_seconds: how long the server may take to stop before it is killed.
 
     Attributes:
-        address: where it listens.
+        address: the address it listens on.
 
-    Entering raises UsageError when the server leaves with status 2 (its message says what is wrong with the videos or
-    flags) and ServerLost when it dies otherwise or is silent for too long; both quote the last lines it wrote.
+    Entering raises UsageError if the server exits with status 2 (its message says what is wrong with the videos or
+    flags), and ServerLost if it dies otherwise or is silent for too long. Both quote the last lines it wrote.
     """
 
     address: str
@@ -64,13 +64,13 @@ class LocalServer:
         self._cpu_seconds: dict[tuple[int, float], float] = {}
 
     def __enter__(self) -> LocalServer:
-        # The port file's folder is the server's only while it starts; what it writes goes to a file, because a pipe
-        # that nobody reads would stop it.
+        # The server needs the port file's folder only while it starts. Its output goes to a file, because it would
+        # block on a full pipe.
         with tempfile.TemporaryDirectory(prefix="v2v-server-") as folder:
             port_file = Path(folder, "port")
             self._errors = tempfile.TemporaryFile()
             command = [sys.executable, "-m", "v2v_server", *self._arguments, "--port-file", str(port_file)]
-            # A process that is killed cannot stop its server: the server looks after that itself.
+            # A killed process cannot stop its server, so the server watches its parent.
             command += ["--parent-pid", str(os.getpid())]
             try:
                 self._process = subprocess.Popen(
@@ -91,17 +91,17 @@ class LocalServer:
 
     @property
     def pid(self) -> int:
-        """Of the server's main process.
+        """Return the id of the server's main process.
 
         Raises:
-            UsageError: it does not run.
+            UsageError: the server is not running.
         """
         if self._process is None:
-            raise UsageError("the local server does not run: use it inside its with block")
+            raise UsageError("the local server is not running: use it inside its with block")
         return self._process.pid
 
     def _wait_for(self, port_file: Path, process: subprocess.Popen[bytes]) -> str:
-        said, deadline = 0, time.monotonic() + self._start_seconds
+        seen, deadline = 0, time.monotonic() + self._start_seconds
         while True:
             if port_file.exists() and (address := port_file.read_text(encoding="utf-8").strip()):
                 return address
@@ -110,29 +110,29 @@ class LocalServer:
                 raise (UsageError if status == 2 else ServerLost)(
                     f"the local server ended with status {status} before it listened: {self.last_lines()}"
                 )
-            if self._said_bytes() > said:
-                said, deadline = self._said_bytes(), time.monotonic() + self._start_seconds
+            if self._stderr_bytes() > seen:
+                seen, deadline = self._stderr_bytes(), time.monotonic() + self._start_seconds
             if time.monotonic() >= deadline:
                 raise ServerLost(
                     f"the local server does not listen after {self._start_seconds:g} s of silence: "
-                    f"{self.last_lines()}; start v2v-serve yourself, which shows what it is at, and connect to it, or "
+                    f"{self.last_lines()}; start v2v-serve yourself, which shows its progress, and connect to it, or "
                     "give LocalServer more start_seconds"
                 )
             time.sleep(_POLL_SECONDS)
 
-    def _said_bytes(self) -> int:
+    def _stderr_bytes(self) -> int:
         return 0 if self._errors is None else os.fstat(self._errors.fileno()).st_size
 
     def last_lines(self) -> str:
-        """The end of what the server wrote to its standard error."""
+        """Return the last lines that the server wrote to its standard error."""
         if self._errors is None:
             return "(it was not started)"
-        # The server writes where the file stands, and the two of us share that place: it must not be moved.
-        lines = os.pread(self._errors.fileno(), self._said_bytes(), 0).decode(errors="replace").strip().splitlines()
+        # pread, because the server shares the file's offset and writes there.
+        lines = os.pread(self._errors.fileno(), self._stderr_bytes(), 0).decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-_LAST_LINES:]) or "(it wrote nothing)"
 
     def stop(self) -> None:
-        """Asks the server to leave (SIGTERM), then kills what is left of its processes. May be called again."""
+        """Stop the server with SIGTERM, then kill its remaining processes. Repeated calls do nothing."""
         process, self._process = self._process, None
         try:
             if process is not None:
@@ -144,7 +144,7 @@ class LocalServer:
                     process.kill()
                     process.wait()
                 for survivor in tree:
-                    with _gone_is_fine():
+                    with _ignore_ended_process():
                         survivor.kill()
                 psutil.wait_procs(tree, self._stop_seconds)
         finally:
@@ -153,9 +153,9 @@ class LocalServer:
                 errors.close()
 
     def cpu_seconds(self) -> dict[int, float]:
-        """User and system time of each process of the tree, by process id; the ones seen before and gone included."""
+        """Return user plus system time of each process of the tree by process id, including ended ones seen before."""
         for process in _tree(self.pid):
-            with _gone_is_fine():
+            with _ignore_ended_process():
                 times = process.cpu_times()
                 self._cpu_seconds[process.pid, process.create_time()] = times.user + times.system
         found: dict[int, float] = {}
@@ -164,29 +164,29 @@ class LocalServer:
         return found
 
     def rss_bytes(self) -> dict[int, int]:
-        """Resident bytes of each living process of the tree, by process id; pages they share count for each."""
+        """Return resident bytes of each living process of the tree by process id; shared pages count for each."""
         found: dict[int, int] = {}
         for process in _tree(self.pid):
-            with _gone_is_fine():
+            with _ignore_ended_process():
                 found[process.pid] = process.memory_info().rss
         return found
 
 
 def recipe_flags(recipe: Recipe) -> list[str]:
-    """The recipe for ``v2v-serve``: at its start it looks which videos are long and large enough for it."""
+    """Return flags that give ``v2v-serve`` this recipe. At its start it checks which videos are large enough for it."""
     return [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
 
 
 def _tree(pid: int) -> Iterator[psutil.Process]:
-    with _gone_is_fine():
+    with _ignore_ended_process():
         root = psutil.Process(pid)
         yield root
         yield from root.children(recursive=True)
 
 
 @contextmanager
-def _gone_is_fine() -> Iterator[None]:
-    """A process may end between being listed and being asked."""
+def _ignore_ended_process() -> Iterator[None]:
+    """Ignore that a process ended between being listed and being queried."""
     try:
         yield
     except psutil.NoSuchProcess:

@@ -1,4 +1,4 @@
-"""What a consumer asks for of a stream: the options that change its samples' bytes. Pure."""
+"""Check the options with which a consumer requests a stream: those that change its samples' bytes. Pure."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from v2v_protocol.sample import array_layout
 from v2v_protocol.settings import nearest
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
 
-# What is left to the server may be anything, so that it is no reason to refuse what goes with some of it.
+# Fields left to the server may have any value, so an option that fits at least one of them is accepted here.
 _ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE)
 _LONGEST = Recipe(voxels_per_clip=1_000_000, bins=1)
 
 
 class Options:
-    """Fields of a StreamSpec by name; the server decides those that are None.
+    """Hold fields of a StreamSpec by name. The server decides those that are None.
 
     Args:
-        arrays: names of the arrays wanted; they change no byte, but must be known.
+        arrays: names of the requested arrays. They do not change the samples' bytes, but must be known.
         fields: see :meth:`v2v_protocol.spec.StreamSpec.from_dict`; ``recipe`` may be a Recipe.
 
     Raises:
-        UsageError: a value outside its limits, or an unknown array: here, and not by the server. What only the server's
-            own spec can tell is left to it.
+        UsageError: a value is outside its limits, or an array is unknown. Conflicts with the server's own spec are
+            reported by the server.
     """
 
     def __init__(self, arrays: tuple[str, ...], **fields: Any) -> None:
@@ -43,14 +43,14 @@ class Options:
         StreamSpec.from_dict({"flow_from": self._asked.get("flow_from")}, default=clip)
 
     def spec(self, pinned: StreamIdentity | None, side: str) -> Mapping[str, Any]:
-        """What to ask the server for: a pinned stream's spec, which must be what the options say.
+        """Return the spec to request from the server: a pinned stream's spec, or else these options.
 
         Args:
-            pinned: the stream begun; None when there is none.
-            side: words for what pinned it.
+            pinned: the stream already begun; None if there is none.
+            side: what pinned it, in words for the message of a mismatch.
 
         Raises:
-            StateMismatch: the options ask for another stream.
+            StateMismatch: the options contradict the pinned stream.
         """
         if pinned is None:
             return dict(self._asked)
@@ -63,14 +63,14 @@ class Options:
 
 
 def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) -> None:
-    """Check names of keyword arguments.
+    """Check the names of keyword arguments.
 
     Args:
-        function: has the other arguments by name.
+        function: its named parameters are listed among the known arguments.
         options: fields of a StreamSpec by name, as the caller gave them.
 
     Raises:
-        UsageError: a name that is neither.
+        UsageError: a name is not a field of a StreamSpec.
     """
     named = [name for name in inspect.signature(function).parameters if name not in ("self", "options")]
     known = [*named, *SpecOptions.__annotations__]
@@ -80,7 +80,7 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
 
 
 def _plain(recipe: Any) -> Any:
-    """A recipe in plain values that are ours: whoever gave a mapping may change it for the next dataset."""
+    """Copy a recipe into plain values, because the caller may change a mapping for the next dataset."""
     if isinstance(recipe, Recipe):
         return recipe.to_dict()
     if not isinstance(recipe, Mapping):

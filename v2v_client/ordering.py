@@ -1,14 +1,15 @@
-"""The reorder window: samples arrive in any order, batches leave in theirs. Pure.
+"""Reorder samples: they arrive in any order, and batches leave in order. Pure.
 
-The window asks ahead in batch order. Two limits hold at any time:
+The window requests samples ahead in batch order. Two limits hold at any time:
 
-    samples asked for and not received                      <= credit
-    samples asked for and not yet part of a taken batch     <= credit + batch size
+    samples requested and not received                      <= credit
+    samples requested and not yet part of a taken batch     <= credit + batch size
 
-The second bounds memory while one late sample holds up its batch: at most ceil(credit / batch size) + 2 batches have
-buffers. It leaves room for one whole batch however small the credit is, so the first batch can always be completed.
+The second bounds memory while one late sample delays its batch: at most ceil(credit / batch size) + 2 batches have
+buffers. It always leaves space for one whole batch, so even with a small credit the first batch can be completed.
 
-Samples that nobody asked for, and second copies, are counted and dropped: asking again after a cut can make them.
+Samples that were not requested, and second copies, are counted and dropped. Requests repeated after a disconnect can
+cause both.
 """
 
 from __future__ import annotations
@@ -19,39 +20,39 @@ from dataclasses import dataclass
 from v2v_protocol.errors import LimitExceeded
 
 _REQUESTS_A_CREDIT = 8
-"""A request asks for at least this part of the credit; so much less of it is ever under way."""
+"""A request asks for at least 1/8 of the credit, so up to 1/8 of the credit may stay unused."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a sample belongs: its batch, and the row in it."""
+    """Hold where a sample belongs: the number of its batch, and the row in it."""
 
     batch: int
     row: int
 
 
 class ReorderWindow:
-    """Keeps account of the samples of one epoch, not of their bytes.
+    """Track which samples of one epoch are requested and received, without their bytes.
 
     Args:
         batches: numbers of the batches to deliver, in order.
-        indices: global indices of the samples of a batch; every batch has as many, and none shares one.
-        batch_size: how many those are.
-        credit: most samples asked for and not received.
+        indices: returns the global indices of a batch's samples; batches are disjoint.
+        batch_size: samples in each batch.
+        credit: maximum number of samples requested and not received.
 
     Attributes:
-        duplicates: arrivals of a sample that had come already.
-        strays: arrivals of a sample that was never asked for.
+        duplicates: arrivals of a sample that had arrived before.
+        strays: arrivals of a sample that was never requested.
 
     Raises:
-        LimitExceeded: a credit of less than one sample.
+        LimitExceeded: the credit is below 1.
     """
 
     def __init__(
         self, batches: Sequence[int], indices: Callable[[int], tuple[int, ...]], batch_size: int, credit: int
     ) -> None:
         if credit < 1:
-            raise LimitExceeded(f"a credit of {credit} samples; nothing could ever be asked for")
+            raise LimitExceeded(f"credit = {credit} samples: at least 1 is needed to request any")
         self._batches = batches
         self._indices = indices
         self._batch_size = batch_size
@@ -67,19 +68,19 @@ class ReorderWindow:
 
     @property
     def finished(self) -> bool:
-        """Every batch was taken."""
+        """Return whether every batch was taken."""
         return self._taken == len(self._batches)
 
     @property
     def outstanding(self) -> tuple[int, ...]:
-        """Samples asked for and not received, in the order asked."""
+        """Return the samples requested and not received, in the order of the requests."""
         return tuple(self._outstanding)
 
     def ask(self) -> tuple[int, ...]:
-        """What to ask for now, within both limits; it counts as asked for from here on.
+        """Return the indices to request now, within both limits. They count as requested from here on.
 
-        Nothing as long as it is little and some is under way: a request for every sample that arrives would cost the
-        server as much as the sample does.
+        Returns no indices while there are only few and other samples are under way: one request per arriving sample
+        would cost the server as much as the sample does.
         """
         asked: list[int] = []
         room = min(
@@ -108,14 +109,14 @@ class ReorderWindow:
         return True
 
     def place(self, index: int) -> Place:
-        """Where a sample belongs that was asked for."""
+        """Return where a requested sample belongs."""
         return self._places[index]
 
     def receive(self, index: int) -> Place | None:
-        """A sample arrived: the place of its bytes, or None when it is to be dropped."""
+        """Record an arrived sample and return its place, or None if it must be dropped."""
         if index not in self._outstanding:
-            # A sample of a batch that left is a second copy too, but remembering all of those would cost memory
-            # without end; it counts as one that nobody asks for.
+            # A second copy of a sample whose batch has left counts as a stray: remembering all delivered samples
+            # would cost unbounded memory.
             if index in self._places:
                 self.duplicates += 1
             else:
@@ -127,7 +128,7 @@ class ReorderWindow:
         return place
 
     def take(self) -> int | None:
-        """The number of the next batch, if it is complete; it leaves the window."""
+        """Remove the next batch from the window and return its number; None if it is not complete."""
         if self.finished:
             return None
         batch = self._batches[self._taken]

@@ -1,6 +1,6 @@
-"""What server, workers and consumers say to each other.
+"""Messages and data types that server, workers and consumers share.
 
-Pure data: the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
+Pure data: it uses the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
 """
 
 __version__ = "0.1.0"

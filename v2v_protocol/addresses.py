@@ -1,4 +1,4 @@
-"""What an address says about where its peer is. Pure."""
+"""Decide from an address where its peer is. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ipaddress
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name, or an IP address in digits, is surely this machine."""
+    """Return whether a host name, or an IP address in digits, is certainly this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -14,6 +14,6 @@ def is_loopback(host: str) -> bool:
 
 
 def leaves_host(address: str) -> bool:
-    """Whether what is sent to a ZeroMQ address may travel over a network: all but ``ipc://`` and loopback."""
+    """Return whether data sent to a ZeroMQ address may travel over a network: all but ``ipc://`` and loopback."""
     scheme, _, rest = address.partition("://")
     return scheme == "tcp" and not is_loopback(rest.rpartition(":")[0].strip("[]"))

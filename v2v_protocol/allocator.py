@@ -1,4 +1,4 @@
-"""A setting of the C library's allocator that a process which moves many megabytes a second gains from."""
+"""Configure the C library's allocator for processes that receive many megabytes per second."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ _EVER_BYTES = (1 << 31) - 1
 
 
 def keep_freed_memory(_loader_worker: int = 0, *, most_bytes: int = _EVER_BYTES) -> bool:
-    """Makes this process keep memory that it freed, and use it again, instead of handing it back to the kernel.
+    """Make this process keep memory that it freed, and reuse it, instead of returning it to the kernel.
 
-    Every sample is received into fresh memory, and fresh memory from the kernel is cleared and mapped page by page,
-    which doubles the processor time of sending it. Kept memory costs nothing of that. The price: the process stays as
-    large as it ever was. It is a decision about the whole process, so nothing calls this by itself in a trainer: call
-    it before the first iteration, and with loader workers give it to them,
-    ``DataLoader(dataset, batch_size=None, num_workers=2, worker_init_fn=keep_freed_memory)``.
+    Every sample is received into new memory. The kernel clears and maps new memory page by page, which doubles the
+    processor time of sending it. Kept memory avoids this cost, but the process stays as large as it ever was. This is a
+    decision about the whole process, so nothing calls it by itself in a trainer: call it before the first iteration.
+    With loader workers, pass it to them, ``DataLoader(dataset, batch_size=None, num_workers=2,
+    worker_init_fn=keep_freed_memory)``.
 
     Args:
-        most_bytes: free memory beyond this is handed back after all; a larger block is mapped by itself.
+        most_bytes: free memory beyond this is returned to the kernel; a larger block is mapped separately.
 
     Returns:
-        whether the C library understood; only glibc does.
+        whether the C library accepted the settings; only glibc does.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
@@ -34,7 +34,7 @@ def keep_freed_memory(_loader_worker: int = 0, *, most_bytes: int = _EVER_BYTES)
 
 
 def give_back_freed_memory() -> None:
-    """Hands what this process has freed back to the kernel, wherever it lies. Takes milliseconds; only glibc can."""
+    """Return all freed memory of this process to the kernel. Takes milliseconds; only glibc supports it."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

@@ -1,15 +1,15 @@
-"""Names for memory that a consumer shares with the workers of its own host. Pure: who opens it is elsewhere.
+"""Name the memory that a consumer shares with the workers of its own host. Pure: opening it is done elsewhere.
 
-A consumer keeps an *arena*, an anonymous file in memory (memfd_create(2)), for each batch that it fills, and names a
-*slot* of it, the batch's row, with each sample it asks for. A worker that can open the arena makes the sample there and
-sends the header alone; one that cannot, on another host or as another user, sends the arrays in the message. Who asks
-cannot know which, and need not.
+A consumer keeps an *arena*, an anonymous file in memory (memfd_create(2)), for each batch that it fills. With each
+sample that it requests it names a *slot* of the arena, the batch's row. A worker that can open the arena makes the
+sample there and sends only the header. A worker on another host or of another user sends the arrays in the message. The
+consumer does not need to know which it is.
 
-Whether an arena may be used again is the whole difficulty: a worker that was given up may wake and write. So
+An arena must not be reused too early: a worker that was given up may resume and write. So
 
-    the server hands a slot to one worker only: not to a second one, nor to the next after the first was lost;
-    a header that names the slot says that its worker writes there no more;
-    a consumer uses an arena for another batch only when such a header came for every slot that it had named.
+    the server gives a slot to one worker only: not to a second one, nor to the next after the first was lost;
+    a header that names the slot states that its worker no longer writes there;
+    a consumer reuses an arena for another batch only when such a header has come for every slot that it named.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _NAME = re.compile(r"(\d{1,10}):(\d{1,10}):(\d{1,10}):([0-9a-f]{32})")
 
 @dataclass(frozen=True, slots=True)
 class ArenaName:
-    """How a worker of the same host finds an arena, and knows that it found it.
+    """Information by which a worker on the same host finds an arena and verifies it.
 
     Attributes:
-        pid: process of the consumer.
-        descriptor: of the arena, in that process.
-        slots: how many samples it holds.
-        token: 32 hexadecimal digits that nobody else has; part of the name that the system knows the memory by.
+        pid: process id of the consumer.
+        descriptor: file descriptor of the arena in that process.
+        slots: number of samples that it holds.
+        token: 32 random hexadecimal digits; part of the name under which the system knows the memory.
     """
 
     pid: int
@@ -48,10 +48,10 @@ class ArenaName:
 
     @classmethod
     def parse(cls, text: str) -> ArenaName:
-        """The name back from its text.
+        """Parse the text of an arena name.
 
         Raises:
-            ProtocolError: it is none.
+            ProtocolError: the text does not name an arena.
         """
         match = _NAME.fullmatch(text)
         if match is None or not 0 < int(match[3]) <= MOST_SLOTS:
@@ -60,23 +60,23 @@ class ArenaName:
 
     @property
     def path(self) -> str:
-        """Where Linux lets processes of the same user and process namespace open it."""
+        """Path under which Linux lets processes of the same user and process namespace open it."""
         return f"/proc/{self.pid}/fd/{self.descriptor}"
 
     @property
     def memory_name(self) -> str:
-        """What the memory is called; what ``path`` links to is made of it."""
+        """Name of the memory, from which the target of ``path`` is derived."""
         return f"v2v-{self.token}"
 
     @property
     def link(self) -> str:
-        """What ``path`` links to while it is this arena's."""
+        """Target of the symbolic link ``path`` while the arena exists."""
         return f"/memfd:{self.memory_name} (deleted)"
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A place for one sample.
+    """Memory for one sample.
 
     Attributes:
         arena: text of the :class:`ArenaName`.
@@ -88,11 +88,11 @@ class Slot:
 
 
 def array_offsets(sizes: Sequence[int], slots: int) -> list[int]:
-    """Where in an arena each array of a whole batch begins, and after them, where the arena ends: whole pages.
+    """Return the offset in an arena of each array of a whole batch, then the size of the arena: whole pages, in bytes.
 
     Args:
         sizes: bytes of each array of one sample, in the order of the headers.
-        slots: of the arena.
+        slots: number of slots of the arena.
     """
     pages = (-(-size * slots // _PAGE_BYTES) for size in sizes)
     return [_PAGE_BYTES * before for before in itertools.accumulate(pages, initial=0)]

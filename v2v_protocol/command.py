@@ -1,7 +1,7 @@
-"""A command line: its flags, its help, and from what it did to its exit status.
+"""Build command lines: flags, help, and exit status.
 
-Exit status: 0 success, 1 the command could not do its work, 2 wrong usage or input, 130 interrupted. An error of ours
-is one line on stderr; ``--debug`` shows its trace.
+Exit status: 0 success, 1 the command could not do its work, 2 wrong usage or input, 130 interrupted. Our own errors
+print one line on stderr; ``--debug`` shows the traceback.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _GENERAL = "General"
 
 
 class Parser(argparse.ArgumentParser):
-    """The flags of a command, in groups, with ``--help``, ``--version`` and ``--debug``.
+    """Flags of a command, in groups, with ``--help``, ``--version`` and ``--debug``.
 
     Args:
-        name: of the command.
-        usage: what follows the name in the first line of its help.
-        description: what it does, in plain text.
+        name: name of the command.
+        usage: text after the name in the first line of the help.
+        description: what the command does, plain text.
         examples: command lines.
-        status: what its exit status means, in plain text, where that is more than every command's.
+        status: meanings of its exit status beyond those of every command, plain text.
     """
 
     def __init__(self, name: str, usage: str, description: str, examples: Sequence[str], status: str = "") -> None:
@@ -56,13 +56,13 @@ class Parser(argparse.ArgumentParser):
         general.add_argument("--debug", action="store_true", help="show the trace of an error")
 
     def group(self, title: str) -> argparse._ArgumentGroup:
-        """The group of that title, made when it is first asked for."""
+        """Return the group with this title; create it on first use."""
         if title not in self._groups:
             self._groups[title] = self.add_argument_group(title)
         return self._groups[title]
 
     def add_settings(self, cls: Any) -> None:
-        """A flag for each setting of a dataclass; one that is not given is None."""
+        """Add a flag for each setting of a dataclass; the value of a flag that is not given is None."""
         for name, setting in settings_of(cls).items():
             flag = flag_of(name)
             if setting.is_hidden:
@@ -78,17 +78,17 @@ class Parser(argparse.ArgumentParser):
                 )
 
     def format_help(self) -> str:
-        """The help; what every command has comes last."""
+        """Format the help; options that every command has come last."""
         self._action_groups.sort(key=lambda group: group.title == _GENERAL)
         return super().format_help()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """argparse's own; keeps what was given for :meth:`error`."""
+        """Parse as argparse does, and keep the arguments for :meth:`error`."""
         self._given = list(sys.argv[1:] if args is None else args)
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> Never:
-        """Ends with status 2 and one line. A flag that nobody knows comes before anything else that is wrong."""
+        """Exit with status 2 and one line. An unknown flag is reported before any other error."""
         known = self._option_string_actions
         for given in self._given:
             flag = given.partition("=")[0]
@@ -108,18 +108,18 @@ def run_command(
     failures: tuple[type[V2VError], ...] = (),
     interrupted: str = "interrupted",
 ) -> int:
-    """Parses and runs.
+    """Parse the command line and run the command.
 
     Args:
-        parser: of a command with a flag ``--debug``.
+        parser: parser of a command with a flag ``--debug``.
         run: returns the exit status; None is 0.
         argv: the command line; None takes that of the process.
-        failures: errors that say that the work failed (status 1), unless they are a UsageError; all others say that it
-            could not be done (status 2).
-        interrupted: what to say of a Ctrl-C; nothing if empty.
+        failures: errors that mean that the work failed (status 1), unless they are a UsageError; all other errors mean
+            that the input was wrong (status 2).
+        interrupted: message after a Ctrl-C; nothing if empty.
 
     Returns:
-        what ``run`` returned, else 1 or 2 after an error, 130 after a Ctrl-C.
+        what ``run`` returned, 1 or 2 after an error, or 130 after a Ctrl-C.
     """
     try:
         arguments = parser.parse_args(argv)
@@ -140,22 +140,22 @@ def run_command(
 
 
 def version_of(name: str) -> str:
-    """What a command says of itself: the version of the program, and of what it speaks and computes."""
+    """Return the version line of a command: versions of the program, the protocol and the numerics."""
     return f"{name} {__version__} (protocol {PROTOCOL_VERSION}, numerics {NUMERICS_VERSION})"
 
 
 def flag_of(name: str) -> str:
-    """How a setting is written on a command line."""
+    """Return the command-line flag of a setting."""
     return f"--{name.replace('_', '-')}"
 
 
 def _wrapped(text: str) -> str:
-    """Each line broken by itself."""
+    """Wrap each line of a text separately."""
     return "\n".join(textwrap.fill(line, _HELP_WIDTH) for line in text.split("\n"))
 
 
 def _reader(setting: Setting) -> Callable[[str], Any]:
-    """From the text of a flag to its value."""
+    """Return a function that converts the text of a flag to its value."""
 
     def read(text: str) -> Any:
         try:

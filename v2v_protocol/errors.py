@@ -1,27 +1,27 @@
-"""Every exception this project raises on purpose, and whose fault it reports.
+"""Every exception that this project raises on purpose, and the party at fault.
 
     V2VError
     |-- UsageError               the caller: an argument, a flag, a configuration file
     |   |-- RecipeError              a recipe key, value or preset
     |   |-- KeyRefused               a key: missing, readable by others, revoked, or of another side or server
     |   |-- CorpusError              a folder, list file or index that gives no sequence
-    |   |   `-- IndexUnreadable          the catalogue's index, just now: no video's fault
+    |   |   `-- IndexUnreadable          the catalogue's index cannot be read now; no video is at fault
     |   `-- StateMismatch            a saved position that belongs to another stream
-    |-- VideoError               the file: it cannot give what it promised (path, frame, reason)
+    |-- VideoError               the file: it cannot deliver what was catalogued (path, frame, reason)
     |   |-- VideoChanged             it is not the file that was catalogued
-    |   `-- VideoUnreadable          this host cannot read it, whatever is in it
-    |-- ProtocolError            the peer: it sent what no peer of ours would send
+    |   `-- VideoUnreadable          this host cannot read it, whatever its content
+    |-- ProtocolError            the peer: it sent something outside the protocol
     |   |-- VersionMismatch          another protocol or numerics version
     |   `-- LimitExceeded            a message, a list or a credit larger than stated
-    |-- RemoteError              the server answered a request with a refusal (code, text)
+    |-- RemoteError              the server refused a request (code, text)
     |   `-- SampleUnavailable        one sample could not be made from any of its candidates
-    |-- ServerLost               nobody: the server did not answer within the deadline
-    |   `-- NoWorkers                it answers, but nobody can make a sample
+    |-- ServerLost               no known party: the server did not answer within the deadline
+    |   `-- NoWorkers                the server answers, but no worker can make a sample
     `-- WorkerCrashLoop          the workers die without finishing anything
 
 RepeatedSamplesWarning is a warning: the call works, but is rarely what the user intends.
 
-A message says what is wrong, the number, the limit and what to do about it.
+A message states what is wrong with the value, the limit, and what to do, in this order.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class RepeatedSamplesWarning(UserWarning):
 
 
 class V2VError(Exception):
-    """Root of the tree: everything the project raises on purpose."""
+    """Base class of every exception that the project raises on purpose."""
 
 
 class UsageError(V2VError):
-    """The caller asked for something that cannot be: an argument, a flag, a configuration file."""
+    """The caller gave an invalid argument, flag or configuration file."""
 
 
 class RecipeError(UsageError):
@@ -46,15 +46,17 @@ class RecipeError(UsageError):
 
 
 class KeyRefused(UsageError):
-    """A key that does not open this server: missing, readable by others, revoked, or of another side or server."""
+    """A key is not accepted: missing, readable by others, revoked, or of another side or server."""
 
 
 class CorpusError(UsageError):
-    """A folder, list file or catalogue index that cannot serve: missing, empty, or admitting nothing."""
+    """A folder, list file or catalogue index cannot be used: missing, empty, or without any usable sequence."""
 
 
 class IndexUnreadable(CorpusError):
-    """The catalogue's index cannot be read now: another process holds it, or its storage fails. No video's fault."""
+    """The catalogue's index cannot be read now: another process holds it, or its storage fails. No video is at
+    fault.
+    """
 
 
 class StateMismatch(UsageError):
@@ -62,12 +64,12 @@ class StateMismatch(UsageError):
 
 
 class VideoError(V2VError):
-    """A video file cannot give what it promised.
+    """A video file cannot deliver what was catalogued.
 
     Attributes:
         video: the path or catalogue id of the file.
-        frame: the first frame number (presentation order, from 0) that could not be had; None when no single
-            frame is to blame (the file does not open).
+        frame: the first frame number (presentation order, from 0) that is not available; None if no single frame is to
+            blame (the file does not open).
         reason: one line of text.
     """
 
@@ -88,11 +90,13 @@ class VideoChanged(VideoError):
 
 
 class VideoUnreadable(VideoError):
-    """This host could not read the file, which says nothing of its bytes: it is not there, or its storage failed."""
+    """This host could not read the file: it is missing, or its storage failed. This does not depend on the file's
+    bytes.
+    """
 
 
 class ProtocolError(V2VError):
-    """The peer sent something that no peer of this protocol sends."""
+    """The peer sent something outside the protocol."""
 
 
 class VersionMismatch(ProtocolError):
@@ -107,7 +111,7 @@ class RemoteError(V2VError):
     """The server refused a request.
 
     Attributes:
-        code: a short stable word, see ``v2v_protocol.messages.ErrorCode``; "unknown" where a message names none.
+        code: a short stable word, see ``v2v_protocol.messages.ErrorCode``; "unknown" if a message has none.
         text: the server's explanation.
     """
 
@@ -125,7 +129,7 @@ class RemoteError(V2VError):
 
 
 def _taken_apart(message: str) -> tuple[str, str]:
-    """The text and the code of a :class:`RemoteError` from its message; what stands around it is text as well."""
+    """Split the message of a :class:`RemoteError` into text and code; text around it is kept as text."""
     found = list(re.finditer(r" \[([a-z-]+)\]$", message, re.MULTILINE))
     if not found:
         return message, "unknown"
@@ -141,7 +145,7 @@ class ServerLost(V2VError):
 
 
 class NoWorkers(ServerLost):
-    """The server answers, but it had no worker that could make a sample within the deadline; the message says why."""
+    """The server answers, but no worker could make a sample within the deadline; the message says why."""
 
 
 class WorkerCrashLoop(V2VError):

@@ -1,9 +1,9 @@
-"""Events made of voxel grids, for whoever reads events. A voxel grid has no times within a bin: these are invented.
+"""Convert voxel grids to events. A voxel grid has no times within a bin, so these times are invented.
 
-The rule. A bin of duration ``bin_us`` with the signed count n gives ``|n|`` events of that sign at its pixel, spread
+The rule: a bin of duration ``bin_us`` with the signed count n gives ``|n|`` events of that sign at its pixel, spread
 evenly: event k of 0 .. ``|n| - 1`` lies ``(2k + 1) / 2|n|`` of the way through the bin, rounded down to a microsecond.
-So a single event lies in the middle of its bin, and :meth:`EventList.voxels` gives back the grids. What a grid
-lost stays lost: events of both signs that cancelled within a bin, and counts beyond what its dtype holds.
+So a single event lies in the middle of its bin, and :meth:`EventList.voxels` returns the original grids. Information
+that the grid has lost is not restored: events of both signs that cancelled within a bin, and counts beyond its dtype.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _LARGEST_TIME_US = 2**62
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class EventList:
-    """Events in order of time; those of one microsecond in order of rows and columns.
+    """Events in order of time; those of the same microsecond in order of rows and columns.
 
     Attributes:
         x, y: uint16 [N], px; (0, 0) is the top left pixel.
         t: int64 [N], microseconds from the beginning of the first voxel grid. Invented within a bin (see the module).
-        p: bool [N], True where it got brighter.
-        width_px, height_px: of the sensor.
+        p: bool [N], True if the pixel got brighter.
+        width_px, height_px: size of the sensor.
     """
 
     x: npt.NDArray[np.uint16]
@@ -46,15 +46,15 @@ class EventList:
         return f"EventList({len(self)} of {self.width_px}x{self.height_px} px, times within a bin invented)"
 
     def voxels(self, grids: int, bins: int, bin_us: float, dtype: str = "int16") -> npt.NDArray[Any]:
-        """The events accumulated in bins: the voxel grids they were made of, if these arguments are theirs.
+        """Accumulate the events in bins. With matching arguments this returns the voxel grids that they were made from.
 
         Args:
             grids, bins: T and bins of the result.
             bin_us: duration of a bin, microseconds.
-            dtype: numpy dtype of the counts; wide enough, or they wrap.
+            dtype: numpy dtype of the counts; counts wrap if it is too narrow.
 
         Returns:
-            [grids, bins, H, W] signed event counts. Events behind the last bin are left out.
+            [grids, bins, H, W] signed event counts. Events after the last bin are left out.
         """
         edges = _edges(grids * bins, bin_us)
         place = np.searchsorted(edges, self.t, side="right") - 1
@@ -66,14 +66,14 @@ class EventList:
 
 
 def to_events(voxels: npt.NDArray[Any], bin_us: float) -> EventList:
-    """Events whose counts are these voxel grids. Their times within a bin are invented (see the module).
+    """Convert voxel grids to events. Their times within a bin are invented (see the module).
 
     Args:
-        voxels: [T, bins, H, W] signed event counts; T grids that follow each other.
+        voxels: [T, bins, H, W] signed event counts; T consecutive grids.
         bin_us: duration of a bin, microseconds, 1 or more; need not be whole.
 
     Raises:
-        UsageError: no such array, counts that are not whole, or a duration out of range.
+        UsageError: the array has another shape or fractional counts, or the duration is out of range.
     """
     voxels = np.asarray(voxels)
     if voxels.ndim != 4 or voxels.dtype.kind not in "if" or max(voxels.shape[2:]) > _LARGEST_SIDE_PX:
@@ -97,7 +97,7 @@ def to_events(voxels: npt.NDArray[Any], bin_us: float) -> EventList:
 
 
 def _bin_events(counts: npt.NDArray[Any], start_us: int, span_us: int) -> tuple[npt.NDArray[Any], ...]:
-    """(x, y, t, p) of one bin."""
+    """Return (x, y, t, p) of one bin."""
     y, x = np.nonzero(counts)
     signed = counts[y, x]
     if not np.isfinite(signed).all() or (signed != np.trunc(signed)).any():
@@ -112,7 +112,7 @@ def _bin_events(counts: npt.NDArray[Any], start_us: int, span_us: int) -> tuple[
 
 
 def _edges(count: int, bin_us: float) -> npt.NDArray[np.int64]:
-    """[count + 1] beginnings of the bins and the end of the last, whole microseconds."""
+    """Return [count + 1] starts of the bins and the end of the last, whole microseconds."""
     if not 1 <= bin_us * max(count, 1) < _LARGEST_TIME_US or bin_us < 1:
         raise UsageError(f"bin_us = {bin_us!r}: give the duration of a bin in microseconds, at least 1")
     edges: npt.NDArray[np.int64] = np.floor(np.arange(count + 1) * float(bin_us)).astype(np.int64)

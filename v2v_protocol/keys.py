@@ -1,7 +1,8 @@
-"""The key of a consumer or a worker: its file, which `v2v-keys new` writes, and what ZeroMQ is told of it.
+"""Read and use the key of a consumer or a worker.
 
-A key file is JSON: the side it is for, a name, the server's public key, and a pair of its own. It serves one side only:
-the server keeps consumers' and workers' keys apart. ``ipc://`` addresses take no keys: they let in only our own user.
+`v2v-keys new` writes a key file. It is JSON: the side it is for, a name, the server's public key, and a key pair of its
+own. It serves one side only: the server keeps consumers' and workers' keys apart. ``ipc://`` addresses use no keys:
+only our own user can connect to them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 
 @dataclass(frozen=True, slots=True)
 class PeerKey:
-    """What a key file holds. Its secret is in no text that Python makes of it."""
+    """Content of a key file. Its secret is excluded from ``repr``."""
 
     side: str
     name: str
@@ -46,24 +47,24 @@ class PeerKey:
     secret: str = field(repr=False)
 
     def secure(self, socket: Any) -> None:
-        """To be called before a ZeroMQ socket connects."""
+        """Set this key on a ZeroMQ socket. Call it before the socket connects."""
         socket.curve_serverkey = self.server.encode()
         socket.curve_publickey = self.public.encode()
         socket.curve_secretkey = self.secret.encode()
 
 
 def key_for(address: str, side: str, file: str | os.PathLike[str] | None) -> PeerKey | None:
-    """The key to use with an address.
+    """Return the key to use with an address.
 
     Args:
         side: "consumer" or "worker".
-        file: of the key; None takes what ``V2V_KEYS`` names, and "" none at all.
+        file: key file; None uses the file that ``V2V_KEYS`` names, "" uses no key.
 
     Returns:
-        None: none was given, or the address needs none.
+        None if no key was given, or the address needs none.
 
     Raises:
-        KeyRefused: the file cannot be read, others can read it, or it is for the other side.
+        KeyRefused: the file cannot be read, other users can read it, or it is for the other side.
     """
     named = os.environ.get(VARIABLE, "") if file is None else os.fspath(file)
     if not named or address.startswith("ipc:"):
@@ -92,7 +93,7 @@ def read_key(file: Path) -> PeerKey:
 
 
 def is_key(text: object) -> bool:
-    """Whether it is written as half of a CURVE pair is (Z85, ZeroMQ RFC 32): 5 letters stand for 4 bytes."""
+    """Return whether a text has the form of half a CURVE pair (Z85, ZeroMQ RFC 32): 5 characters for 4 bytes."""
     if not isinstance(text, str) or len(text) != KEY_LETTERS or set(text) - set(_Z85):
         return False
     groups = (text[at : at + 5] for at in range(0, KEY_LETTERS, 5))
@@ -100,10 +101,10 @@ def is_key(text: object) -> bool:
 
 
 def read_private(file: Path) -> str:
-    """The text of a file that holds a secret.
+    """Read the text of a file that holds a secret.
 
     Raises:
-        KeyRefused: it cannot be read, or others can read it.
+        KeyRefused: it cannot be read, or other users can read it.
     """
     try:
         with file.open("rb") as opened:
@@ -116,26 +117,28 @@ def read_private(file: Path) -> str:
 
 
 def write_key(file: Path, key: PeerKey) -> None:
-    """Writes a key file that only its owner can read.
+    """Write a key file that only its owner can read.
 
     Raises:
-        FileExistsError: one is there.
+        FileExistsError: the file exists.
     """
     write_private(file, json.dumps(asdict(key), indent=1) + "\n")
 
 
 def write_private(file: Path, content: str) -> None:
-    """Makes a file of mode 0600.
+    """Create a file of mode 0600.
 
     Raises:
-        FileExistsError: one is there.
+        FileExistsError: the file exists.
     """
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as opened:
         opened.write(content)
 
 
 def nameless_key(key: PeerKey) -> IO[bytes]:
-    """A key file without a name, in memory where the system can: who is handed it reads it as ``/dev/fd/NUMBER``."""
+    """Return an open, unnamed key file, in memory if the system supports it. A child process reads it as
+    ``/dev/fd/NUMBER``.
+    """
     in_memory = hasattr(os, "memfd_create")
     file = os.fdopen(os.memfd_create("v2v-key"), "w+b") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
     os.fchmod(file.fileno(), 0o600)
@@ -145,7 +148,7 @@ def nameless_key(key: PeerKey) -> IO[bytes]:
 
 
 class Handshakes:
-    """Counts the handshakes of a socket that connects, by the events of its monitor.
+    """Count the handshakes of a socket that connects, from the events of its monitor.
 
     Args:
         address, key, side: of the socket, for messages.
@@ -160,18 +163,18 @@ class Handshakes:
         self._has_key = key is not None
 
     def begin(self) -> None:
-        """Another socket takes the place of the one before."""
+        """Start again for a new socket."""
         self.succeeded = 0
 
     def take(self, waiting: Callable[[], int], receive: Callable[[], Sequence[bytes]]) -> None:
-        """Takes in the events that are there.
+        """Process the available events.
 
         Args:
-            waiting: whether there is one.
-            receive: it.
+            waiting: returns whether an event is available.
+            receive: returns the next event.
 
         Raises:
-            KeyRefused: the two sides will never agree.
+            KeyRefused: the two sides cannot agree.
         """
         while waiting():
             event, value = struct.unpack("=Hi", receive()[0])
@@ -199,18 +202,21 @@ class Handshakes:
                 )
 
     def _is_lost(self) -> bool:
-        """Whether the two sides disagree about a key, and what the server said of that was lost: it ends such a
-        handshake as soon as it knows, and its words may go with the connection. So it is asked again, now and then."""
+        """Return whether the two sides disagree about a key and the server's reply was lost. The server ends such a
+        handshake as soon as it notices, and the reply may be lost with the connection. So this side asks again from
+        time to time.
+        """
         if self._is_proven or self._silent % _ASK_EVERY != 1:
             return False
         return mechanism_of(self._address) == (b"NULL" if self._has_key else b"CURVE")
 
 
 def mechanism_of(address: str, seconds: float = 2.0) -> bytes:
-    """How the server there wants to be spoken to, by its greeting (ZMTP 3: 64 bytes, of which 20 name the mechanism).
+    """Return the security mechanism of the server, from its greeting (ZMTP 3: 64 bytes, of which 20 name the
+    mechanism).
 
     Returns:
-        ``b"CURVE"`` or ``b"NULL"``; nothing where no such server answers in time.
+        ``b"CURVE"`` or ``b"NULL"``; empty if no such server answers in time.
     """
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     greeting = b""

@@ -1,5 +1,5 @@
-"""Whether a peer is alive: when it was last heard, when to ask, when it is gone. Pure; times are seconds on the
-caller's clock, which never goes back.
+"""Track whether a peer is alive: when it was last heard, when to ping it, when it is gone. Pure; times are seconds on
+the caller's monotonic clock.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ import math
 
 
 class Liveness:
-    """What is known of one peer.
+    """State of one peer.
 
     Args:
-        now: the time; the peer counts as heard now.
+        now: monotonic time, seconds; the peer counts as heard now.
         gone_seconds: silence after which the peer is gone; infinite: never.
-        ping_seconds: silence after which the peer is asked whether it lives; infinite: it is never asked.
-        longest_ping_seconds: the wait until it is asked again doubles each time, up to this; by default it stays
+        ping_seconds: silence after which the peer is pinged; infinite: never.
+        longest_ping_seconds: the interval between pings doubles each time, up to this; by default it stays
             ``ping_seconds``.
     """
 
@@ -31,29 +31,29 @@ class Liveness:
         self._gone_seconds = gone_seconds
         self._ping_seconds = ping_seconds
         self._longest_wait = max(ping_seconds, longest_ping_seconds)
-        self.heard(now)
+        self.mark_heard(now)
 
-    def heard(self, now: float) -> None:
-        """Something came from the peer."""
+    def mark_heard(self, now: float) -> None:
+        """Note a message from the peer."""
         self._heard = now
         self._wait = self._ping_seconds
         self._ask_at = now + self._wait
 
     def leave_out(self, seconds: float) -> None:
-        """For so long nobody listened: it does not count as silence."""
+        """Exclude time during which this process was not polling."""
         self._heard += seconds
         self._ask_at += seconds
 
     def silence(self, now: float) -> float:
-        """Seconds since the peer was heard."""
+        """Return the seconds since the peer was heard."""
         return now - self._heard
 
     def is_gone(self, now: float) -> bool:
-        """Whether it has been silent for too long."""
+        """Return whether it has been silent for too long."""
         return self.silence(now) >= self._gone_seconds
 
     def ping_due(self, now: float) -> bool:
-        """Whether to ask the peer now; whoever is told so asks."""
+        """Return whether to ping the peer now. After True the caller must send the ping."""
         if now < self._ask_at:
             return False
         self._wait = min(2 * self._wait, self._longest_wait)
@@ -61,5 +61,5 @@ class Liveness:
         return True
 
     def next_due(self, now: float) -> float:
-        """Seconds until :meth:`ping_due` or :meth:`is_gone` has something to say, at least 0."""
+        """Return the seconds until :meth:`ping_due` or :meth:`is_gone` changes, at least 0."""
         return max(0.0, min(self._ask_at, self._heard + self._gone_seconds) - now)

@@ -31,11 +31,11 @@ from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
 from v2v_protocol.settings import (
     Setting,
     check_settings,
+    format_value,
     nearest,
     number,
     require_known,
     settings_of,
-    shown,
     span,
     switch,
     whole,
@@ -195,7 +195,7 @@ class Recipe:
 
     @property
     def smallest_and_largest_threshold(self) -> tuple[float, float]:
-        """Ends of what the recipe itself can draw for either polarity, log units."""
+        """End of what the recipe itself can draw for either polarity, log units."""
         (low, high), (ratio_low, ratio_high) = self.threshold, self.threshold_ratio
         return low * min(1.0, ratio_low), high * max(1.0, ratio_high)
 
@@ -266,7 +266,7 @@ def effect_settings() -> dict[str, Setting]:
 
 
 def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """Ends of what any pixel's threshold can be, for nominal ones between two values."""
+    """End of what any pixel's threshold can be, for nominal ones between two values."""
     spread = LARGEST_NORMAL * mismatch_sigma
     return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
 
@@ -299,5 +299,5 @@ def preset(name: object) -> Recipe:
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)
-        raise RecipeError(f"unknown recipe preset {shown(name)}{near}; known: {known}")
+        raise RecipeError(f"unknown recipe preset {format_value(name)}{near}; known: {known}")
     return PRESETS[name]

@@ -12,7 +12,7 @@ from v2v_protocol.errors import UsageError
 
 
 def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
-    """Writes the records of a command's ``--json FILE``.
+    """Write the records of a command's ``--json FILE``.
 
     Raises:
         UsageError: the file cannot be written.

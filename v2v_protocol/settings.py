@@ -88,9 +88,9 @@ class Setting:
         """
         checked = self._converted(value)
         if checked is None:
-            raise error(f"{name} = {shown(value)}: {self.expected}{self._hint(value)}")
+            raise error(f"{name} = {format_value(value)}: {self.expected}{self._hint(value)}")
         if self.kind in ("range", "bounds") and checked[0] > checked[1]:
-            raise error(f"{name} = {shown(value)}: the lowest value comes first")
+            raise error(f"{name} = {format_value(value)}: the lowest value comes first")
         return checked
 
     def _converted(self, value: object) -> Any:
@@ -207,7 +207,7 @@ def settings_of(cls: Any) -> Mapping[str, Setting]:
 
 
 def check_settings(item: Any, name: Callable[[str], str], error: type[UsageError] = UsageError) -> None:
-    """Checks and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
+    """Check and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
 
     Args:
         name: what messages call a field.
@@ -230,7 +230,7 @@ def require_known(
     names = list(known)
     for key in keys:
         if key not in names:
-            raise error(f"unknown {what} {shown(key)}{nearest(key, names)}; known: {', '.join(names)}")
+            raise error(f"unknown {what} {format_value(key)}{nearest(key, names)}; known: {', '.join(names)}")
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> int:
@@ -240,7 +240,7 @@ def require_whole(name: str, value: object, low: int, high: int) -> int:
         UsageError: it is none, or outside the limits; the message calls it ``name``.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise UsageError(f"{name} = {shown(value)}: give a whole number from {low} to {high}")
+        raise UsageError(f"{name} = {format_value(value)}: give a whole number from {low} to {high}")
     return value
 
 
@@ -250,7 +250,7 @@ def nearest(key: object, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """A value for a message: as it is written, but no page of it."""
     as_text = repr(list(value) if isinstance(value, tuple) else value)
     return as_text if len(as_text) <= _LONGEST_SHOWN else as_text[:_LONGEST_SHOWN] + " ..."

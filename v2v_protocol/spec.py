@@ -12,7 +12,7 @@ from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
-from v2v_protocol.settings import check_settings, nearest, require_known, settings_of, shown, switch, whole, word
+from v2v_protocol.settings import check_settings, format_value, nearest, require_known, settings_of, switch, whole, word
 
 VoxelDtype = Literal["int8", "int16", "float32"]
 OnBadVideo = Literal["substitute", "raise"]
@@ -201,7 +201,7 @@ def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
     """
     if not isinstance(name, str) or name not in SPEED_PRESETS:
         near, known = nearest(name, SPEED_PRESETS), ", ".join(SPEED_PRESETS)
-        raise UsageError(f"unknown preset {shown(name)}{near}; known: {known}")
+        raise UsageError(f"unknown preset {format_value(name)}{near}; known: {known}")
     return dataclasses.replace(base, sibling_spacing=0, **SPEED_PRESETS[name])
 
 

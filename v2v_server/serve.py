@@ -20,19 +20,29 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, PassOver, Show, ToConsumer, ToWorker
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    CutOff,
+    GiveUp,
+    ReportRefusal,
+    Show,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
-from v2v_server.console.farewell import farewell
 from v2v_server.console.progress import catalogue_progress
+from v2v_server.console.shutdown_summary import format_shutdown_summary
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
@@ -96,7 +106,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
 
 
 def serve(config: ServeConfig) -> None:
-    """Runs a server until SIGINT or SIGTERM.
+    """Run a server until SIGINT or SIGTERM.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -112,13 +122,13 @@ def serve(config: ServeConfig) -> None:
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
     for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
         log.say(line)
-    catalogue.wait_no_more()
+    catalogue.fail_fast()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
     quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
     quarantine = read_quarantine(quarantine_file)
-    for verdict in quarantine.verdicts(quarantine.latest):
-        log.say(f"in quarantine: {verdict}")
+    for entry in quarantine.entries(quarantine.latest):
+        log.say(f"in quarantine: {entry}")
     dispatcher = Dispatcher(
         catalogue,
         config.spec,
@@ -215,11 +225,11 @@ class Server:
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
-        self._held_up_due: float | None = None
+        self._blocked_due: float | None = None
         self._give_back_at = math.inf
 
     def turn(self, longest_wait_seconds: float) -> None:
-        """Takes what has come, and does what is due. Waits for a message if none is there.
+        """Take what has come, and does what is due. Waits for a message if none is there.
 
         Raises:
             WorkerCrashLoop: the workers die without finishing anything.
@@ -240,8 +250,8 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, withheld in self._supervisor.withheld(now).items():
-                self._dispatcher.worker_withheld(identity, withheld)
+            for identity, stalled in self._supervisor.stalled(now).items():
+                self._dispatcher.worker_stalled(identity, stalled)
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
@@ -251,17 +261,17 @@ class Server:
                 give_back_freed_memory()
             for line in [*self._supervisor.news(), *(self._page.watch(now) if self._page is not None else [])]:
                 self._say(line)
-            self._look_what_holds_up(now)
+            self._warn_if_blocked(now)
             self._scale(now)
             self._carry_out([*self._watch.tick(now)])
             self._show(now)
 
     def close(self) -> None:
-        """Tells the workers to stop, ends them, and ends all connections."""
+        """Tell the workers to stop, ends them, and ends all connections."""
         self._status.close()
         if self._announced:
             state = self._watch.state(self._clock())
-            for line in farewell(state):
+            for line in format_shutdown_summary(state):
                 self._log.say(line)
             if self._log.is_json:
                 self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)
@@ -276,7 +286,7 @@ class Server:
                 self._port_file.unlink(missing_ok=True)
 
     def _carry_out(self, actions: list[Action]) -> None:
-        """Does what the dispatcher wants, in its order, and tells it what came of it."""
+        """Do what the dispatcher wants, in its order, and tells it what came of it."""
         dispatcher, now = self._dispatcher, self._clock
         todo = deque(actions)
         while todo:
@@ -291,18 +301,18 @@ class Server:
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
-                case Condemn() as record:
+                case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.recorded(record, self._record(record), now())))
-                case LookFor() as missing:
-                    todo.extend(dispatcher.looked_for(missing, self._look_for(missing), now()))
-                case PassOver(refusal, request):
+                    todo.extendleft(reversed(dispatcher.quarantine_recorded(record, self._record(record), now())))
+                case CheckVideo() as missing:
+                    todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
+                case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case Show() as show:
                     todo.extend(self._watch.ask(show))
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
-        """Ends the process of a worker that hangs, if it is one of ours."""
+        """End the process of a worker that hangs, if it is one of ours."""
         loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
@@ -310,35 +320,35 @@ class Server:
         self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
         return loss
 
-    def _record(self, record: Condemn) -> list[Verdict]:
-        """Writes a verdict down. A server that cannot write goes on: its operator is told what that costs.
+    def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
+        """Write a verdict down. A server that cannot write goes on: its operator is told what that costs.
 
         Returns:
             the lines that the quarantine has more now.
         """
-        verdict = record.verdict
+        entry = record.entry
         try:
-            written = write_verdict(self._quarantine_file, verdict, self._quarantine)
+            written = write_entry(self._quarantine_file, entry, self._quarantine)
         except (OSError, CorpusError) as error:
             self._say(
-                f"{verdict.path} from frame {verdict.frame}: {verdict.reason}; it is passed over this once and comes "
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; it is passed over this once and comes "
                 f"again, because the quarantine cannot be written: {error}",
                 "error",
                 record.request,
-                video=verdict.path,
+                video=entry.path,
             )
             return []
         for line in written:
             self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
         return written
 
-    def _look_for(self, missing: LookFor) -> bool:
+    def _check_video(self, missing: CheckVideo) -> bool:
         """Whether the video is here as it was catalogued. If so, the operator is told of the host that has it not,
         once in a while: all workers of a host fail alike."""
         try:
             self._catalogue.check(missing.video, missing.fingerprint)
         except VideoChanged:
-            self._catalogue.doubt(missing.video)
+            self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -358,15 +368,15 @@ class Server:
             )
         return True
 
-    def _look_what_holds_up(self, now: float) -> None:
+    def _warn_if_blocked(self, now: float) -> None:
         """Another server that writes holds the index for moments; what lasts is said, once."""
-        if not self._dispatcher.held_up:
-            self._held_up_due = None
-        elif self._held_up_due is None:
-            self._held_up_due = now + _SOON_SECONDS
-        elif now >= self._held_up_due:
-            self._held_up_due = math.inf
-            self._say(f"no sample is begun: {self._dispatcher.held_up}", "warning")
+        if not self._dispatcher.blocked_reason:
+            self._blocked_due = None
+        elif self._blocked_due is None:
+            self._blocked_due = now + _SOON_SECONDS
+        elif now >= self._blocked_due:
+            self._blocked_due = math.inf
+            self._say(f"no sample is begun: {self._dispatcher.blocked_reason}", "warning")
 
     def _scale(self, now: float) -> None:
         """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""
@@ -379,7 +389,7 @@ class Server:
             self._say(f"workers: {decision.workers} from now on, because {decision.reason}")
 
     def _show(self, now: float) -> None:
-        """Says once that the server is ready; after that keeps the status up to date."""
+        """Say once that the server is ready; after that keeps the status up to date."""
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
             address, worker_address = self._transport.address, self._transport.worker_address
@@ -427,7 +437,7 @@ def _private_address(label: str) -> str:
 
 
 def _write_port_file(file: str, address: str) -> None:
-    """Writes the address in one step: whoever sees the file sees all of it."""
+    """Write the address in one step: whoever sees the file sees all of it."""
     path = Path(file)
     partial = path.parent / f".{path.name}.{os.getpid()}"
     try:

@@ -83,7 +83,7 @@ def _record_of(leases: Sequence[Lease], root: Path) -> dict[str, Any]:
         flow, record[f"flow_{scene}_cpu_seconds"] = _timed(lambda: _flow(decoded))  # noqa: B023
         _, record[f"simulation_{scene}_cpu_seconds"] = _timed(lambda: _simulated(decoded))  # noqa: B023
         flows.append(flow)
-        plan = decoded.draft.plan
+        plan = decoded.plan.flow_plan
         if scene == "off":
             truth = _flow(decoded, _REFERENCE)
     compared = np.linspace(0, len(truth) - 1, _COMPARED_VOXELS).round().astype(int)
@@ -103,22 +103,22 @@ def _timed(work: Callable[[], _T]) -> tuple[_T, float]:
 
 def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16]:
     """Return flow [T, 2, H, W] as a worker makes it, or by one method."""
-    draft = decoded.draft
+    plan = decoded.plan
     settings = _settings(decoded) if method is None else replace(_settings(decoded), method=method)
-    plan = draft.plan.methods if draft.plan is not None and method is None else ()
-    return flow_for(decoded.clip.frames, draft.params, draft.spec.recipe, settings, plan=plan).flow
+    methods = plan.flow_plan.methods if plan.flow_plan is not None and method is None else ()
+    return flow_for(decoded.clip.frames, plan.params, plan.spec.recipe, settings, plan=methods).flow
 
 
 def _simulated(decoded: Decoded) -> object:
-    params, spec = decoded.draft.params, decoded.draft.spec
+    params, spec = decoded.plan.params, decoded.plan.spec
     view = view_part(decoded.clip.frames, params, spec.recipe, _settings(decoded).margin_px)
     return simulate_clip(apply_view(view, params, spec.recipe), params, spec.recipe, spec.voxel_dtype, None)
 
 
 def _settings(decoded: Decoded) -> FlowSettings:
-    if decoded.draft.flow is None:
+    if decoded.plan.flow is None:
         raise UsageError("the lease asks for no flow")
-    return decoded.draft.flow
+    return decoded.plan.flow
 
 
 def totals(clips: Sequence[Record]) -> list[dict[str, Any]]:

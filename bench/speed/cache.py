@@ -59,7 +59,7 @@ def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> list[floa
         make_sample(lease, decoded)
         clock.append(time.process_time())
         # make_sample contains the view: time it once more by itself.
-        apply_view(decoded.clip.frames, decoded.draft.params, decoded.draft.spec.recipe)
+        apply_view(decoded.clip.frames, decoded.plan.params, decoded.plan.spec.recipe)
         clock.append(time.process_time())
         read, made, view = np.diff(clock)
         spent += read, view, made - view

@@ -48,7 +48,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, encode_sample
 from v2v_server.system.process import die_with_parent, keep_freed_memory
-from v2v_server.worker.handover import pack, room_for, sample_message
+from v2v_server.worker.output_buffer import open_output_buffer, pack, sample_message
 from v2v_server.worker.produce import sample_layout
 
 Ready = Mapping[str, npt.NDArray[Any]]
@@ -178,11 +178,11 @@ def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:
     )
     if samples is not None:
         return _ready_message(lease, name, provenance, samples)
-    room = room_for(lease, sample_layout(lease))
+    buffer = open_output_buffer(lease, sample_layout(lease))
     # Untouched memory is one shared page of zeros, which is nearly free to send.
-    for array in room.arrays.values():
+    for array in buffer.arrays.values():
         array.fill(1)
-    return sample_message(lease, room, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
+    return sample_message(lease, buffer, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
 
 
 _packed: dict[int, list[bytes]] = {}

@@ -33,7 +33,7 @@ from v2v_protocol.messages import Denied
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.wire import decode, decode_map, encode, encode_map
-from v2v_server.worker.handover import slot_arrays
+from v2v_server.worker.output_buffer import slot_arrays
 
 SEED = 5
 QUICK = Patience(ping_seconds=0.05, rewant_seconds=0.2)
@@ -525,7 +525,7 @@ def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
     batches = iter(stream)
     next(batches)
     server.call(lambda: setattr(server, "mute", True))
-    with pytest.raises(ServerLost, match=rf"{server.address}: nothing heard for .* last sample: epoch 0, index \d+"):
+    with pytest.raises(ServerLost, match=rf"{server.address}: nothing received for .* last sample: epoch 0, index \d+"):
         list(batches)
 
 

@@ -45,7 +45,7 @@ def test_it_is_up_inside_the_block_and_gone_after_it_with_its_children(program):
         assert server.rss_bytes().keys() == pids
         assert all(size > 0 for size in server.rss_bytes().values())
     assert not any(process.is_running() for process in tree)
-    with pytest.raises(UsageError, match="does not run"):
+    with pytest.raises(UsageError, match="is not running"):
         server.cpu_seconds()
     server.stop()
 

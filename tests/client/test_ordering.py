@@ -100,6 +100,6 @@ def test_duplicates_and_strays_are_told_apart():
     assert (window.duplicates, window.strays) == (1, 1)
 
 
-def test_a_credit_of_none_is_refused():
-    with pytest.raises(LimitExceeded, match="credit of 0"):
+def test_a_credit_of_zero_is_refused():
+    with pytest.raises(LimitExceeded, match="credit = 0 samples"):
         ReorderWindow([0], lambda _: (0,), 1, 0)

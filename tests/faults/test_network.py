@@ -150,7 +150,9 @@ def test_nothing_heard_within_the_deadline_names_address_and_last_sample(proxy: 
     batches = iter(dataset(proxy, timeout_seconds=3.5))
     first = next(batches)
     proxy.blackhole()
-    expected = rf"{proxy.address}: nothing heard for \d+ s; last sample: epoch {first.epoch}, index \d+; .*\(now 3.5\)"
+    expected = (
+        rf"{proxy.address}: nothing received for \d+ s; last sample: epoch {first.epoch}, index \d+; .*\(now 3.5\)"
+    )
     with pytest.raises(ServerLost, match=expected):
         list(batches)
     assert proxy.swallowed > 0

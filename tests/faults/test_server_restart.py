@@ -98,7 +98,7 @@ def test_a_server_that_is_gone_for_good_is_given_up_naming_the_last_sample(clips
         with iterating(address, timeout_seconds=3.5) as (client, go_on):
             kill(server)
             go_on.set()
-            expected = rf"{address}: nothing heard for \d+ s; last sample: epoch 0, index \d+; start v2v-serve there"
+            expected = rf"{address}: nothing received for \d+ s; last sample: epoch 0, index \d+; start v2v-serve there"
             with pytest.raises(ServerLost, match=expected):
                 client.result()
 

@@ -13,8 +13,7 @@ provenance states, and must be the same.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as Several
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +25,7 @@ from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import Sequence, SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.worker.produce import decode_for, make_sample
 
 
@@ -77,7 +76,7 @@ class StreamOracle:
         self._schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, self._spec), self._spec)
         self.sequences = self._schedule.count
 
-    def sequence(self, epoch: int, index: int, candidate: int) -> Sequence:
+    def sequence(self, epoch: int, index: int, candidate: int) -> VideoSequence:
         """Return the sequence of a sample's candidate."""
         return self._schedule.candidate(self._asked.seed, epoch, index, candidate)
 
@@ -148,7 +147,7 @@ class Verdict:
         return summed | {name: getattr(self, name) for name in fields}
 
 
-def check(catalogue: Catalogue, logs: Several[tuple[Profile, Iterable[Line]]], *, remakes: int, seed: int) -> Verdict:
+def check(catalogue: Catalogue, logs: Sequence[tuple[Profile, Iterable[Line]]], *, remakes: int, seed: int) -> Verdict:
     """Check the logs of all consumers.
 
     Args:

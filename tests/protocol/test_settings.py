@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.settings import (
     check_settings,
+    format_value,
     number,
     require_known,
     settings_of,
-    shown,
     span,
     switch,
     text,
@@ -110,5 +110,5 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one() -> None:
 
 
 def test_a_message_shows_no_page_of_a_value() -> None:
-    assert len(shown("x" * 10_000)) < 300
-    assert shown((0.1, 1e-6)) == "[0.1, 1e-06]"
+    assert len(format_value("x" * 10_000)) < 300
+    assert format_value((0.1, 1e-6)) == "[0.1, 1e-06]"

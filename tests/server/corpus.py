@@ -40,7 +40,7 @@ class NamedCorpus:
     held: set[str] = field(default_factory=set)
     notes: tuple[str, ...] = ()
 
-    def wait_no_more(self) -> None:
+    def fail_fast(self) -> None:
         """There is no index to wait for."""
 
     def digest_under(self, scene: str) -> str:

@@ -29,10 +29,10 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.catalogue.catalogue import Catalogue
 
 DEADLINE = 60.0
@@ -117,8 +117,8 @@ class Peers:
     given_up: list[bytes] = field(default_factory=list)
     remote: set[bytes] = field(default_factory=set)
     writable: bool = True
-    recorded: list[Verdict] = field(default_factory=list)
-    others: list[Verdict] = field(default_factory=list)
+    recorded: list[QuarantineEntry] = field(default_factory=list)
+    others: list[QuarantineEntry] = field(default_factory=list)
     gone: set[str] = field(default_factory=set)
     passed_over: list[Refusal] = field(default_factory=list)
     sent: list[tuple[str, Any]] = field(default_factory=list)
@@ -148,16 +148,18 @@ class Peers:
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
                     todo.extend(self.dispatcher.worker_lost(identity, Loss(cause, reason), self.now))
-                case Condemn() as record:
-                    self.sent.append(("record", record.verdict))
-                    todo.extendleft(reversed(self.dispatcher.recorded(record, self._write(record.verdict), self.now)))
-                case PassOver(refusal):
+                case AddToQuarantine() as record:
+                    self.sent.append(("record", record.entry))
+                    todo.extendleft(
+                        reversed(self.dispatcher.quarantine_recorded(record, self._write(record.entry), self.now))
+                    )
+                case ReportRefusal(refusal):
                     self.passed_over.append(refusal)
-                case LookFor() as missing:
+                case CheckVideo() as missing:
                     found = missing.video not in self.gone
-                    todo.extend(self.dispatcher.looked_for(missing, found, self.now))
+                    todo.extend(self.dispatcher.video_checked(missing, found, self.now))
 
-    def _write(self, verdict: Verdict) -> list[Verdict]:
+    def _write(self, verdict: QuarantineEntry) -> list[QuarantineEntry]:
         if not self.writable:
             return []
         others, self.others = self.others, []

@@ -11,7 +11,7 @@ from v2v_protocol.messages import Message
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Withheld
+from v2v_server.broker.leases import Stall
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker
 from v2v_server.supervise.protocol import Death
 
@@ -103,7 +103,7 @@ class ToySupervisor:
             self._begin(self.workers[-1], self._address)
         return deaths
 
-    def withheld(self, now: float) -> dict[bytes, Withheld]:
+    def stalled(self, now: float) -> dict[bytes, Stall]:
         return {}
 
     def watches(self, identity: bytes) -> bool:

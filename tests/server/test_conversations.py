@@ -39,7 +39,17 @@ from v2v_server.broker.quarantine import read_quarantine
 from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
 from v2v_server.serve import Server
-from v2v_server.worker.conversation import CREDIT, Action, Leave, Listen, Load, Make, Send, Tools, WorkerConversation
+from v2v_server.worker.conversation import (
+    CREDIT,
+    Action,
+    Callbacks,
+    Leave,
+    Listen,
+    Load,
+    Make,
+    Send,
+    WorkerConversation,
+)
 
 WORKERS = 2
 FAILING = "v1.mp4"
@@ -95,13 +105,13 @@ class Worker:
     def __init__(self, name: bytes, world: World) -> None:
         self.name, self.world = name, world
         self.kernels = False
-        tools = Tools(
+        callbacks = Callbacks(
             is_ready=lambda lease: self.kernels or lease.indices[0] % 5 != 0,
             is_compiled=lambda lease: lease.indices[0] % 2 == 0,
             is_decoded=lambda lease: lease.indices[0] % 3 == 0,
         )
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
-        self.conversation = WorkerConversation(hello, "queue://workers", tools, is_watched=True)
+        self.conversation = WorkerConversation(hello, "queue://workers", callbacks, is_watched=True)
         self.step: Action = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))
@@ -121,16 +131,16 @@ class Worker:
                 inbox = self.world.queues.sent[self.name]
                 messages = [frames[0] for frames in inbox]
                 inbox.clear()
-                self._take(self.conversation.heard(messages, self.world.now))
+                self._take(self.conversation.on_messages(messages, self.world.now))
             case Load():
                 self.kernels = True
-                self._take(self.conversation.loaded(self.world.now))
+                self._take(self.conversation.on_kernels_loaded(self.world.now))
             case Make(lease):
                 if lease.video == FAILING:
                     error = VideoError(lease.video, 3, "cut short")
-                    self._take(self.conversation.failed(error, self.world.now))
+                    self._take(self.conversation.on_failure(error, self.world.now))
                 else:
-                    self._take(self.conversation.made(self.frames(lease), self.world.now))
+                    self._take(self.conversation.on_sample(self.frames(lease), self.world.now))
 
     @staticmethod
     def frames(lease: Lease) -> list[Any]:

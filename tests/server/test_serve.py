@@ -19,19 +19,19 @@ from v2v_protocol.messages import Pong, Stop
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
-from v2v_server.broker.actions import Action, Condemn, GiveUp, LookFor, PassOver, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, Verdict, read_quarantine
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 
-VERDICT = Verdict(0, "v.mp4", "f", 0, "crash", "t")
-RECORD = Condemn(VERDICT, Request(b"c", 0, 0))
+VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")
+RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
 
 
 class Scripted:
@@ -42,6 +42,7 @@ class Scripted:
         self.after_record = after_record
         self.told: list[tuple[Any, ...]] = []
         self.times: list[float] = []
+        self.blocked_reason = ""
         self.counters = Counters()
         self._there = peers().dispatcher
 
@@ -53,11 +54,11 @@ class Scripted:
         said, self.first = self.first, []
         return said
 
-    def recorded(self, record: Condemn, written: list[Verdict], now: float) -> list[Action]:
+    def quarantine_recorded(self, record: AddToQuarantine, written: list[QuarantineEntry], now: float) -> list[Action]:
         self.told.append(("recorded", record, written))
         return list(self.after_record)
 
-    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
+    def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         self.told.append(("looked for", missing, found))
         return []
 
@@ -86,8 +87,8 @@ def served(
     **settings: Any,
 ) -> Server:
     """A server that has made one turn."""
-    doubted: list[str] = []
-    catalogue = SimpleNamespace(check=check, doubted=doubted, doubt=doubted.append, root=folder, videos=(), refusals=())
+    stale: list[str] = []
+    catalogue = SimpleNamespace(check=check, stale=stale, mark_stale=stale.append, root=folder, videos=(), refusals=())
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),
@@ -128,11 +129,11 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
         if not found:
             raise VideoChanged("a.mp4", None, "another file")
 
-    missing = LookFor("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
+    missing = CheckVideo("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
     dispatcher = Scripted([missing, missing])
     server = served(dispatcher, tmp_path, check=check)
     assert dispatcher.told == [("looked for", missing, found)] * 2
-    assert cast(Any, server)._catalogue.doubted == ([] if found else ["a.mp4"] * 2)
+    assert cast(Any, server)._catalogue.stale == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
     assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
 
@@ -141,8 +142,8 @@ def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.Cap
     dispatcher = Scripted([])
     now = [0.0]
     server = served(dispatcher, tmp_path, clock=lambda: now[0])
-    for held_up, seconds in (("locked", 1.0), ("", 1.0), ("locked", 1.0), ("locked", 6.0), ("locked", 60.0)):
-        dispatcher.held_up = held_up
+    for reason, seconds in (("locked", 1.0), ("", 1.0), ("locked", 1.0), ("locked", 6.0), ("locked", 60.0)):
+        dispatcher.blocked_reason = reason
         now[0] += seconds
         server.turn(0.0)
     assert capsys.readouterr().err.count("no sample is begun: locked") == 1
@@ -184,7 +185,7 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool,
 
 
 def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    served(Scripted([PassOver(Refusal("a.mp4", 7, "cut short"))]), tmp_path)
+    served(Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"))]), tmp_path)
     assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
 
 
@@ -247,7 +248,7 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     at = peers()
     at.hello(b"c", seed=5)
     request = Request(b"c", 2, 7)
-    dispatcher = Scripted([PassOver(Refusal("a.mp4", 7, "cut short"), request), Condemn(VERDICT, request)])
+    dispatcher = Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"), request), AddToQuarantine(VERDICT, request)])
     dispatcher._there = at.dispatcher
     server = served(dispatcher, tmp_path, log_format="json")
     server.close()

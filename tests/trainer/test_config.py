@@ -49,8 +49,8 @@ def test_the_papers_e2vid():
     [
         ("e2vid-fixed-thresholds", {"stream.recipe"}),
         ("e2vid-contrast", {"stream.recipe"}),
-        ("e2vid-webvid100", {"stream.videos", "run.epochs"}),
-        ("e2vid-webvid1k", {"stream.videos", "run.epochs"}),
+        ("e2vid-webvid100", {"stream.videos", "run.epochs", "run.keep_epochs"}),
+        ("e2vid-webvid1k", {"stream.videos", "run.epochs", "run.keep_epochs"}),
         ("e2vid-filtered", {"stream.list"}),
     ],
 )
@@ -60,6 +60,7 @@ def test_an_ablation_differs_in_one_thing(name, changed):
 
 def test_the_other_recipes_are_those_of_the_code_and_the_paper():
     assert [load_config(f"e2vid-webvid{size}").run.epochs for size in ("100", "1k")] == [8000, 800]
+    assert [load_config(f"e2vid-webvid{size}").run.keep_epochs for size in ("100", "1k")] == [0, 0]
     alex = load_config("e2vid-alex-tc").loss
     assert (alex.l1_weight, alex.lpips_network, alex.temporal_first_step, alex.temporal_rule) == (0, "alex", 1, "half")
     published = {
@@ -73,6 +74,7 @@ def test_the_other_recipes_are_those_of_the_code_and_the_paper():
         rates = (config.optimizer.learning_rate, config.optimizer.weight_decay, config.optimizer.learning_rate_decay)
         assert (config.optimizer.name, *rates, config.stream.batch_size, config.run.epochs) == expected, name
         assert (config.network.name, config.optimizer.amsgrad) == (name, True)
+        assert (config.compute.precision, config.compute.cudnn_benchmark) == ("tf32", True)
     assert load_config("hypere2vid").loss.guide_epochs == 16
     assert [load_config(name).loss.gamma for name in ("eraft", "eraft-as-published", "evflownet")] == [0.8, 0, 0]
     assert {load_config(name).loss.raft_size for name in ("eraft", "evflownet")} == {"large"}
@@ -123,6 +125,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("loss.l1_weight=0", r"l1_weight, lpips_weight and temporal_weight are all 0"),
         ("loss.l1_weight=-1", r"loss\.l1_weight = -1: give a number from 0"),
         ("loss.flow=guess", r"loss\.flow = 'guess': choose one of raft, stream"),
+        ("run.validate_config=mine.yaml", r"run\.validate_config = mine\.yaml: run\.validate is missing"),
         ("loss=3", r"--set loss=3: write SECTION\.KEY=VALUE"),
         ("run.steps", r"--set run\.steps: write SECTION\.KEY=VALUE"),
         ("run.steps=[", r"not a value in YAML"),

@@ -119,6 +119,13 @@ def test_one_compiled_time_step_makes_the_same_step(tmp_path: Path, monkeypatch:
         build(load_config(configured(tmp_path), settings), ALONE)
 
 
+def test_a_compiled_step_needs_a_new_pytorch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "__version__", "2.6.0+cu124")
+    with pytest.raises(UsageError, match=r"compute\.compile = step: PyTorch is 2\.6\.0\+cu124, and this needs 2\.7"):
+        build(load_config(configured(tmp_path), ["compute.compile=step"]), ALONE)
+    build(load_config(configured(tmp_path)), ALONE)
+
+
 def test_dropout_differs_between_ranks_and_steps_and_not_between_runs(tmp_path: Path) -> None:
     """One process for each rank in turn, with the same weights and the same batch."""
     voxels, frames = torch.randint(-3, 4, (2, 3, 2, 16, 20)), torch.rand(2, 3, 1, 16, 20)

@@ -11,12 +11,12 @@ import pytest
 from trainer.pictures import (
     GAP_PX,
     Video,
+    add_header,
     contact_sheet,
     draw_events,
     draw_flow,
     draw_grey,
     flow_scale,
-    headed,
     side_by_side,
     write_png,
 )
@@ -70,7 +70,7 @@ def test_a_film_is_large_enough_to_see() -> None:
 
 def test_a_headed_picture_keeps_its_pixels_and_names_its_columns() -> None:
     picture = np.random.default_rng(0).integers(0, 255, (60, 390, 3)).astype(np.uint8)
-    page = headed(picture, ("events", "target", "reconstruction"), "step 7", time_runs_down=True)
+    page = add_header(picture, ("events", "target", "reconstruction"), "step 7", time_runs_down=True)
     assert np.array_equal(page[-60:, -390:], picture)
     names = page[:-60, -390:]
     columns = np.split(names, 3, axis=1)
@@ -78,7 +78,7 @@ def test_a_headed_picture_keeps_its_pixels_and_names_its_columns() -> None:
     assert (columns[0] == BRIGHTER).all(axis=-1).any()
     assert (columns[0] == DARKER).all(axis=-1).any()
     assert not any((column == BRIGHTER).all(axis=-1).any() for column in columns[1:])
-    assert headed(picture, ()) is picture
+    assert add_header(picture, ()) is picture
 
 
 def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:

@@ -17,12 +17,14 @@ from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.evaluation.test_flow import constant
 from tests.trainer.evaluation.test_flow import recording as flow_recording
 from tests.trainer.training import configured
+from trainer.config import RunConfig
 from trainer.config_file import load_config
 from trainer.learner import build
 from trainer.models import NETWORKS
 from trainer.models.firenet import FireNet
 from trainer.precision import bfloat16_products
 from trainer.run.distributed import Ranks
+from trainer.run.validation import Validation
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
 CPU = torch.device("cpu")
@@ -105,8 +107,9 @@ def allowed() -> tuple[bool, bool]:
 
 @pytest.fixture
 def _as_before() -> Iterator[None]:
-    before = allowed()
+    before, benchmark = allowed(), torch.backends.cudnn.benchmark
     yield
+    torch.backends.cudnn.benchmark = benchmark
     torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = before
 
 
@@ -117,12 +120,19 @@ def test_scores_within_a_training_of_shorter_products_are_of_full_ones(tmp_path:
     flow = task == "flow"
     settings = ["compute.precision=tf32", *(["network.name=evflownet", "loss.flow=stream"] if flow else [])]
     learner = build(load_config(configured(tmp_path), settings), ALONE)
-    assert allowed() == (True, True)
+    assert allowed() == (False, True)  # convolutions alone, as PyTorch does by itself
     network = constant(0, 0) if flow else FireNet(base_channels=2)
     path = tmp_path / "recordings" / "a.h5"
     _ = flow_recording(path) if flow else random_recording(path)
     seen = set()
     network.register_forward_hook(lambda *_: seen.add(allowed()))
-    learner.task.validator(network, path.parent)()
+    Validation(learner.task, network, RunConfig(validate=str(path.parent)), ALONE)()
     assert seen == {(False, False)}
-    assert allowed() == (True, True)
+    assert allowed() == (False, True)
+
+
+@pytest.mark.usefixtures("_as_before")
+@pytest.mark.parametrize("benchmark", [True, False])
+def test_cudnn_times_its_algorithms_unless_the_configuration_says_otherwise(tmp_path: Path, benchmark: bool) -> None:
+    build(load_config(configured(tmp_path), [f"compute.cudnn_benchmark={str(benchmark).lower()}"]), ALONE)
+    assert torch.backends.cudnn.benchmark == benchmark

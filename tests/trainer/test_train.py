@@ -2,56 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 
 from tests.client.fake_server import FakeServer
-from tests.trainer.evaluation.h5_file import random_recording
-from tests.trainer.training import arguments, losses, trained
+from tests.trainer.training import arguments, losses, refused, same, trained
 from trainer.config_file import load_config
-from trainer.evaluation.cli import main as evaluate
 from trainer.models import NETWORKS, FireNet, VoxelNetwork
 from trainer.models.sequence import Guide, Settings
-from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, save_checkpoint
+from trainer.run.checkpoint import LAST, load_checkpoint
 from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
 from trainer.weights import load_into, load_network
-from v2v_protocol.errors import UsageError
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[FakeServer]:
-    with FakeServer(sequences=23) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def whole(server: FakeServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An uninterrupted run of 12 steps: two epochs of 5 and a part of the third."""
-    return trained(tmp_path_factory.mktemp("whole"), server.address, "run", run__steps=12)
-
-
-def same(left: object, right: object) -> bool:
-    """Equal to the last bit, tensors included."""
-    if isinstance(left, Tensor) and isinstance(right, Tensor):
-        return torch.equal(left, right)
-    if isinstance(left, dict) and isinstance(right, dict):
-        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
-    if isinstance(left, list | tuple) and isinstance(right, list | tuple):
-        return len(left) == len(right) and all(map(same, left, right))
-    return left == right
 
 
 def test_it_trains(whole: Path) -> None:
@@ -193,63 +163,6 @@ def test_a_preview_does_not_change_the_training(server: FakeServer, whole: Path,
     assert losses(run) == losses(whole)[:4]
 
 
-def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
-    server: FakeServer, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = trained(tmp_path, server.address, "run", run__steps=12, run__judge_every=5)
-    assert losses(run) == losses(whole)
-    judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
-    assert [record["step"] for record in judged] == [5, 10, 12]
-    assert judged[-1]["held_out_total"] < judged[0]["held_out_total"]
-    assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
-
-
-def test_the_network_that_does_best_on_recordings_is_kept(server: FakeServer, whole: Path, tmp_path: Path) -> None:
-    """Scored at the ends of epochs, without changing the training; a resumed run knows what was best before."""
-    for seed in range(2):
-        random_recording(tmp_path / "recordings" / f"{seed}.h5", seed=seed)
-    validation = {"run__validate": str(tmp_path / "recordings"), "run__validate_every": 2}
-    run = trained(tmp_path, server.address, "run", run__steps=23, **validation)
-    assert losses(run)[:12] == losses(whole)
-
-    def scored() -> dict[int, float]:
-        return {r["step"]: r["validation_mse"] for r in read_metrics(run / METRICS) if "validation_mse" in r}
-
-    assert list(scored()) == [10, 20]
-    first_best = min(scored(), key=scored().__getitem__)
-    assert load_checkpoint(run / "best.pt").step == first_best
-    record = next(record for record in read_metrics(run / METRICS) if "validation_mse" in record)
-    assert 0 < record["validation_correlation_lacking"] < 2
-    trained(tmp_path, server.address, "run", "run/last.pt", run__steps=43, **validation)
-    assert list(scored()) == [10, 20, 30, 40]
-    assert load_checkpoint(run / "best.pt").step == min(scored(), key=scored().__getitem__)
-    said = trainer_evaluation_means(run / "best.pt", tmp_path / "recordings")
-    assert said["mse"] == pytest.approx(min(scored().values()), rel=1e-6)
-
-
-def trainer_evaluation_means(weights: Path, recordings: Path) -> dict[str, float]:
-    """What ``v2v-eval`` says of the averaged network."""
-    out = weights.with_suffix(".json")
-    assert (
-        evaluate(
-            ["--weights", str(weights), "--ema", "--data", str(recordings), "--metrics", "mse", "--json", str(out)]
-        )
-        == 0
-    )
-    scores = [record["mse"] for record in json.loads(out.read_text("utf-8")) if record.get("sequence") in ("0", "1")]
-    return {"mse": float(np.mean(scores))}
-
-
-@pytest.mark.parametrize("network", ["firenet", "evflownet"])
-def test_recordings_that_cannot_be_scored_are_said_before_the_first_step(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], network: str
-) -> None:
-    flow = {"loss__flow": "stream"} if network == "evflownet" else {}
-    missing = refused(tmp_path, server.address, capsys, run__validate="nowhere", network__name=network, **flow)
-    assert "run.validate = nowhere" in missing
-    assert not (tmp_path / "run" / "last.pt").exists()
-
-
 @pytest.mark.parametrize(("processor", "slow"), [("AVX2", True), ("AVX512", False)])
 def test_bfloat16_in_software_is_said(
     server: FakeServer,
@@ -319,7 +232,7 @@ def test_flow_is_judged_and_shown_as_well(server: FakeServer, tmp_path: Path) ->
     )  # fmt: skip
     assert server.hellos[-1].arrays == ("voxels", "flow", "flow_valid")
     judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
-    assert [record["step"] for record in judged] == [1, 2]
+    assert [record["step"] for record in judged] == [0, 1, 2]
     assert all(record["held_out_end_point_error_px"] > 0 for record in judged)
     sheet = cv2.imread(str(run / "previews" / "step-0000002-0.png"))
     height, width = 3 * (8 * 16 + 4), 3 * (8 * 20 + 4)
@@ -369,145 +282,3 @@ def test_bfloat16_channels_last_is_close(server: FakeServer, whole: Path, tmp_pa
     for mine, theirs in zip(losses(run), losses(whole)[:2], strict=True):
         assert mine["total"] == pytest.approx(theirs["total"], rel=2e-2)
         assert mine["total"] != theirs["total"]
-
-
-def refused(folder: Path, address: str, capsys: pytest.CaptureFixture[str], **settings: object) -> str:
-    assert main(arguments(folder, address, "run", **settings)) == 2  # type: ignore[arg-type]
-    return capsys.readouterr().err
-
-
-def test_a_folder_with_a_run_is_not_written_over(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trained(tmp_path, server.address, "run", run__steps=1)
-    assert "holds a run: go on with --resume" in refused(tmp_path, server.address, capsys)
-
-
-@pytest.mark.parametrize("out", ["file", "file/run"])
-def test_a_folder_that_cannot_be_written_is_said_before_anything_is_asked(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
-) -> None:
-    (tmp_path / "file").touch()
-    before = len(server.hellos)
-    assert main(arguments(tmp_path, server.address, out, run__steps=1)) == 2
-    assert re.search(r"run\.out = .*file.*; give another folder with --out", capsys.readouterr().err)
-    assert len(server.hellos) == before
-
-
-def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def denied(_: Path) -> bool:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "exists", denied)
-    with pytest.raises(UsageError, match=r"run\.out = .*: Permission denied; give another folder"):
-        require_fresh(tmp_path)
-
-
-def test_a_run_goes_on_in_its_own_folder(server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    without_out = ["small.yaml", "--connect", server.address, "--set", "run.steps=1"]
-    trained(tmp_path, server.address, "elsewhere", run__steps=1)
-    assert main(without_out) == 0
-    first = (tmp_path / "runs" / "small" / LAST).read_bytes()
-    assert main([*without_out, "--set", "run.steps=2", "--resume", f"elsewhere/{LAST}"]) == 0
-    assert load_checkpoint(tmp_path / "elsewhere" / LAST).step == 2
-    assert (tmp_path / "runs" / "small" / LAST).read_bytes() == first
-
-
-def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    trained(tmp_path, server.address, "run", run__steps=1)
-    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", optimizer__learning_rate=0.5)
-    assert "optimizer.learning_rate: 0.01 -> 0.5" in message
-    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", stream__seed=9)
-    assert "stream.seed: 0 -> 9" in message
-
-
-def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeServer(sequences=23) as server:
-        trained(tmp_path, server.address, "run", run__steps=1)
-        server.restart(catalogue="catalogue-2")
-        message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}")
-    assert "catalogue_digest" in message
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"loss__lpips_weight": 1.0}, "loss.lpips_backbone is missing.*download.pytorch.org/models/vgg16"),
-        (
-            {"loss__lpips_weight": 1.0, "loss__lpips_backbone": "no.pth", "loss__lpips_heads": "no.pth"},
-            "no file no.pth",
-        ),
-        (
-            {"loss__temporal_weight": 1.0, "loss__temporal_first_step": 1},
-            "loss.raft_weights is missing.*raft_small_C_T_V2",
-        ),
-        ({"network__options": {"chanels": 3}}, "network.options.chanels: firenet knows base_channels"),
-        ({"network__options": {"base_channels": 2.5}}, "network.options.base_channels = 2.5: give a whole number"),
-        ({"network__options": {"normalize_voxels": "no"}}, "network.options.normalize_voxels = 'no': give true or fal"),
-        (
-            {"network__name": "e2vid", "network__options": {"norm": "BN"}},
-            "network.options.norm = 'BN': choose one of none, batch",
-        ),
-        ({"network__weights": "no.pt"}, "no file no.pt"),
-    ],
-)
-def test_what_is_missing_is_said_before_anything_is_asked_of_the_server(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, object], message: str
-) -> None:
-    before = len(server.hellos)
-    assert re.search(message, refused(tmp_path, server.address, capsys, **settings))
-    assert len(server.hellos) == before
-    assert not (tmp_path / "run").exists()
-
-
-def test_without_videos_or_address_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--videos DIR, or --connect ADDRESS" in refused(tmp_path, "", capsys)
-
-
-def test_a_diverged_run_keeps_the_checkpoint_before(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = trained(tmp_path, server.address, "run", run__steps=1)
-    good = load_checkpoint(run / LAST)
-    spoilt = {name: tensor * torch.nan for name, tensor in good.model.items()}
-    save_checkpoint(tmp_path / "spoilt.pt", dataclasses.replace(good, model=spoilt))
-    assert main(arguments(tmp_path, server.address, "run", resume="spoilt.pt", run__steps=3, run__save_every=1)) == 1
-    message = capsys.readouterr().err
-    assert "step 2: loss nan" in message
-    assert "nothing was saved since this start" in message
-    assert same(load_checkpoint(run / LAST).model, good.model)
-
-
-def test_a_disk_that_refuses_is_said(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("trainer.loop.save_checkpoint", full)
-    message = refused(tmp_path, server.address, capsys, run__steps=2)
-    assert re.search(r"step 2 cannot be saved as .*last\.pt: No space left on device", message)
-
-
-def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeServer(sequences=23) as server:
-        sent = []
-
-        def silent_from_the_third_batch(frames: list[object]) -> list[object]:
-            sent.append(frames)
-            if len(sent) == 12:
-                server.mute = True
-            return frames
-
-        server.alter = silent_from_the_third_batch
-        message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=2.0)
-    assert "nothing heard" in message
-    assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
-    assert (tmp_path / "run" / METRICS).is_file()
-
-
-def test_a_server_that_never_was_there_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = refused(tmp_path, f"ipc://{tmp_path}/nobody", capsys, stream__timeout_seconds=0.1)
-    assert "nothing heard" in message
-    assert not (tmp_path / "run" / LAST).exists()

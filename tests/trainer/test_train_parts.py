@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import gc
-import json
 import os
 import signal
 import weakref
 from collections.abc import Iterator
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,7 +20,6 @@ from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
-from trainer.run.reporting import METRICS, Meter, Reporter, read_metrics
 from trainer.train import serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
@@ -220,84 +217,17 @@ def test_workers_that_the_signal_ended_as_well_are_no_error(error: Exception) ->
         list(stop.until(items(0)))
 
 
-# --- readings ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_meter_gives_means_and_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [10.0]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    meter = Meter(ALONE)
-    assert meter.read(0.0) == {}
-    for value in (1.0, 2.0, 6.0):
-        meter.add({"total": torch.tensor(value), "l1": torch.tensor(-value)})
-    now[0] = 16.0
-    reading = meter.read(1.5, 0.75)
-    assert reading == {
-        "total": 3.0, "l1": -3.0, "steps_per_second": 0.5, "data_wait_seconds": 0.5, "transfer_seconds": 0.25,
-        "compute_seconds": 1.25,
-    }  # fmt: skip
-    meter.add({"total": torch.tensor(4.0)})
-    now[0] = 17.0
-    assert meter.read(2.0, 1.0) == {
-        "total": 4.0, "steps_per_second": 1.0, "data_wait_seconds": 0.5, "transfer_seconds": 0.25,
-        "compute_seconds": 0.25,
-    }  # fmt: skip
-
-
-def test_metrics_are_lines_of_json(tmp_path: Path) -> None:
-    path = tmp_path / "m.jsonl"
-    path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps({"step": 2}) + "\n")
-    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
-
-
-@pytest.mark.parametrize("torn", ['{"step": 3, "to', "{", "\0\0\0", "\ufffd"])
-def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path, torn: str) -> None:
-    path = tmp_path / "m.jsonl"
-    path.write_text('{"step": 1}\n{"step": 2}\n' + torn)
-    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
-    path.write_text('{"step": 1}\n{"step": 2}')
-    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
-    path.write_text(torn)
-    assert read_metrics(path) == []
-
-
-@pytest.mark.parametrize("damaged", ['{"step": 3, "to', "", "3", '{"epoch": 0}'])
-def test_a_line_that_nobody_cut_off_is_said(tmp_path: Path, damaged: str) -> None:
-    path = tmp_path / "m.jsonl"
-    for after in ("", '{"step": 4}\n', '{"ste'):
-        path.write_text(f'{{"step": 1}}\n{damaged}\n{after}')
-        with pytest.raises(UsageError, match=r"m\.jsonl, line 2, is no record"):
-            read_metrics(path)
-
-
-def test_a_reading_that_cannot_be_written_is_said(tmp_path: Path) -> None:
-    reporter = Reporter(tmp_path, speaks=True)
-    (tmp_path / METRICS).symlink_to("/dev/full")
-    with reporter, pytest.raises(UsageError, match=r"metrics\.jsonl: No space left"):
-        reporter.metrics(1, 0, 0.1, {"total": 1.0})
-
-
-def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    path = tmp_path / METRICS
-    path.write_text('{"step": 1}\n{"step": 2}\n{"st')
-    old = path.read_bytes()
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        Reporter(tmp_path, speaks=True, step=1)
-    assert path.read_bytes() == old
-    assert [entry.name for entry in tmp_path.iterdir()] == [METRICS]
+# --- ranks -----------------------------------------------------------------------------------------------------------
 
 
 def test_one_process_is_a_rank_by_itself() -> None:
-    with ranks("cpu") as mine:
+    with ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
         assert mine.any(True)
         assert not mine.any(False)
         assert mine.from_first("address") == "address"
         assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
+        assert mine.gather("a") == ["a"]
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt, SystemExit])
@@ -306,10 +236,10 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
 ) -> None:
     left = []
     monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
     monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: left.append(True))
-    with pytest.raises(error) if error else nullcontext(), ranks("cpu") as mine:
+    with pytest.raises(error) if error else nullcontext(), ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size) == (1, 2)
         if error:
             raise error
@@ -327,13 +257,13 @@ def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.Mo
         return weakref.ref(Model())
 
     monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda _: None)
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
     known = []
     monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: known.append(model()))
     gc.disable()  # not by chance
     try:
-        with ranks("cpu"):
+        with ranks("cpu", 60.0):
             model = trained()
             assert model() is not None
     finally:
@@ -343,5 +273,5 @@ def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_said() -> None:
-    with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda"):
+    with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda", 60.0):
         pass

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -17,26 +16,24 @@ import numpy as np
 import psutil
 import pytest
 import torch
+import yaml
 
 from tests.client.fake_server import FakeServer
 from tests.clips import panned_luma, write_clip
-from tests.trainer.training import arguments, losses, trained
+from tests.trainer.evaluation.h5_file import random_recording
+from tests.trainer.training import OF_THE_CLOCK, arguments, losses, trained
 from trainer.config_file import load_config
 from trainer.feed import held_out_batch
 from trainer.learner import build
-from trainer.run.checkpoint import LAST, load_checkpoint
+from trainer.run.checkpoint import BEST, LAST, load_checkpoint
 from trainer.run.distributed import Ranks
+from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]
 ALONE = Ranks(0, 1, torch.device("cpu"))
 TRAIN = (sys.executable, "-m", "trainer.train")
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[FakeServer]:
-    with FakeServer(sequences=23) as running:
-        yield running
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 
 
 @pytest.fixture(autouse=True)
@@ -75,14 +72,13 @@ def test_ctrl_c_ends_the_run_and_saves_it(server: FakeServer, tmp_path: Path) ->
 def test_two_ranks_train_as_one_with_twice_the_batch(server: FakeServer, tmp_path: Path) -> None:
     """The ranks' samples are those of one global batch, and their gradients are averaged."""
     alone = trained(tmp_path, server.address, "alone", stream__batch_size=6, run__steps=5)
-    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    command = [*torchrun, "-m", "trainer.train"]
+    command = [*TORCHRUN, "-m", "trainer.train"]
     first = arguments(tmp_path, server.address, "both", stream__batch_size=3, run__steps=2)
     done = subprocess.run([*command, *first], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("done after step 2") == 1  # only the first rank speaks
     again = arguments(tmp_path, server.address, "both", f"both/{LAST}", stream__batch_size=3, run__steps=5)
-    command = [*torchrun, "-m", "tests.trainer.one_rank"]
+    command = [*TORCHRUN, "-m", "tests.trainer.one_rank"]
     done = subprocess.run([*command, *again], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     one, two = losses(alone), losses(tmp_path / "both")
@@ -91,6 +87,53 @@ def test_two_ranks_train_as_one_with_twice_the_batch(server: FakeServer, tmp_pat
         assert mine["total"] == pytest.approx(theirs["total"], rel=1e-4)
         assert mine["gradient_norm"] == pytest.approx(theirs["gradient_norm"], rel=1e-3)
         assert mine["epoch"] == theirs["epoch"]
+
+
+@pytest.mark.slow
+def test_two_ranks_with_validation_go_on_after_a_kill_as_if_there_had_been_none(
+    server: FakeServer, tmp_path: Path
+) -> None:
+    """Losses, held-out losses, scores, weights and the best network; batch norm differs between the ranks."""
+    for seed, name in enumerate(("a/0", "a/1", "b/0")):
+        random_recording(tmp_path / "recordings" / f"{name}.h5", seed=seed)
+    data_sets = [{"name": "a", "sequences": {"0": [0, 0.06], "1": None}}, {"name": "b", "sequences": ["0"]}]
+    (tmp_path / "validate.yaml").write_text(yaml.safe_dump({"data": data_sets}), encoding="utf-8")
+
+    def command(out: str, resume: str | None = None) -> list[str]:
+        given = arguments(
+            tmp_path, server.address, out, resume, stream__batch_size=2, run__steps=13, run__save_every=3,
+            run__judge_every=4, run__validate=str(tmp_path / "recordings"),
+            run__validate_config=str(tmp_path / "validate.yaml"), network__name="e2vid",
+            network__options={"base_channels": 2, "encoders": 1, "norm": "batch"},
+        )  # fmt: skip
+        return [*TORCHRUN, "-m", "trainer.train", *given]
+
+    def records(out: str) -> list[dict[str, object]]:
+        found = read_metrics(tmp_path / out / METRICS)
+        return [{name: value for name, value in each.items() if name not in OF_THE_CLOCK} for each in found]
+
+    whole = subprocess.run(command("whole"), cwd=ROOT, capture_output=True, text=True, check=False)
+    assert whole.returncode == 0, whole.stderr
+    scores = [record for record in records("whole") if "validation_mse" in record]
+    assert [record["step"] for record in scores] == [5, 10]
+    with subprocess.Popen(
+        command("killed"), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        until_step(process, 7)
+        family = [*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)]
+        for each in family:
+            each.kill()
+        process.communicate()
+    psutil.wait_procs(family)
+    assert load_checkpoint(tmp_path / "killed" / LAST).step == 6
+    again = subprocess.run(command("killed", f"killed/{LAST}"), cwd=ROOT, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert records("killed") == records("whole")
+    for name in (LAST, BEST):
+        ours, theirs = (load_checkpoint(tmp_path / out / name) for out in ("killed", "whole"))
+        assert ours.step == theirs.step
+        for mine, other in ((ours.model, theirs.model), (ours.ema or {}, theirs.ema or {})):
+            assert all(torch.equal(mine[key], other[key]) for key in other)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
+import torch
 import yaml
+from torch import Tensor
 
 from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
@@ -62,3 +65,20 @@ def losses(out: Path) -> list[dict[str, Any]]:
         for record in read_metrics(out / METRICS)
         if "total" in record
     ]
+
+
+def refused(folder: Path, address: str, capsys: pytest.CaptureFixture[str], **settings: object) -> str:
+    """Train and be refused with status 2; return what was said."""
+    assert main(arguments(folder, address, "run", **settings)) == 2  # type: ignore[arg-type]
+    return capsys.readouterr().err
+
+
+def same(left: object, right: object) -> bool:
+    """Equal to the last bit, tensors included."""
+    if isinstance(left, Tensor) and isinstance(right, Tensor):
+        return torch.equal(left, right)
+    if isinstance(left, dict) and isinstance(right, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, list | tuple) and isinstance(right, list | tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    return left == right

@@ -1,4 +1,4 @@
-"""Raw recordings of event cameras -> the h5 layout that evaluation reads (``trainer.evaluation.layout``)."""
+"""Convert raw recordings of event cameras to the h5 layout that evaluation reads (``trainer.evaluation.layout``)."""
 
 from trainer.convert.conversion import Converted, convert
 from trainer.convert.items import EventChunk, Item, Picture, SensorSize

@@ -1,4 +1,4 @@
-"""A zip file or a folder of files, read the same way."""
+"""Read a zip file or a folder of files through the same interface."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from v2v_protocol.errors import UsageError
 
 
 class Archive:
-    """Members by their paths, with / between the parts.
+    """Give access to the members of a zip file or folder by their paths, with / as separator.
 
-    Args:
-        path: a zip file or a folder.
+    Attributes:
+        bytes_of: size of each member by its path.
 
     Raises:
-        UsageError: neither of them.
+        UsageError: the path is neither a folder nor a complete zip file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,13 +32,13 @@ class Archive:
         self._zip: zipfile.ZipFile | None = None
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
-            self.bytes_of = _recorded({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
+            self.bytes_of = _without_hidden({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
             return
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise UsageError(f"{path} is neither a folder nor a whole zip file: {error}") from error
-        self.bytes_of = _recorded(
+            raise UsageError(f"{path} is neither a folder nor a complete zip file: {error}") from error
+        self.bytes_of = _without_hidden(
             {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         )
 
@@ -50,59 +50,59 @@ class Archive:
             self._zip.close()
 
     def find(self, name: str) -> str | None:
-        """The member of this name in the outermost folder that has one; None without any.
+        """Return the member of this name in the outermost folder that has one; None if there is no such member.
 
         Raises:
-            UsageError: several folders of that depth have one, so these are several recordings.
+            UsageError: several folders of that depth have one, so the archive holds several recordings.
         """
         found = [member for member in self.bytes_of if member == name or member.endswith(f"/{name}")]
         depth = min((member.count("/") for member in found), default=0)
         outermost = sorted(member for member in found if member.count("/") == depth)
         if len(outermost) > 1:
             folders = ", ".join(member.removesuffix(f"/{name}") for member in outermost[:3])
-            raise UsageError(f"{self.path} holds {len(outermost)} recordings ({folders}): give each by itself")
+            raise UsageError(f"{self.path} holds {len(outermost)} recordings ({folders}): convert each separately")
         return outermost[0] if outermost else None
 
     @contextlib.contextmanager
     def open(self, member: str) -> Iterator[IO[bytes]]:
-        """A stream of its bytes.
+        """Open a stream of a member's bytes.
 
         Raises:
-            UsageError: no such member, or it is damaged (on opening or while it is read), encrypted, or packed by a
-                method that Python has not.
+            UsageError: there is no such member, or it is damaged (on opening or while it is read), encrypted, or
+                compressed by a method that Python does not support.
         """
         if member not in self.bytes_of:
             raise UsageError(f"{self.path} has no {member}")
         try:
-            with self._opened(member) as stream:
+            with self._open(member) as stream:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise UsageError(f"{self.path}: {member} cannot be read: {error}") from error
 
-    def _opened(self, member: str) -> IO[bytes]:
+    def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
             return (self.path / member).open("rb")
         try:
             return self._zip.open(member)
-        except RuntimeError as error:  # encrypted, or packed by a method that Python has not: Deflate64 of Windows
+        except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
             raise UsageError(
-                f"{self.path}: {member} cannot be read: {error}; unpack it, and give the folder"
+                f"{self.path}: {member} cannot be read: {error}; unpack the file, and give the folder"
             ) from error
 
     def picture(self, member: str) -> npt.NDArray[np.uint8]:
-        """A PNG or JPEG as grey values, uint8 [H, W].
+        """Read a PNG or JPEG as grey values, uint8 [H, W].
 
         Raises:
-            UsageError: as :meth:`open`, or no picture.
+            UsageError: as :meth:`open`, or the member is not a picture.
         """
         with self.open(member) as stream:
             data = np.frombuffer(stream.read(), np.uint8)
         pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
         if pixels is None:
-            raise UsageError(f"{self.path}: {member} is no picture that can be read")
+            raise UsageError(f"{self.path}: {member} is not a readable picture")
         return np.asarray(pixels, np.uint8)
 
 
-def _recorded(bytes_of: dict[str, int]) -> dict[str, int]:
-    """Without the ``._name`` that macOS puts beside each file, in zips (under ``__MACOSX``) and on foreign disks."""
+def _without_hidden(bytes_of: dict[str, int]) -> dict[str, int]:
+    """Drop the ``._name`` files that macOS adds for each file, in zips (under ``__MACOSX``) and on other disks."""
     return {member: size for member, size in bytes_of.items() if not posixpath.basename(member).startswith("._")}

@@ -1,7 +1,7 @@
-"""ROS 1 bags: ``dvs_msgs/EventArray`` (HQF, IJRR, MVSEC) or ``event_camera_msgs/EventPacket``; ``sensor_msgs/Image``.
+"""Read ROS 1 bags: ``dvs_msgs/EventArray`` (HQF, IJRR, MVSEC) or ``event_camera_msgs/EventPacket``, and images.
 
-Messages are parsed here, from their serialised bytes: an EventArray is an array of 13-byte records, which numpy reads
-at once.
+Images are ``sensor_msgs/Image``. This module parses the serialised messages itself: an EventArray is an array of
+13-byte records, which NumPy reads in one call.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ IMAGE = "sensor_msgs/msg/Image"
 RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("secs", "<u4"), ("nsecs", "<u4"), ("polarity", "u1")])
 EVT_HEADERS = {"evt2": "% evt 2.0", "evt3": "% evt 3.0"}
 DAMAGE = (EOFError, RuntimeError, ValueError, LookupError, AssertionError)
-"""What rosbags, and the decompressors that it calls, raise on bytes that are not theirs, beside errors of their own."""
+"""Errors that rosbags and its decompressors raise on damaged files, in addition to their own classes."""
 COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 
 def recognises(path: Path) -> bool:
-    """By the first bytes."""
+    """Return whether the file starts with a bag's first bytes."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -39,12 +39,12 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """Events and pictures of a bag.
+    """Yield events and pictures of a bag.
 
-    Times of EventPackets count from the stamp of the first packet, with the sensor's clock between the events.
+    Times of EventPackets start at the stamp of the first packet and advance by the sensor's clock.
 
     Raises:
-        UsageError: damaged, no or several topics of events, or an encoding that is not read here.
+        UsageError: the bag is damaged, has no topic or several topics of events, or an unsupported encoding.
     """
     try:
         from rosbags.rosbag1 import Reader, ReaderError
@@ -64,7 +64,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     except (ReaderError, struct.error, OSError) as error:
         raise UsageError(f"{path}: the bag cannot be read: {error}") from error
     except DAMAGE as error:
-        raise UsageError(f"{path}: the bag cannot be read, it is damaged: {error!r}") from error
+        raise UsageError(f"{path}: the bag is damaged and cannot be read: {error!r}") from error
 
 
 def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
@@ -77,7 +77,7 @@ def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress
         message = _Message(raw)
         message.skip_header()
         height, width, count = message.unpack("<III")
-        # Some drivers leave these 0.
+        # Some drivers write 0 here.
         if size is None and height and width:
             size = SensorSize(width, height)
             yield size
@@ -87,7 +87,7 @@ def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress
 
 
 def _read_packets(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
-    """The packets of a sensor are one stream of words, decoded as one: strung together in a temporary file."""
+    """Concatenate the packets in a temporary file and decode it: they are pieces of a single stream of words."""
     first_stamp_ns: int | None = None
     encoding = ""
     with tempfile.TemporaryDirectory() as folder:
@@ -103,7 +103,7 @@ def _read_packets(bag: Any, events: str, images: str | None, path: Path, progres
                     first_stamp_ns, encoding = stamp_ns, this_encoding
                     if encoding not in EVT_HEADERS:
                         raise UsageError(
-                            f"{path}: packets on {events} are in encoding {encoding!r}; those read are "
+                            f"{path}: packets on {events} are in encoding {encoding!r}; supported are "
                             f"{', '.join(EVT_HEADERS)}"
                         )
                     stream.write(f"{EVT_HEADERS[encoding]}\n% geometry {width}x{height}\n% end\n".encode())
@@ -132,7 +132,7 @@ def _messages(bag: Any, topics: tuple[str | None, ...], progress: Progress) -> I
 
 
 class _Message:
-    """Reads a ROS 1 message from its start: little endian, nothing aligned, lengths in front."""
+    """Read a ROS 1 message from its start: little endian, unaligned, with lengths before variable-size fields."""
 
     def __init__(self, raw: bytes) -> None:
         self._raw, self._at = raw, 0
@@ -147,7 +147,7 @@ class _Message:
         return self.array(np.dtype("u1"), length).tobytes().decode("utf-8", "replace")
 
     def skip_header(self) -> int:
-        """std_msgs/Header; returns its stamp in ns."""
+        """Skip a std_msgs/Header and return its stamp in ns."""
         _, seconds, nanoseconds = self.unpack("<III")
         self.text()
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
@@ -155,7 +155,7 @@ class _Message:
     def array(self, dtype: np.dtype[Any], count: int) -> npt.NDArray[Any]:
         end = self._at + count * dtype.itemsize
         if end > len(self._raw):
-            raise struct.error(f"a message ends {end - len(self._raw)} bytes early")
+            raise struct.error(f"a message is {end - len(self._raw)} bytes too short")
         values = np.frombuffer(self._raw, dtype, count, self._at)
         self._at = end
         return values
@@ -169,7 +169,9 @@ def _picture(raw: bytes, path: Path) -> Picture:
     _, step, count = message.unpack("<BII")
     channels = 3 if encoding in COLOURS else 1
     if encoding not in ("mono8", "8UC1", *COLOURS) or step < width * channels or count < height * step:
-        raise UsageError(f"{path}: a picture is {encoding!r}, {width} x {height}; mono8, 8UC1, bgr8, rgb8 are read")
+        raise UsageError(
+            f"{path}: a picture is {encoding!r}, {width} x {height}; supported are mono8, 8UC1, bgr8, rgb8"
+        )
     rows = message.array(np.dtype("u1"), height * step).reshape(height, step)[:, : width * channels]
     if encoding in COLOURS:
         rows = cv2.cvtColor(np.ascontiguousarray(rows).reshape(height, width, 3), COLOURS[encoding])
@@ -187,11 +189,13 @@ def _events_topic(connections: list[Any], wanted: str | None, path: Path) -> str
 
 
 def _images_topic(connections: list[Any], events: str, wanted: str | None, path: Path) -> str | None:
-    """The one asked for; else ``image_raw`` beside the events; else the only one."""
+    """Return the requested topic, else ``image_raw`` next to the events, else the only one; None without pictures."""
     topics = {connection.topic for connection in connections if connection.msgtype == IMAGE}
     if wanted is not None:
         if wanted not in topics:
-            raise UsageError(f"{path}: no pictures on {wanted}; they are on {', '.join(sorted(topics)) or 'no topic'}")
+            raise UsageError(
+                f"{path}: no pictures on {wanted}; topics with pictures: {', '.join(sorted(topics)) or '-'}"
+            )
         return wanted
     beside = f"{events.rpartition('/')[0]}/image_raw"
     if beside in topics:

@@ -1,6 +1,6 @@
-"""The command line of `v2v-convert`.
+"""Run `v2v-convert`.
 
-Exit status: 0 everything was converted, 2 wrong usage or input (what was converted before stays), 130 interrupted.
+Exit status: 0 everything was converted, 2 wrong usage or input (recordings converted before stay), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from v2v_protocol.records import write_json
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     parser = Parser(
         "v2v-convert", "SRC [SRC ...] --out PATH [flags]",
         "Convert recordings of event cameras into the h5 layout that v2v-eval reads.",
@@ -38,17 +38,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument(
         "--out", required=True, metavar="PATH", help="folder for the new files, or (one SRC) a file ending in .h5"
     )
-    recordings.add_argument("--form", choices=tuple(FORMS), help="what the recordings are (default: look)")
-    recordings.add_argument("--size", metavar="WxH", help="size of the sensor, where a recording does not state it")
+    recordings.add_argument("--form", choices=tuple(FORMS), help="form of the recordings (default: recognised)")
+    recordings.add_argument("--size", metavar="WxH", help="size of the sensor in px, if a recording does not state it")
     recordings.add_argument(
         "--time-unit", choices=tuple(NS_PER_UNIT),
-        help="of times in text files (default: seconds if there is a point in them, else us)",
+        help="unit of times in text files (default: s if they have a decimal point, else us)",
     )  # fmt: skip
-    recordings.add_argument("--camera", choices=("left", "right"), default="left", help="of a stereo recording (MVSEC)")
-    recordings.add_argument("--events-topic", metavar="TOPIC", help="of a bag with several")
-    recordings.add_argument("--images-topic", metavar="TOPIC", help="of a bag with several")
+    recordings.add_argument(
+        "--camera", choices=("left", "right"), default="left",
+        help="camera of a stereo recording (MVSEC; default left)",
+    )  # fmt: skip
+    recordings.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
+    recordings.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
     out.add_argument("--overwrite", action="store_true", help="replace files that exist")
-    out.add_argument("--json", metavar="FILE", help="also write a record of each recording")
+    out.add_argument("--json", metavar="FILE", help="also write a record of each recording to this file")
     interrupted = "interrupted; no incomplete file is left"
     return run_command(parser, _run, argv, interrupted=interrupted)
 
@@ -92,18 +95,20 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def summary(done: Converted) -> str:
-    """What became of one recording, in a line or two."""
+    """Return a summary of one conversion, in a few lines."""
     written = done.written
     text = (
         f"{done.destination}: {written.events} events in {written.seconds:.3f} s, {written.images} images, "
         f"{written.size.width} x {written.size.height} ({done.form})"
     )
     if written.size_is_guessed:
-        text += "\n  the size is only that of the events' area, nothing states the sensor's: give --size WxH"
+        text += "\n  the recording does not state the sensor's size; the events' area is used: give --size WxH"
     if written.reordered_events:
-        text += f"\n  {written.reordered_events} times an event was earlier than the one before it; sorted"
+        text += f"\n  {written.reordered_events} events were earlier than their predecessor; sorted"
     if written.backward_images:
-        text += f"\n  {written.backward_images} images are not later than the one before; v2v-eval repairs their times"
+        text += (
+            f"\n  {written.backward_images} images are not later than the previous one; v2v-eval repairs their times"
+        )
     if not written.images:
         text += "\n  no images: v2v-eval can reconstruct it (--fps), but not score it"
     return text
@@ -132,24 +137,26 @@ def _progress(name: str) -> Iterator[items.Progress]:
         TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     if not sys.stderr.isatty():
-        yield lines_of_progress(name, sys.stderr)
+        yield log_progress(name, sys.stderr)
         return
     with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def lines_of_progress(
+def log_progress(
     name: str, out: TextIO, *, clock: Callable[[], float] = time.monotonic, every_seconds: float = 30.0
 ) -> items.Progress:
-    """For a log: a line now and then, with the share that is done and the time left; none where the size of the whole
-    is not known."""
-    began = told = clock()
+    """Return a progress callback for logs, which prints the share done and the time left every ``every_seconds``.
+
+    It prints no lines if the total is unknown.
+    """
+    began = printed = clock()
 
     def progress(done: int, total: int | None) -> None:
-        nonlocal told
-        if total is not None and 0 < done < total and (now := clock()) - told >= every_seconds:
-            told = now
+        nonlocal printed
+        if total is not None and 0 < done < total and (now := clock()) - printed >= every_seconds:
+            printed = now
             left = (now - began) * (total - done) / done
             print(f"{name}: {done / total:.0%} converted, about {left:.0f} s left", file=out, flush=True)
 

@@ -1,4 +1,4 @@
-"""One raw recording -> one h5 file: which form it is, and its items into the writer."""
+"""Convert a raw recording to an h5 file: recognise its form, and pass its items to the writer."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from v2v_protocol.errors import UsageError
 
 @dataclass(frozen=True)
 class RawForm:
-    """A raw form.
+    """Describe a raw form.
 
     Attributes:
-        title: what it is, for the help.
-        recognises: whether a path looks like it; looks at the name and the first bytes only.
-        read: yields its items.
+        title: description for the help text.
+        recognises: returns whether a path has this form, judged by the name and the first bytes only.
+        read: yields the items of a recording.
         published_shift: see :class:`RecordingWriter`.
     """
 
@@ -44,12 +44,12 @@ FORMS = {
 
 @dataclass(frozen=True)
 class Converted:
-    """One conversion.
+    """Report one conversion.
 
     Attributes:
         source, destination: paths.
         form: key of FORMS.
-        written: what is in the new file.
+        written: content of the new file.
     """
 
     source: Path
@@ -59,10 +59,10 @@ class Converted:
 
 
 def recognise(path: Path) -> str:
-    """Which of FORMS a file or folder is.
+    """Return the key of FORMS for a file or folder.
 
     Raises:
-        UsageError: it is missing, or none of them.
+        UsageError: it is missing, or has a form that is not in FORMS.
     """
     if not path.exists():
         raise UsageError(f"no file or folder {path}")
@@ -70,11 +70,11 @@ def recognise(path: Path) -> str:
         if form.recognises(path):
             return name
     forms = "; ".join(form.title for form in FORMS.values())
-    raise UsageError(f"{path} is no recording that can be read. These can: {forms}. --form says which it is")
+    raise UsageError(f"{path} is not a known recording. Known forms: {forms}. Give the form with --form")
 
 
 def default_name(source: Path) -> str:
-    """Name of the file to make: the sequence's, as data sets name it."""
+    """Return the name of the new file: the sequence's name in data sets, with the ending .h5."""
     stem = source.name if source.is_dir() else source.stem
     return stem.removesuffix("_data") + layout.SUFFIXES[0]
 
@@ -92,13 +92,15 @@ def convert(
 
     Args:
         source: file or folder.
-        destination: file to make.
-        form: key of FORMS; None looks.
-        overwrite: replace an existing destination.
+        destination: file to write.
+        form: key of FORMS; None recognises it.
+        options: information that the recording lacks; None for the defaults.
+        overwrite: whether to replace an existing destination.
         progress: see :data:`trainer.convert.items.Progress`.
 
     Raises:
-        UsageError: the source is missing, damaged or not understood; the destination exists or lies in the source.
+        UsageError: the source is missing, damaged or of an unknown form; or the destination exists or lies in the
+            source.
     """
     source, destination = Path(source), Path(destination)
     options = options or ConvertOptions()
@@ -111,7 +113,7 @@ def convert(
     if destination.exists() and destination.samefile(source):
         raise UsageError(f"{destination} is the source itself")
     if source.is_dir() and destination.resolve().is_relative_to(source.resolve()):
-        raise UsageError(f"{destination} lies in the source folder, which is never written to; give another --out")
+        raise UsageError(f"{destination} lies in the source folder, which is read-only here; give another --out")
     if destination.exists() and not overwrite:
         raise UsageError(f"{destination} exists; --overwrite replaces it")
     chosen = FORMS[form]
@@ -122,7 +124,7 @@ def convert(
             for item in chosen.read(source, options, progress):
                 writer.add(item)
     except OSError as error:
-        # Readers name their own: what is left is the disk under the destination.
+        # Readers convert their own errors, so this one comes from writing the destination.
         raise UsageError(f"{destination}: cannot be written: {error}") from error
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")

@@ -1,4 +1,4 @@
-"""EVAID-R: ``event/*.txt`` (``t x y p``, us), ``gt/*.png``, ``timestamps.txt`` (us), ``shape.txt`` (``W H``)."""
+"""Read EVAID-R: ``event/*.txt`` (``t x y p``, us), ``gt/*.png``, ``timestamps.txt`` (us), ``shape.txt`` (``W H``)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 
 def recognises(path: Path) -> bool:
-    """An archive with ``timestamps.txt`` and a folder ``event``."""
+    """Return whether the path is an archive with ``timestamps.txt`` and a folder ``event``."""
     if not (path.is_dir() or path.suffix == ".zip"):
         return False
     with Archive(path) as archive:
@@ -25,10 +25,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """The items of one recording; the event files follow each other in the order of their names.
+    """Yield the items of one recording. The event files are read in the order of their names.
 
     Raises:
-        UsageError: a part is missing or not what it should be.
+        UsageError: a part is missing or malformed.
     """
     with Archive(path) as archive:
         events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
@@ -59,7 +59,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
 
 
 def _members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[str]:
-    """Files of the folder of this name, in order: 2.txt before 10.txt."""
+    """Return the files in the folder of this name in numeric order: 2.txt before 10.txt."""
     found = [
         member
         for member in archive.bytes_of
@@ -77,4 +77,4 @@ def _integers(archive: Archive, name: str) -> list[int]:
     try:
         return [round(float(word)) for word in words]
     except ValueError as error:
-        raise UsageError(f"{archive.path}: {member} holds something else than numbers: {error}") from None
+        raise UsageError(f"{archive.path}: {member} holds text that is not a number: {error}") from None

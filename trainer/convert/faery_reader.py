@@ -1,4 +1,4 @@
-"""Files that the faery package decodes: aedat4 of DAVIS cameras; Prophesee's EVT 2 and 3 (.raw) and DAT."""
+"""Read files with the faery package: aedat4 of DAVIS cameras; Prophesee's EVT 2 and 3 (.raw) and DAT."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ EVT_WORDS: dict[str, np.dtype[Any]] = {
     **dict.fromkeys(("2.0", "EVT2"), np.dtype("<u4")),
     **dict.fromkeys(("3.0", "EVT3"), np.dtype("<u2")),
 }
-"""Words by what a header says of their version."""
+"""Dtype of a word by the version in the header."""
 NOT_DECODED = "2.1"
-"""A version that faery knows and, up to 0.7.1, has not implemented: it panics. As EVT21 it does not know it."""
+"""A version that faery up to 0.7.1 recognises but does not implement: it panics. It does not recognise "EVT21"."""
 TIME_HIGH = 0x8
-"""What the four upper bits of a word are where the others are the upper bits of a time."""
+"""Value of the four upper bits of a word whose other bits are the upper bits of a time."""
 LOOKED_THROUGH_WORDS = 1 << 20
 LONGEST_LINE_BYTES = 1 << 12
 GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
 
 def recognises_aedat4(path: Path) -> bool:
-    """By the first bytes."""
+    """Return whether the file starts with aedat4's first bytes."""
     return _head(path).startswith(AEDAT4_MAGIC)
 
 
 def recognises_prophesee(path: Path) -> bool:
-    """A ``.raw`` or ``.dat`` whose header lines begin with %."""
+    """Return whether the path is a ``.raw`` or ``.dat`` file whose header lines begin with %."""
     return path.suffix in (".raw", ".dat") and _head(path).startswith(b"%")
 
 
 def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """Events and frames of the first camera of a file; a frame's time is the middle of its exposure.
+    """Yield events and frames of a file's first camera. A frame's time is the middle of its exposure.
 
     Raises:
-        UsageError: damaged, without events, or frames that are not 8 bits or not of the whole sensor.
+        UsageError: the file is damaged or has no events, or its frames are not 8-bit or not of the whole sensor.
     """
     with _errors_of_faery(path), _faery().aedat.Decoder(path) as decoder:
         tracks = decoder.tracks()
@@ -67,14 +67,14 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iter
 
 
 def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """Events of a file; the sensor's size is in its header or in ``options``.
+    """Yield events of a file. The sensor's size is in its header or in ``options``.
 
-    Words of EVT carry the lower bits of a time only; the upper bits come by themselves, many times a millisecond.
-    Where a recording begins in the middle of the sensor's stream, events in front of the first of these have no time:
-    they are left out.
+    Event words of EVT hold only the lower bits of a time; the upper bits are words of their own, many per millisecond.
+    If a recording begins in the middle of the sensor's stream, events before the first upper bits have no time, and
+    are dropped.
 
     Raises:
-        UsageError: damaged, of no stated size, or of a version that faery does not decode.
+        UsageError: the file is damaged, does not state the size, or has a version that faery does not decode.
     """
     faery = _faery()
     fallback = None if options.size is None else (options.size.width, options.size.height)
@@ -100,7 +100,7 @@ def _event_packets(decoder: Any) -> Iterator[npt.NDArray[Any]]:
 
 
 def _events_without_time(path: Path, module: Any, fallback: tuple[int, int] | None) -> int:
-    """How many events of an EVT file lie in front of the first upper bits of a time: as many as that part of it has."""
+    """Return the number of events of an EVT file before the first upper bits of a time, by decoding only that part."""
     word, head = _evt_words(path)
     if word is None:
         return 0
@@ -116,10 +116,10 @@ def _events_without_time(path: Path, module: Any, fallback: tuple[int, int] | No
 
 
 def _evt_words(path: Path) -> tuple[np.dtype[Any] | None, int]:
-    """The words of an EVT file, None where its header names no known ones, and at which byte they begin.
+    """Return the dtype of an EVT file's words (None if its header names no known version), and their first byte.
 
     Raises:
-        UsageError: a version that faery does not decode.
+        UsageError: the version is one that faery does not decode.
     """
     word: np.dtype[Any] | None = None
     with path.open("rb") as file:
@@ -132,7 +132,7 @@ def _evt_words(path: Path) -> tuple[np.dtype[Any] | None, int]:
             if key in ("evt", "format"):
                 version = value.partition(";")[0]
                 if version == NOT_DECODED:
-                    raise UsageError(f"{path} is in EVT 2.1, which is not read here; EVT 2, EVT 3 and DAT are")
+                    raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
                 word = EVT_WORDS.get(version, word)
             elif key == "end":
                 return word, file.tell()
@@ -184,7 +184,7 @@ def _errors_of_faery(path: Path) -> Iterator[None]:
         hint = "; give --size WIDTHxHEIGHT" if "size" in text else ""
         raise UsageError(f"{path} cannot be decoded: {text}{hint}") from error
     except BaseException as error:
-        # A panic of Rust, on bytes that faery did not think of: its class is not to be imported, and no Exception.
+        # A Rust panic on unexpected bytes. Its class cannot be imported, and is not a subclass of Exception.
         if type(error).__name__ != "PanicException":
             raise
         raise UsageError(f"{path} cannot be decoded: {error}") from error

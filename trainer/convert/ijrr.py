@@ -1,6 +1,6 @@
-"""IJRR (Mueggler et al. 2017), the text form: ``events.txt``, ``images.txt`` (``t path``), PNGs; in a zip or a folder.
+"""Read IJRR (Mueggler et al. 2017) in its text form, in a zip or a folder.
 
-A single text file of events is read as well.
+It consists of ``events.txt``, ``images.txt`` (``t path``) and PNGs. A single text file of events is read as well.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TEXT_SUFFIXES = (".txt", ".csv")
 
 
 def recognises(path: Path) -> bool:
-    """A text file, or an archive with ``events.txt``."""
+    """Return whether the path is a text file, or an archive with ``events.txt``."""
     if path.is_file() and path.suffix in TEXT_SUFFIXES:
         return True
     if not (path.is_dir() or path.suffix == ".zip"):
@@ -31,10 +31,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """The items of one recording.
+    """Yield the items of one recording.
 
     Raises:
-        UsageError: a part is missing or not what it should be.
+        UsageError: a part is missing or malformed.
     """
     if path.is_file() and path.suffix in TEXT_SUFFIXES:
         total, done = path.stat().st_size, 0
@@ -72,7 +72,7 @@ def _read_archive(archive: Archive, options: ConvertOptions, progress: Progress)
 
 
 def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
-    """Time and member of every line of ``images.txt``; none without such a file."""
+    """Return time (ns) and member of every line of ``images.txt``; an empty list without that file."""
     listing = archive.find(IMAGES)
     if listing is None:
         return []
@@ -92,6 +92,6 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
             raise UsageError(f"{archive.path}: {listing}, line {number}: {line!r} is not `seconds path`")
         member = folder + parts[1].strip()
         if member not in archive.bytes_of:
-            raise UsageError(f"{archive.path}: {listing}, line {number} names {parts[1].strip()}, which is not there")
+            raise UsageError(f"{archive.path}: {listing}, line {number} names {parts[1].strip()}, which does not exist")
         pictures.append((int(to_ns(np.array([seconds]), f"{archive.path}: {listing}, line {number}")[0]), member))
     return pictures

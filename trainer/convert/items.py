@@ -1,4 +1,4 @@
-"""What every reader of a raw form yields: the size of the sensor, chunks of events, pictures; in any order.
+"""Define the items that readers of raw recordings yield, in any order: sensor size, chunks of events, pictures, flow.
 
 Times are int64 nanoseconds of the recording's own clock. Nanoseconds since 1970 fit until 2262 and subtract exactly;
 seconds since 1970 in float64 are 0.24 us apart.
@@ -15,17 +15,17 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 
 Progress = Callable[[int, int | None], None]
-"""Called with the bytes read so far, and the bytes in all where they are known."""
+"""Progress callback: called with the amount read so far (bytes or messages), and the total if it is known."""
 
 
 @dataclass(frozen=True, eq=False)
 class EventChunk:
-    """Some events of a recording.
+    """Hold consecutive events of a recording.
 
     Attributes:
         t_ns: int64 [N].
         x, y: integers [N], pixels, origin at the upper left.
-        p: bool [N], True where it got brighter.
+        p: bool [N], True for a brightness increase.
     """
 
     t_ns: npt.NDArray[np.int64]
@@ -36,7 +36,7 @@ class EventChunk:
     def __post_init__(self) -> None:
         lengths = {len(self.t_ns), len(self.x), len(self.y), len(self.p)}
         if len(lengths) > 1:
-            raise UsageError(f"events with columns of different lengths: {sorted(lengths)}")
+            raise UsageError(f"the columns of events have different lengths: {sorted(lengths)}")
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -44,13 +44,13 @@ class EventChunk:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A frame of the same sensor.
+    """Hold a frame of the same sensor.
 
     Attributes:
-        t_ns: when it was taken.
+        t_ns: time of the frame.
         pixels: uint8 [H, W].
-        published_event_index: index of the event that the published conversion pairs with this picture, where the raw
-            form states one.
+        published_event_index: index of the event that the published conversion pairs with this picture; None if the
+            raw form does not state it.
     """
 
     t_ns: int
@@ -60,17 +60,17 @@ class Picture:
 
 @dataclass(frozen=True)
 class SensorSize:
-    """What the recording states about its sensor, in pixels."""
+    """Hold the size of the sensor, in pixels."""
 
     width: int
     height: int
 
     @classmethod
     def parse(cls, text: str) -> SensorSize:
-        """``346x260``.
+        """Parse WIDTHxHEIGHT, such as ``346x260``.
 
         Raises:
-            UsageError: anything else.
+            UsageError: the text has another form, or a size is 0.
         """
         width, _, height = text.lower().partition("x")
         if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
@@ -80,10 +80,10 @@ class SensorSize:
 
 @dataclass(frozen=True, eq=False)
 class FlowField:
-    """True flow from a time to that of the next field.
+    """Hold the true flow from a time to that of the next field.
 
     Attributes:
-        t_ns: when it begins.
+        t_ns: time at which it begins.
         flow: float32 [2, H, W] (x, y), px; NaN where it is not known.
     """
 
@@ -96,13 +96,14 @@ Item = EventChunk | Picture | SensorSize | FlowField
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """What a user may have to say because a raw form does not.
+    """Hold information that some raw forms lack and the user supplies.
 
     Attributes:
-        size: of the sensor, where the file does not state it.
-        time_unit: "s", "us" or "ns" of the times in text files; None takes s where they have a point, else us.
+        size: size of the sensor, if the file does not state it.
+        time_unit: unit "s", "us" or "ns" of the times in text files; None takes s if they have a decimal point, else
+            us.
         camera: "left" or "right" of a stereo recording (MVSEC).
-        events_topic, images_topic: of a bag that has several.
+        events_topic, images_topic: topics to read from a bag that has several.
     """
 
     size: SensorSize | None = None
@@ -116,17 +117,21 @@ LARGEST_NS = 2.0**63
 
 
 def to_ns(times: npt.NDArray[np.float64], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
-    """float64 times, in seconds unless ``ns_per_unit`` says otherwise -> int64 nanoseconds, to the nearest.
+    """Convert float64 times to int64 nanoseconds, rounded to the nearest.
+
+    Args:
+        where: beginning of the error message.
+        ns_per_unit: nanoseconds per unit of ``times``; the default means seconds.
 
     Raises:
-        UsageError: a time that int64 cannot hold, so one of another unit, or no number; ``where`` begins the message.
+        UsageError: a time is NaN or does not fit int64, so its unit is probably wrong.
     """
     ns = np.rint(times * ns_per_unit)
     held = np.abs(ns) < LARGEST_NS
     if not held.all():
-        # A cast would make the same number of all of them.
+        # A cast would turn all of them into the same number.
         raise UsageError(
-            f"{where}: a time of {ns[~held][0] * 1e-9:.10g} s, which no recording has; --time-unit gives the unit of "
-            "text files"
+            f"{where}: a time is {ns[~held][0] * 1e-9:.10g} s, which is out of range; give the unit of text files with "
+            "--time-unit"
         )
     return ns.astype(np.int64)

@@ -1,4 +1,4 @@
-"""MVSEC (Zhu et al. 2018): ``*_data.hdf5``, one of its two DAVIS cameras.
+"""Read MVSEC (Zhu et al. 2018): ``*_data.hdf5``, one of its two DAVIS cameras.
 
 | path | content |
 |---|---|
@@ -7,7 +7,7 @@
 | ``davis/left/image_raw_ts`` | float64 [M], s |
 | ``davis/left/image_raw_event_inds`` | int64 [M], the event nearest to each picture |
 
-Where ``*_gt.hdf5`` lies beside it, its flow is taken too:
+If ``*_gt.hdf5`` is in the same folder, its flow is read too:
 
 | path | content |
 |---|---|
@@ -33,45 +33,45 @@ READ_EVENTS = 1 << 18
 
 
 def recognises(path: Path) -> bool:
-    """An HDF5 file with a group ``davis``.
+    """Return whether the path is an HDF5 file with a group ``davis``.
 
     Raises:
-        UsageError: an HDF5 file, and damaged.
+        UsageError: it is an HDF5 file, but damaged.
     """
     if path.suffix not in (".hdf5", ".h5") or not h5py.is_hdf5(path):
         return False
-    with _opened(path) as file:
+    with _open(path) as file:
         return "davis" in file
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """The items of one camera of a recording.
+    """Yield the items of one camera of a recording.
 
     Raises:
-        UsageError: a part is missing, damaged or of another shape.
+        UsageError: a part is missing, damaged or has another shape.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         yield from _read(file, path, options.camera, progress)
     truth = path.with_name(path.name.replace("_data", "_gt"))
     if truth != path and truth.is_file():
-        with _opened(truth) as file:
+        with _open(truth) as file:
             yield from _flow(file, truth, options.camera)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
+def _open(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             require_self_contained(file, path)
             yield file
-    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's, on files that are cut off or damaged
+    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's errors, for truncated or damaged files
         raise UsageError(f"{path} cannot be read as HDF5: {error}") from error
 
 
 def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Iterator[Item]:
     group = file.get(f"davis/{camera}")
     if group is None or "events" not in group:
-        raise UsageError(f"{path} has no davis/{camera}/events; cameras there: {', '.join(file.get('davis', ()))}")
+        raise UsageError(f"{path} has no davis/{camera}/events; its cameras: {', '.join(file.get('davis', ()))}")
     events, pictures = group["events"], group.get("image_raw")
     if events.ndim != 2 or events.shape[1] != 4:
         raise UsageError(f"{path}: davis/{camera}/events is {list(events.shape)}, not [N, 4]")

@@ -1,4 +1,4 @@
-"""Text files of events: one ``t x y p`` a line, p in {0, 1} or {-1, 1}; a first line ``width height`` is allowed.
+"""Read text files of events: one ``t x y p`` per line, p in {0, 1} or {-1, 1}; the first line may be ``width height``.
 
 Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments. A byte order mark is skipped.
 """
@@ -22,7 +22,7 @@ COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
 COMMA = re.compile(rb"(?<=[^\s,])[ \t]*,[ \t]*(?=[^\s,])")
 NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
 TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
-"""A line whose first number has a point or, without one, a negative exponent (1e-06)."""
+"""Matches a line whose first number has a decimal point, or a negative exponent without one (1e-06)."""
 
 
 def read_text_events(
@@ -32,17 +32,17 @@ def read_text_events(
     time_unit: str | None = None,
     advance: Callable[[int], None] = lambda _bytes: None,
 ) -> Iterator[SensorSize | EventChunk]:
-    """
+    """Yield the sensor's size, if the file states it, and chunks of events.
+
     Args:
-        stream: of the file's bytes; read in blocks of 4 MiB.
-        name: of the file, for messages.
-        time_unit: "s", "us" or "ns"; None takes seconds where a time of the first block has a point, else us. Not the
-            first time alone: ``%g`` writes 0 and 1e-06.
-        advance: called with the bytes of each block.
+        stream: the file's bytes; read in blocks of 4 MiB.
+        name: name of the file, for messages.
+        time_unit: "s", "us" or "ns"; None takes seconds if any time in the first block has a decimal point, else us.
+            The first time alone is not enough: ``%g`` writes 0 and 1e-06.
+        advance: called with the size of each block in bytes.
 
     Raises:
-        UsageError: a line that is not four numbers (the message gives its number and text), or times that are in
-            another unit.
+        UsageError: a line is not four numbers (the message gives its number and text), or the times have another unit.
     """
     if time_unit is not None and time_unit not in NS_PER_UNIT:
         raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
@@ -69,8 +69,10 @@ def read_text_events(
 
 
 def _plain(block: bytes) -> bytes:
-    """The block with comments blanked and single commas between values as spaces; its lines keep their numbers. A comma
-    beside an empty field stays, so that its line is refused."""
+    """Blank comments, and replace single commas between values by spaces. The number of lines stays the same.
+
+    A comma next to an empty field stays, so that its line is refused.
+    """
     if b"#" in block:
         block = COMMENT.sub(b"", block)
     return COMMA.sub(b" ", block) if b"," in block else block
@@ -85,7 +87,7 @@ def _sensor_size(line: bytes, name: str) -> SensorSize:
 
 
 def _time_unit(block: bytes) -> str | None:
-    """Of the events in a block; None where there is none."""
+    """Return the time unit of the events in a block, "s" or "us"; None if the block has no events."""
     if not block.strip():
         return None
     return "s" if TIME_WITH_A_FRACTION.search(block) else "us"
@@ -102,9 +104,9 @@ def _chunk(block: bytes, name: str, lines_before: int, time_unit: str | None) ->
 
 
 def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
-    """[N, 4], or None where the block is not N lines of four finite numbers, the coordinates whole."""
+    """Parse a block to [N, 4]; None unless it is N lines of four finite numbers with integer coordinates."""
     with warnings.catch_warnings():
-        # What cannot be parsed to its end is a warning in some releases of numpy, an error in others.
+        # For text that it cannot parse to the end, NumPy warns in some releases and raises in others.
         warnings.simplefilter("error", DeprecationWarning)
         try:
             values = np.fromstring(block, np.float64, sep=" ")
@@ -112,7 +114,7 @@ def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
             return None
     lines = block.count(b"\n") + (not block.endswith(b"\n"))
     if len(values) != 4 * lines or not np.isfinite(values).all():
-        # Blank lines are no fault.
+        # Blank lines are allowed.
         kept = [line for line in block.splitlines() if line.strip()]
         if len(values) != 4 * len(kept) or not all(len(line.split()) == 4 for line in kept):
             return None

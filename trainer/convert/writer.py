@@ -1,12 +1,12 @@
-"""Writes the h5 layout, in one pass and bounded memory.
+"""Write the h5 layout in one pass, with bounded memory.
 
-Events pass through a buffer of FLUSH_EVENTS + REORDER_EVENTS, in which those that come somewhat late are put in order.
-Of the pictures only the times are kept; which event each belongs to is found at the end, in one pass over the times of
-the events on disk, so pictures may come before or after their events.
+Events pass through a buffer of FLUSH_EVENTS + REORDER_EVENTS, which sorts events that arrive slightly late. Only the
+times of pictures are kept in memory. The event of each picture is found at the end, in one pass over the event times on
+disk, so pictures may come before or after their events.
 
     event_idx = number of events earlier than the picture     (events[event_idx] is the first one at its time or later)
 
-The file has another name until it is complete.
+The file has a temporary name until it is complete.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ COLUMNS = {"ts": np.float64, "xs": np.uint16, "ys": np.uint16, "ps": np.bool_}
 
 @dataclass(frozen=True)
 class Written:
-    """What went into the file.
+    """Report the content of the written file.
 
     Attributes:
-        events, images: how many.
-        seconds: from the first to the last event.
-        reordered_events: events that came earlier in time than their predecessor.
-        backward_images: pictures whose time is not later than their predecessor's; kept as they are.
-        size: of the sensor.
-        size_is_guessed: nothing stated it, so it is the smallest that holds all events.
+        events, images: their numbers.
+        seconds: time from the first to the last event.
+        reordered_events: number of events that came earlier in time than their predecessor.
+        backward_images: number of pictures whose time is not later than their predecessor's; they are not changed.
+        size: size of the sensor.
+        size_is_guessed: True if the recording does not state the size, so that it is the smallest one that holds all
+            events.
     """
 
     events: int
@@ -54,15 +55,15 @@ class Written:
 
 
 class RecordingWriter:
-    """A context manager; leaving it without an exception completes the file, with one it removes what there is.
+    """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes it.
 
     Args:
-        path: of the file to make.
-        source: what the root attribute ``data_source`` shall say.
-        size: of the sensor; None takes what the recording states, or the pictures', or the smallest that holds all
-            events.
-        published_shift: where the published conversion of this raw form pairs a picture with an earlier event than
-            ``event_idx`` says, by how many; its choice is then written beside ours (``event_idx_published``).
+        path: file to write.
+        source: value of the root attribute ``data_source``.
+        size: size of the sensor; None takes the size that the recording states, or that of the pictures, or the
+            smallest that holds all events.
+        published_shift: how many events earlier than ``event_idx`` the published conversion of this raw form pairs a
+            picture with. If it is not 0, its choice is also written (``event_idx_published``).
 
     Raises:
         UsageError: the folder cannot be written to.
@@ -113,11 +114,11 @@ class RecordingWriter:
                 self._partial.unlink(missing_ok=True)
 
     def add(self, item: Item) -> None:
-        """Take the next item of the recording.
+        """Add the next item of the recording.
 
         Raises:
-            UsageError: events further out of order than the buffer reaches, or outside the sensor; pictures of
-                different sizes; a stated size that the user contradicts.
+            UsageError: events are further out of order than the buffer can sort, or outside the sensor; pictures have
+                different sizes; or the recording's size differs from the user's.
         """
         if isinstance(item, SensorSize):
             if self._size is not None and self._size != item:
@@ -156,13 +157,13 @@ class RecordingWriter:
         self._picture_times.append(picture.t_ns)
 
     def _set_origin(self, t_ns: int) -> int:
-        """The time that becomes 0: that of the first item, whichever it is."""
+        """Return the time that becomes 0: that of the first item of any kind."""
         if self._origin_ns is None:
             self._origin_ns = t_ns
         return self._origin_ns
 
     def _flush(self, keep: int) -> None:
-        """Write all pending events but the last ``keep``."""
+        """Write all pending events except the last ``keep``."""
         t_ns, x, y, p = (
             np.concatenate([getattr(chunk, name) for chunk in self._pending]) for name in ("t_ns", "x", "y", "p")
         )
@@ -174,7 +175,7 @@ class RecordingWriter:
             seconds = (self._last_ns - t_ns[0]) * 1e-9
             raise UsageError(
                 f"{self._source}: near event {self._events} the time goes back by {seconds:.6f} s over more than "
-                f"{REORDER_EVENTS} events; sort the recording, or cut it there"
+                f"{REORDER_EVENTS} events; sort the recording, or split it there"
             )
         self._reordered += backward
         count = len(t_ns) - keep
@@ -193,7 +194,10 @@ class RecordingWriter:
         if not len(t_ns):
             return
         if min(x.min(), y.min()) < 0 or max(x.max(), y.max()) > np.iinfo(np.uint16).max:
-            raise UsageError(f"{self._source}: events at x {x.min()} .. {x.max()}, y {y.min()} .. {y.max()}")
+            raise UsageError(
+                f"{self._source}: events at x {x.min()} .. {x.max()}, y {y.min()} .. {y.max()}; coordinates must be "
+                f"from 0 to {np.iinfo(np.uint16).max}"
+            )
         self._largest = SensorSize(
             max(self._largest.width, int(x.max()) + 1), max(self._largest.height, int(y.max()) + 1)
         )
@@ -209,7 +213,7 @@ class RecordingWriter:
         if self._pending:
             self._flush(keep=0)
         if not self._events or self._origin_ns is None or self._last_ns is None:
-            raise UsageError(f"{self._source} holds no events")
+            raise UsageError(f"{self._source} has no events")
         size = self._size or self._picture_size or self._largest
         if self._picture_size not in (None, size):
             raise UsageError(f"{self._source}: pictures are {self._picture_size}, the sensor is {size}")

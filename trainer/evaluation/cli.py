@@ -1,6 +1,6 @@
-"""The command line of `v2v-eval`.
+"""Run `v2v-eval`.
 
-Exit status: 0 everything that is there was evaluated, 2 wrong usage or input, 130 interrupted.
+Exit status: 0 all existing recordings were evaluated, 2 wrong usage or input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 
 LEAST_WIDTH = 110
-"""Of tables that do not go to a terminal."""
+"""Width of tables that are not written to a terminal, in characters."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return run_command(_parser(), _run, argv)
 
 
 def _parser() -> Parser:
     parser = Parser(
         "v2v-eval", "[CONFIG] [--weights FILE] --data DIR [flags]",
-        "Reconstruct recordings of event cameras, or find the flow in them, and score that.",
+        "Reconstruct pictures from recordings of event cameras, or estimate their flow, and score the result.",
         [
             "v2v-eval paper-discrete --weights runs/e2vid/last.pt --data recordings/",
             "v2v-eval --data own.h5 --out pictures/ --video",
@@ -62,60 +62,68 @@ def _parser() -> Parser:
     what, how, out = parser.group("What"), parser.group("How"), parser.group("Output")
     what.add_argument(
         "config", nargs="?", metavar="CONFIG",
-        help=f"YAML file, or one of {', '.join(sorted(shipped()))}; without it, all recordings of --data",
+        help=f"YAML file, or one of {', '.join(sorted(shipped()))}; default: all recordings of --data",
     )  # fmt: skip
     what.add_argument(
         "--weights", default=str(SHIPPED), metavar="FILE",
-        help="of the network, nothing in it is executed; default: a FireNet of ours (docs/model-card.md)",
+        help="weights of the network; code in the file is never executed (default: this project's FireNet, "
+        "docs/model-card.md)",
     )  # fmt: skip
     what.add_argument(
         "--data", required=True, metavar="DIR",
-        help="with CONFIG: the folder with one folder a data set; without: a folder of .h5 files, or one of them",
+        help="with CONFIG: folder with one folder per data set; without: folder of .h5 files, or a single one",
     )  # fmt: skip
-    what.add_argument("--ema", action="store_true", help="the averaged weights of an own checkpoint")
-    what.add_argument("--model", choices=tuple(NETWORKS), help="what the weights are (default: look)")
+    what.add_argument("--ema", action="store_true", help="take the averaged weights of a checkpoint of v2v-train")
+    what.add_argument("--model", choices=tuple(NETWORKS), help="network of the weights (default: recognised)")
     how.add_argument(
-        "--normalize-voxels", action="store_true", help="normalise every voxel grid, as published FireNet wants"
+        "--normalize-voxels", action="store_true", help="normalise every voxel grid, as the published FireNet requires"
     )
-    how.add_argument("--voxels", choices=get_args(Kind), help="default: CONFIG's, or discrete")
+    how.add_argument("--voxels", choices=get_args(Kind), help="kind of voxel grids (default: CONFIG's, or discrete)")
     how.add_argument(
         "--span", choices=get_args(Span),
-        help="what the bins divide: first to last event of a window (published, default), or the time of the window",
+        help="what the bins divide: the time from a window's first to its last event (published, default), or the "
+        "whole window",
     )  # fmt: skip
-    what.add_argument("--metrics", metavar="A,B", help=f"of {', '.join(METRICS)}; default: CONFIG's")
+    what.add_argument("--metrics", metavar="A,B", help=f"some of {', '.join(METRICS)} (default: CONFIG's)")
     what.add_argument(
         "--lpips", nargs=3, action="append", default=[], metavar=("NET", "BACKBONE", "HEADS"),
-        help="weights of LPIPS for alex, squeeze or vgg; may be given several times",
+        help="weight files of LPIPS for alex, squeeze or vgg; may be repeated",
     )  # fmt: skip
     how.add_argument(
         "--stretch", choices=get_args(Stretch), default="none",
-        help="values of each reconstruction to 0 .. 1 before it is scored: from its least to its greatest, from its "
-        "1st to its 99th percentile, or by its histogram (default: as they are)",
+        help="how to map reconstructions to 0 .. 1 before scoring: from minimum to maximum (min-max), from "
+        "the 1st to the 99th percentile (robust), or by histogram equalisation (equalized) (default: none)",
     )  # fmt: skip
-    what.add_argument("--cuts", choices=("paper", "none"), default="paper", help="none: score all of each recording")
+    what.add_argument(
+        "--cuts", choices=("paper", "none"), default="paper",
+        help="time range of each recording to score: that of CONFIG (paper, default), or all of it (none)",
+    )  # fmt: skip
     how.add_argument(
         "--as-published", action="store_true",
-        help="event_idx as stored, times cut to us, EVAID's cuts a picture later: as the released code does, faults "
-        "included",
+        help="evaluate as the released code does, including its faults: event_idx as stored, times truncated to us, "
+        "EVAID's time ranges one picture later",
     )  # fmt: skip
     windows = how.add_mutually_exclusive_group()
     windows.add_argument(
         "--window-seconds", type=float, metavar="S",
-        help="windows of so long, in place of those from picture to picture; a picture is scored against the window "
-        "whose end is nearest, at most half a window away",
+        help="windows of S seconds, instead of from picture to picture; a picture is scored against the window whose "
+        "end is nearest, at most half a window away",
     )  # fmt: skip
-    windows.add_argument("--window-events", type=int, metavar="N", help="the same with windows of so many events")
+    windows.add_argument("--window-events", type=int, metavar="N", help="windows of N events, scored the same way")
     windows.add_argument(
-        "--window-pictures", type=int, default=1, metavar="N", help="windows from a picture to the N-th after it (1)"
+        "--window-pictures", type=int, default=1, metavar="N",
+        help="windows from each picture to the N-th after it (default 1)",
+    )  # fmt: skip
+    windows.add_argument(
+        "--fps", type=float, metavar="N", help="reconstruct N pictures per second of the recording, without scores"
     )
-    windows.add_argument("--fps", type=float, metavar="N", help="reconstruct at this rate; scores nothing")
-    how.add_argument("--size", metavar="WxH", help="of the sensor, for recordings without pictures")
-    how.add_argument("--device", metavar="D", help="default: cuda where there is one, else cpu")
+    how.add_argument("--size", metavar="WxH", help="size of the sensor in px, for recordings without pictures")
+    how.add_argument("--device", metavar="D", help="PyTorch device (default: cuda if available, else cpu)")
     out.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
-    out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of a picture (default 6)")
-    out.add_argument("--video", action="store_true", help="also a video of each sequence, side by side")
-    out.add_argument("--json", metavar="FILE", help="also write flat records")
-    out.add_argument("--per-frame", metavar="FILE.csv", help="also write the scores of every window")
+    out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of each picture (default 6)")
+    out.add_argument("--video", action="store_true", help="also write a video of each sequence to --out")
+    out.add_argument("--json", metavar="FILE", help="also write the scores as flat records to this file")
+    out.add_argument("--per-frame", metavar="FILE.csv", help="also write the scores of every window to this file")
     return parser
 
 
@@ -141,7 +149,7 @@ def _run(arguments: argparse.Namespace) -> int:
                     scores.setdefault(data_set.name, []).append(score)
     except KeyboardInterrupt:
         if scores:
-            print("interrupted; these sequences were done:", file=sys.stderr)
+            print("interrupted; scores of the completed sequences:", file=sys.stderr)
             _print(config, scores)
         raise
     if not scores:
@@ -178,7 +186,9 @@ def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run,
         found = find_recordings(data, data_set)
         with _progress() as advance:
             scores = {
-                sequence: evaluate_flow(flow_run, path, data_set.cuts[sequence] if run.use_cuts else None, advance)
+                sequence: evaluate_flow(
+                    flow_run, path, data_set.time_ranges[sequence] if run.use_time_ranges else None, advance
+                )
                 for sequence, path in found.items()
             }
         console.print(flow_table(data_set.name, scores, config.paper))
@@ -208,13 +218,13 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
     elif arguments.fps is not None:
         names = ()
     else:
-        # Files that were given are to be used.
+        # Metrics whose weight files are given are computed.
         names = list(dict.fromkeys([*names, *(f"lpips_{net}" for net in lpips_files)]))
     if arguments.fps is not None and names:
-        raise UsageError("--fps scores nothing, so it goes without --metrics")
+        raise UsageError("--fps computes no scores: leave out --metrics")
     if arguments.fps is not None and arguments.out is None:
         raise UsageError(
-            "--fps scores nothing: --out DIR says where its pictures go, and --video adds a film of all of them"
+            "--fps computes no scores: give --out DIR for its pictures, and --video for a film of all of them"
         )
     run = Run(
         network=network,
@@ -222,7 +232,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         metrics=make_metrics(names, lpips_files, device),
         device=device,
         as_published=arguments.as_published,
-        use_cuts=arguments.cuts == "paper",
+        use_time_ranges=arguments.cuts == "paper",
         fps=arguments.fps,
         window_pictures=arguments.window_pictures,
         window_seconds=arguments.window_seconds,
@@ -245,7 +255,7 @@ def _device(wanted: str | None) -> str:
     device = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError) as error:  # no such name, none of them here, or not as many
+    except (RuntimeError, AssertionError) as error:  # an unknown name, or a device that this host does not have
         reason = str(error).partition("\n")[0]
         raise UsageError(f"--device {device}: PyTorch cannot compute there: {reason}") from error
     return device
@@ -257,13 +267,13 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
         console = Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         if data_set.name not in scores:
-            console.print(f"{data_set.name}: none of its {len(data_set.cuts)} sequences is there", markup=False)
+            console.print(f"{data_set.name}: 0 of {len(data_set.time_ranges)} sequences found", markup=False)
             continue
         console.print(table(data_set, scores[data_set.name], config.paper))
         for score in scores[data_set.name]:
             if score.repaired_images or score.empty_windows:
                 console.print(
-                    f"{score.sequence}: {score.repaired_images} time stamps of pictures mended, "
+                    f"{score.sequence}: {score.repaired_images} time stamps of pictures repaired, "
                     f"{score.empty_windows} windows without events",
                     markup=False,
                 )
@@ -271,7 +281,7 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
 
 class _WindowRate(ProgressColumn):
     def render(self, task: Task) -> Text:
-        """Windows a second."""
+        """Return the rate in windows per second."""
         return Text("" if task.speed is None else f"{task.speed:.1f}/s")
 
 

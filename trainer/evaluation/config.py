@@ -1,14 +1,14 @@
-"""The configuration of an evaluation: a YAML file, or one that ships with the project, by name.
+"""Read the configuration of an evaluation: a YAML file, or a shipped one by its name.
 
 Its keys:
 
-    model: {name: e2vid, options: {final_activation: none}}    # both optional: the weights tell
+    model: {name: e2vid, options: {final_activation: none}}    # both optional, derived from the weights by default
     voxels: {kind: discrete, bins: 5, span: events}
     metrics: [mse, ssim_range2, ssim, correlation, lpips_alex]
     data:
-      - HQF                                                    # of the paper, with its cuts
+      - HQF                                                    # of the paper, with its time ranges
       - {name: mine, folder: recordings, sequences: {corridor: [0, 10], desk: null}}
-    paper: [E2VID WebVid10K]                                   # rows to show beside
+    paper: [E2VID WebVid10K]                                   # rows of the paper's tables to show as well
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.evaluation import paper
-from trainer.evaluation.cuts import DATA_SETS, Cut, DataSet
+from trainer.evaluation.data_sets import DATA_SETS, DataSet, TimeRange
 from trainer.evaluation.layout import SUFFIXES
 from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.voxelise import VoxelSettings
@@ -33,15 +33,15 @@ KEYS = ("model", "voxels", "metrics", "data", "paper")
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What to evaluate.
+    """Hold what to evaluate.
 
     Attributes:
-        data_sets: in this order.
-        model: key of ``trainer.models.NETWORKS``; None recognises it.
-        model_options: its arguments, where the weights do not tell them.
+        data_sets: in the order of evaluation.
+        model: key of ``trainer.models.NETWORKS``; None recognises the weights.
+        model_options: arguments of the network that override those derived from the weights.
         voxels: how windows become voxel grids; None means discrete with as many bins as the network takes.
-        metrics: names of ``trainer.evaluation.metrics.METRICS``.
-        paper: methods of ``trainer.evaluation.paper.RESULTS``, or of ``FLOW``, to show beside.
+        metrics: names in ``trainer.evaluation.metrics.METRICS``.
+        paper: methods of ``trainer.evaluation.paper.RESULTS`` or ``FLOW`` to show as well.
     """
 
     data_sets: tuple[DataSet, ...]
@@ -53,24 +53,25 @@ class EvaluationConfig:
 
 
 def shipped() -> dict[str, Path]:
-    """Configurations of the project by name."""
+    """Return the paths of the shipped configurations by name."""
     folder = resources.files("trainer.evaluation") / "configs"
     return {Path(file.name).stem: Path(str(file)) for file in folder.iterdir() if file.name.endswith(".yaml")}
 
 
 def read_config(name: str) -> EvaluationConfig:
-    """
+    """Read a configuration.
+
     Args:
         name: path of a YAML file, or name of a shipped configuration.
 
     Raises:
-        UsageError: no such file, or something in it that is not understood; the message names the key.
+        UsageError: there is no such file, or a value in it is not valid; the message names the key.
     """
     path = Path(name)
     if not path.is_file():
         known = shipped()
         if name not in known:
-            raise UsageError(f"no file {name}; configurations that ship with the project: {', '.join(sorted(known))}")
+            raise UsageError(f"no file {name}; shipped configurations: {', '.join(sorted(known))}")
         path = known[name]
     try:
         content = read_yaml(path)
@@ -82,7 +83,7 @@ def read_config(name: str) -> EvaluationConfig:
 
 
 def parse_config(content: Any, where: str) -> EvaluationConfig:
-    """As :func:`read_config`, of the parsed YAML; ``where`` is for messages."""
+    """Check parsed YAML as :func:`read_config` does; ``where`` names it in messages."""
     top = _mapping(content, where, KEYS)
     model = _mapping(top.get("model", {}), f"{where}: model", ("name", "options"))
     voxels = _mapping(top.get("voxels", {}), f"{where}: voxels", ("kind", "bins", "span"))
@@ -90,7 +91,7 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
     names = [data_set.name for data_set in data_sets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UsageError(f"{where}: data: two sets of the name {twice}: give each a name of its own")
+        raise UsageError(f"{where}: data: two data sets are named {twice}: give each its own name")
     return EvaluationConfig(
         data_sets=data_sets,
         model=model.get("name"),
@@ -102,44 +103,44 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
 
 
 def folder_config(path: Path) -> EvaluationConfig:
-    """All recordings of a folder, or a single file, as one data set without cuts."""
+    """Return a configuration for all recordings of a folder, or a single file, as one data set without time ranges."""
     files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
     if not files:
-        raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); v2v-convert makes them from raw ones")
+        raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); convert raw ones with v2v-convert")
     return EvaluationConfig((DataSet(path.stem, ".", dict.fromkeys(file.stem for file in files)),))
 
 
 def _data_set(entry: Any, where: str) -> DataSet:
     if isinstance(entry, str):
         if entry not in DATA_SETS:
-            raise UsageError(f"{where}: {entry!r} is none of the paper's: {', '.join(DATA_SETS)}. Others are given as "
+            raise UsageError(f"{where}: {entry!r} is none of the paper's: {', '.join(DATA_SETS)}. Describe others by "
                              "{name, folder, sequences}")  # fmt: skip
         return DATA_SETS[entry]
     given = _mapping(entry, where, ("name", "folder", "sequences"))
     if "name" not in given or not given.get("sequences"):
-        raise UsageError(f"{where}: a data set has a name and sequences")
+        raise UsageError(f"{where}: a data set needs a name and sequences")
     sequences = given["sequences"]
     if isinstance(sequences, list):
         sequences = dict.fromkeys(map(str, sequences))
     if not isinstance(sequences, Mapping):
-        raise UsageError(f"{where}: sequences are a list, or first and last second by name")
-    cuts = {str(name): _cut(cut, f"{where}: {name}") for name, cut in sequences.items()}
-    return DataSet(str(given["name"]), str(given.get("folder", given["name"])), cuts)
+        raise UsageError(f"{where}: sequences {sequences!r}: give a list, or [first, last] second by name")
+    time_ranges = {str(name): _time_range(span, f"{where}: {name}") for name, span in sequences.items()}
+    return DataSet(str(given["name"]), str(given.get("folder", given["name"])), time_ranges)
 
 
-def _cut(value: Any, where: str) -> Cut | None:
+def _time_range(value: Any, where: str) -> TimeRange | None:
     if value is None:
         return None
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(edge, (int, float)) for edge in value)):
         raise UsageError(f"{where}: {value!r} is not [first second, last second]")
     start, end = float(value[0]), float(value[1])
     if not 0 <= start < end:
-        raise UsageError(f"{where}: a cut from {start:g} to {end:g} s")
+        raise UsageError(f"{where}: [{start:g}, {end:g}] s is not a time range: give 0 <= first < last")
     return start, end
 
 
 def _options(value: Any, where: str) -> dict[str, Any]:
-    """Which there are, the network says."""
+    """Check that options are a mapping of names; the network checks which ones."""
     if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
         raise UsageError(f"{where}: {value!r} should be names and values")
     return dict(value or {})

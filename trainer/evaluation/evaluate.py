@@ -1,4 +1,4 @@
-"""Evaluates data sets: finds their recordings, reconstructs and scores each, draws what is asked for."""
+"""Evaluate data sets: find their recordings, reconstruct and score each, draw the requested pictures."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from trainer import pictures
 from trainer.evaluation import layout
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.metrics import Metric
-from trainer.evaluation.pictures import chosen_steps, draw_step
+from trainer.evaluation.pictures import choose_steps, draw_step
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
@@ -24,17 +24,20 @@ from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
 
 Advance = Callable[[str, int, int], None]
-"""Called with the sequence, the windows done, and the windows in all."""
+"""Progress callback: called with the sequence, the windows done, and the total number of windows."""
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """What to draw.
+    """Hold what to draw.
 
     Attributes:
-        folder: where to; None draws nothing.
-        rows: steps in the picture of a sequence.
-        video: also write a video of each sequence.
+        folder: folder for pictures and videos; None draws none.
+        rows: number of steps in the picture of a sequence, at least 1.
+        video: whether to write a video of each sequence as well.
+
+    Raises:
+        UsageError: ``rows`` is below 1, or ``video`` is set without a folder.
     """
 
     folder: Path | None = None
@@ -45,26 +48,27 @@ class Drawing:
         if self.rows < 1:
             raise UsageError(f"pictures with {self.rows} rows: give at least 1")
         if self.video and self.folder is None:
-            raise UsageError("a video needs --out, the folder to write it to")
+            raise UsageError("a video needs a folder to write it to: give --out")
 
 
 @dataclass(frozen=True)
 class Run:
-    """How to evaluate.
+    """Hold how to evaluate.
 
     Attributes:
         network: in evaluation mode.
-        voxels: as the network wants them.
-        metrics: by name.
-        device: of PyTorch.
+        voxels: settings that the network requires.
+        metrics: metrics by name.
+        device: PyTorch device.
         as_published: see :mod:`trainer.evaluation.readers`.
-        use_cuts: False scores all of each recording.
-        fps: reconstruct at this rate instead of at the pictures; nothing is scored then.
-        window_pictures: windows from a picture to the one that is so many on.
-        window_seconds, window_events: windows of so long, or of so many events, in place of those between pictures.
-        size: of the sensor, see :class:`Recording`.
-        drawing: pictures and videos.
+        use_time_ranges: False scores all of each recording.
+        fps: reconstruct this many pictures per second, not scored; None reconstructs at the pictures.
+        window_pictures: number of pictures from a window's start to its end.
+        window_seconds, window_events: length of windows in seconds, or in events; None for windows between pictures.
+        size: height and width of the sensor, see :class:`Recording`.
+        drawing: pictures and videos to write.
         stretch: see :func:`reconstruct`.
+        score_blank: also score a blank picture in the mean grey of each target.
     """
 
     network: VoxelNetwork
@@ -72,7 +76,7 @@ class Run:
     metrics: Mapping[str, Metric]
     device: str = "cpu"
     as_published: bool = False
-    use_cuts: bool = True
+    use_time_ranges: bool = True
     fps: float | None = None
     window_pictures: int = 1
     window_seconds: float | None = None
@@ -80,16 +84,17 @@ class Run:
     size: tuple[int, int] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     stretch: Stretch = "none"
+    score_blank: bool = True
 
 
 def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
-    """Files of the sequences of a data set that are there, by sequence, in the data set's order."""
+    """Return the existing files of a data set by sequence, in the data set's order."""
     folder = data if data.is_dir() else data.parent
     found = {}
-    for sequence in data_set.cuts:
+    for sequence in data_set.time_ranges:
         candidates = [folder / data_set.folder / f"{sequence}{suffix}" for suffix in layout.SUFFIXES]
         if data.is_file() and (data_set.folder, sequence) == (".", data.stem):
-            candidates = [data]  # whatever its ending, and whatever lies beside it
+            candidates = [data]  # with any ending, even if a file with another one exists
         existing = next((path for path in candidates if path.is_file()), None)
         if existing is not None:
             found[sequence] = existing
@@ -97,32 +102,37 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
 
 
 def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
-    """Look into the recordings that are there, so that the last one is not refused when all others have been evaluated.
+    """Check all existing recordings, so that a bad one is reported before the others are evaluated.
 
     Raises:
         UsageError: see :class:`Recording`.
     """
     for path in find_recordings(data, data_set).values():
-        with Recording(path, as_published=run.as_published, size=run.size) as recording:
-            _windows(run, recording, data_set)
+        check_recording(run, path, data_set)
+
+
+def check_recording(run: Run, path: Path, data_set: DataSet) -> None:
+    """Check that a recording can be evaluated; raises as :func:`check_data_set`."""
+    with Recording(path, as_published=run.as_published, size=run.size) as recording:
+        _windows(run, recording, data_set)
 
 
 def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
     if run.fps is not None:
         return regular_windows(recording, run.fps)
-    cut = data_set.cuts[recording.name] if run.use_cuts else None
+    time_range = data_set.time_ranges[recording.name] if run.use_time_ranges else None
     if run.window_seconds is not None:
-        return windows_of_seconds(recording, run.window_seconds, cut)
+        return windows_of_seconds(recording, run.window_seconds, time_range)
     if run.window_events is not None:
-        return windows_of_events(recording, run.window_events, cut)
-    later = data_set.published_later if run.as_published else 0
-    return picture_windows(recording, cut, pictures=run.window_pictures, later=later)
+        return windows_of_events(recording, run.window_events, time_range)
+    later = data_set.published_shift if run.as_published else 0
+    return picture_windows(recording, time_range, pictures=run.window_pictures, later=later)
 
 
 def evaluate_data_set(
     run: Run, data: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> Iterator[SequenceScore]:
-    """Scores of the sequences that are there, one after another.
+    """Evaluate the existing sequences and yield their scores one by one.
 
     Raises:
         UsageError: see :class:`Recording` and :func:`reconstruct`.
@@ -134,12 +144,12 @@ def evaluate_data_set(
 def evaluate_sequence(
     run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> SequenceScore:
-    """Score, and draw, one recording."""
+    """Score one recording, and draw it if requested."""
     with Recording(path, as_published=run.as_published, size=run.size) as recording, ieee_products():
         windows = _windows(run, recording, data_set)
-        scorer = SequenceScorer(run.metrics)
+        scorer = SequenceScorer(run.metrics, run.score_blank)
         rows = []
-        shown = chosen_steps(len(windows), run.drawing.rows)
+        shown = choose_steps(len(windows), run.drawing.rows)
         with _video(run.drawing, data_set.name, recording.name, windows) as video:
             steps = reconstruct(recording, windows, run.network, run.voxels, device=run.device, stretch=run.stretch)
             for number, step in enumerate(steps):

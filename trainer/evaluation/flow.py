@@ -1,17 +1,17 @@
-"""How well a network finds optical flow on recordings whose flow is known (MVSEC), beside a prediction of no motion.
+"""Score a network's optical flow on recordings with known flow (MVSEC), next to a prediction of no motion.
 
-EE is the length of the error of one pixel, px over one window. Of each window the mean (AEE) and the share of pixels
-with EE above 3 (3PE) are taken, then the mean over the windows of a sequence. *Dense*: over all pixels with known flow.
-*Sparse*: of these, only those with events in the window's voxel grid. "zeros" is what predicting no motion scores: it
-needs no network, so it checks files, windows and masks.
+EE is the length of a pixel's error, in px over one window. The scores of a window are the mean (AEE) and the share of
+pixels with EE above 3 (3PE); those of a sequence are the means over its windows. *Dense* scores are over all pixels
+with known flow. *Sparse* scores are over those of them with events in the window's voxel grid. "zeros" is the score of
+predicting no motion: it needs no network, so it checks files, windows and masks.
 
-Two conventions differ:
+The default and the published conventions differ:
 
-| | right (default) | as published |
+| | correct (default) | as published |
 |---|---|---|
-| flow field i | is of the window that begins at its time, as EV-FlowNet and E-RAFT define it | of the one before |
+| flow field i belongs to | the window that begins at its time, as EV-FlowNet and E-RAFT define it | the window before |
 | the car's hood | rows from 190 on do not count in sequences ``outdoor*`` (EV-FlowNet) | counts |
-| a window in which nothing counts | is left out | scores 0 |
+| a window without pixels that count | is left out | scores 0 |
 | events of the sparse scores, for E-RAFT | those of the window | those of the window before |
 """
 
@@ -30,6 +30,7 @@ from rich.table import Table
 
 from trainer import pictures
 from trainer.evaluation import paper
+from trainer.evaluation.data_sets import TimeRange
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import flow_windows
@@ -46,19 +47,20 @@ TITLES = {"aee_dense": "AEE", "aee_sparse": "AEE sparse", "3pe_dense": "3PE %", 
 
 @dataclass
 class FlowScore:
-    """Means over the windows of a sequence, by the names of :data:`TITLES`; 3PE in per cent."""
+    """Average the scores over the windows of a sequence, by the names of :data:`TITLES`. 3PE is in per cent."""
 
     as_published: bool
     windows: int = 0
     _values: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, prediction: FlowImage, truth: FlowImage, events: npt.NDArray[np.bool_], rows: int) -> None:
-        """
+        """Add the scores of a window.
+
         Args:
             prediction: [2, H, W] (x, y), px.
             truth: the same; NaN, or 0 in both components, where it is not known.
-            events: [H, W], whether there are any.
-            rows: how many rows from the top count.
+            events: bool [H, W], whether a pixel has events.
+            rows: number of rows from the top that count.
         """
         self.windows += 1
         known = np.isfinite(truth).all(axis=0) & (truth != 0).any(axis=0)
@@ -76,20 +78,20 @@ class FlowScore:
 
     @property
     def means(self) -> dict[str, float]:
-        """By name; without those of which no window had anything to count."""
+        """Return the means by name. Scores without any counted pixel in any window are left out."""
         return {name: float(np.mean(self._values[name])) for name in TITLES if name in self._values}
 
 
 @dataclass(frozen=True)
 class FlowRun:
-    """How to evaluate.
+    """Hold how to evaluate flow.
 
     Attributes:
-        network: of task "flow".
-        voxels: as it wants them.
-        device: of PyTorch.
+        network: a network of task "flow".
+        voxels: settings that the network requires.
+        device: PyTorch device.
         as_published: see the module.
-        out: folder for a picture of each sequence, or None.
+        out: folder for a picture of each sequence; None draws none.
     """
 
     network: VoxelNetwork
@@ -102,17 +104,17 @@ class FlowRun:
 def evaluate_flow(
     run: FlowRun,
     path: Path,
-    cut: tuple[float, float] | None,
+    time_range: TimeRange | None,
     advance: Callable[[str, int, int], None] = lambda _name, _done, _total: None,
 ) -> dict[str, FlowScore]:
-    """Scores of the network, and of "zeros", on one recording.
+    """Return the scores of the network and of "zeros" on one recording.
 
     Raises:
-        UsageError: see :class:`Recording`; no flow in it; or the output is not finite.
+        UsageError: see :class:`Recording`; or the recording has no flow; or the network's output is not finite.
     """
     scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
     with Recording(path, as_published=run.as_published) as recording, ieee_products():
-        windows = flow_windows(recording, cut, one_later=run.as_published)
+        windows = flow_windows(recording, time_range, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]
         late = run.as_published and run.network.lead_voxels > 0
@@ -132,9 +134,9 @@ def evaluate_flow(
 def _estimate(
     run: FlowRun, recording: Recording, windows: Sequence[EventWindow]
 ) -> Iterator[tuple[EventWindow, npt.NDArray[np.float32], FlowImage]]:
-    """Window, voxel grid and prediction [2, H, W], in order; memory is carried from the first to the last."""
+    """Yield window, voxel grid and prediction [2, H, W], in order. The network's memory runs from first to last."""
     network, state = run.network.to(run.device).eval(), None
-    # A network that looks at the window before as well sees nothing in front of the first.
+    # A network that also uses the previous window gets zeros before the first.
     before = [np.zeros((run.voxels.bins, *recording.size), np.float32)] * network.lead_voxels
     for window in windows:
         events = recording.events(window)
@@ -144,7 +146,7 @@ def _estimate(
             outputs, state = network(piece, state)
         before, prediction = [], outputs[0, -1].float().cpu().numpy()
         if not np.isfinite(prediction).all():
-            raise UsageError(f"{recording.path}: the network gives values that are not finite at {window.begin:.3f} s")
+            raise UsageError(f"{recording.path}: the network's output is not finite at {window.begin:.3f} s")
         yield window, grid, prediction
 
 
@@ -153,23 +155,23 @@ def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, predictio
     scale = pictures.flow_scale(known)
     panels = [pictures.draw_events(grid), *(pictures.draw_flow(flow, scale) for flow in (known, prediction))]
     drawn = pictures.side_by_side([panel[None] for panel in panels])[0]
-    pictures.write_png(path, pictures.headed(drawn, (pictures.EVENTS, "true flow", "flow found")))
+    pictures.write_png(path, pictures.add_header(drawn, (pictures.EVENTS, "true flow", "estimated flow")))
 
 
 def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:
-    """One block of rows a sequence: network, zeros, and what the paper states."""
-    made = Table(title=escape(name), title_justify="left")
+    """Format a block of rows per sequence: network, zeros, and the paper's values."""
+    rows = Table(title=escape(name), title_justify="left")
     for column in ("sequence", "windows", *TITLES.values()):
-        made.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
+        rows.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
     for sequence, found in scores.items():
-        for who, score in found.items():
-            label = escape(sequence) if who == "network" else f"  {who}"
-            made.add_row(label, str(score.windows), *_numbers(score.means))
+        for predictor, score in found.items():
+            label = escape(sequence) if predictor == "network" else f"  {predictor}"
+            rows.add_row(label, str(score.windows), *_numbers(score.means))
         for method in compared:
             stated = paper.FLOW[method].get(sequence)
             if stated is not None:
-                made.add_row(f"  paper: {method}", "", *_numbers(stated), style="dim")
-    return made
+                rows.add_row(f"  paper: {method}", "", *_numbers(stated), style="dim")
+    return rows
 
 
 def _numbers(values: Mapping[str, float]) -> list[str]:
@@ -179,9 +181,16 @@ def _numbers(values: Mapping[str, float]) -> list[str]:
 def flow_records(
     name: str, scores: Mapping[str, Mapping[str, FlowScore]], settings: Mapping[str, object]
 ) -> list[dict[str, object]]:
-    """One flat record a sequence and predictor."""
+    """Return a flat record per sequence and predictor."""
     return [
-        {"data_set": name, "sequence": sequence, "predictor": who, "windows": score.windows, **score.means, **settings}
+        {
+            "data_set": name,
+            "sequence": sequence,
+            "predictor": predictor,
+            "windows": score.windows,
+            **score.means,
+            **settings,
+        }
         for sequence, found in scores.items()
-        for who, score in found.items()
+        for predictor, score in found.items()
     ]

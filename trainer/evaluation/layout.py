@@ -1,14 +1,14 @@
-"""The h5 layout of a recording: that of the event_cnn_minimal family, which V2V reads too.
+"""Define the h5 layout of a recording, which is that of the event_cnn_minimal family and also of V2V.
 
 | path | dtype | meaning |
 |---|---|---|
 | ``events/ts`` | float64 [N] (float32 is read too) | seconds, not decreasing |
 | ``events/xs``, ``events/ys`` | integers [N] | pixels |
-| ``events/ps`` | bool or integer [N] | above 0 where it got brighter |
+| ``events/ps`` | bool or integer [N] | above 0 for a brightness increase |
 | ``images/<key>`` | uint8 [H, W] | in the order of their keys |
 | ... attribute ``event_idx`` | integer | the first event at the time of the picture or later |
 | ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
-| ... attribute ``event_idx_published`` | integer, optional | what the published conversion writes as ``event_idx`` |
+| ... attribute ``event_idx_published`` | integer, optional | ``event_idx`` as the published conversion writes it |
 | ``flow/<key>`` | float32 [2, H, W], optional | flow (x, y), px, until the next field; NaN: not known |
 | ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
 | root attribute ``sensor_resolution`` | 2 integers | height, width |
@@ -21,5 +21,5 @@ SUFFIXES = (".h5", ".hdf5")
 
 
 def image_key(index: int) -> str:
-    """Path of picture ``index`` in a file that this project writes."""
+    """Return the path of picture ``index`` in a file that this project writes."""
     return f"images/image{index:09d}"

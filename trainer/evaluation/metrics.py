@@ -1,15 +1,15 @@
-"""Distances between a reconstruction and the picture of the sensor.
+"""Compute distances between a reconstruction and the picture of the sensor.
 
 | name | definition |
 |---|---|
 | ``mse`` | mean squared difference, grey values in 0 .. 1 |
 | ``ssim_range2`` | SSIM as the paper computes it: 7x7 uniform window, sample covariance, data range 2 |
-| ``ssim`` | the same with data range 1, which is the range of the values; lower |
-| ``correlation`` | Pearson's: 1 where only brightness and contrast differ, 0 for a blank picture |
+| ``ssim`` | the same with data range 1, which is the range of the values; gives lower values |
+| ``correlation`` | Pearson's: 1 if only brightness and contrast differ, 0 for a blank picture |
 | ``lpips_alex``, ``lpips_squeeze``, ``lpips_vgg`` | LPIPS v0.1 |
 
-Reconstructions are clamped to 0 .. 1 first, not rounded to 8 bits. The paper's tables hold ``mse``, ``ssim_range2`` and
-``lpips_alex``.
+Reconstructions are clamped to 0 .. 1 first, but not rounded to 8 bits. The paper's tables hold ``mse``, ``ssim_range2``
+and ``lpips_alex``.
 
 SSIM (Wang et al. 2004), as ``skimage.metrics.structural_similarity`` defines it, with means mu, (co)variances s of the
 sample kind (N - 1) over each window that lies wholly in the picture, and C1 = (0.01 R)^2, C2 = (0.03 R)^2 for range R:
@@ -41,22 +41,22 @@ METRICS = ("mse", "ssim_range2", "ssim", "correlation", *LPIPS_METRICS)
 
 
 def mse(prediction: GreyImage, target: GreyImage) -> float:
-    """Mean squared difference."""
+    """Return the mean squared difference."""
     return float(np.mean((prediction - target) ** 2))
 
 
 def correlation(prediction: GreyImage, target: GreyImage) -> float:
-    """Pearson's; 0 where either picture is blank."""
+    """Return Pearson's correlation; 0 if either picture is blank."""
     ours, truth = prediction - prediction.mean(), target - target.mean()
     scale = float(np.sqrt((ours**2).sum() * (truth**2).sum()))
     return float((ours * truth).sum()) / scale if scale > 1e-12 else 0.0
 
 
 def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> float:
-    """See the module.
+    """Return the SSIM that the module defines, for values that span ``data_range``.
 
     Raises:
-        UsageError: pictures smaller than the window.
+        UsageError: the pictures are smaller than the window.
     """
     if min(target.shape) < SSIM_WINDOW_PX:
         raise UsageError(f"SSIM of a picture of {target.shape[0]} x {target.shape[1]}: give at least 7 x 7")
@@ -67,7 +67,7 @@ def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> floa
 
 
 def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str = "cpu") -> Metric:
-    """LPIPS with weights from files, see :meth:`trainer.losses.lpips.LPIPS.from_files`."""
+    """Create LPIPS with weights from files, see :meth:`trainer.losses.lpips.LPIPS.from_files`."""
     network = LPIPS.from_files(net, backbone, heads).to(device)
 
     def distance(prediction: GreyImage, target: GreyImage) -> float:
@@ -81,31 +81,31 @@ def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str 
 def make_metrics(
     names: Sequence[str], lpips_files: Mapping[str, tuple[str | Path, str | Path]], device: str = "cpu"
 ) -> dict[str, Metric]:
-    """Metrics by name.
+    """Create metrics by name.
 
     Args:
-        names: of METRICS.
-        lpips_files: backbone and heads by network ("alex", "squeeze", "vgg").
-        device: where LPIPS runs.
+        names: names in METRICS.
+        lpips_files: files of backbone and heads by network ("alex", "squeeze", "vgg").
+        device: PyTorch device for LPIPS.
 
     Raises:
-        UsageError: an unknown name, or LPIPS without its files.
+        UsageError: a name is unknown, or LPIPS has no files.
     """
-    made: dict[str, Metric] = {}
+    metrics: dict[str, Metric] = {}
     for name in names:
         if name not in METRICS:
             raise UsageError(f"metric {name!r}: give some of {', '.join(METRICS)}")
         if name in ("mse", "correlation"):
-            made[name] = mse if name == "mse" else correlation
+            metrics[name] = mse if name == "mse" else correlation
         elif name in LPIPS_METRICS:
             net = LPIPS_METRICS[name]
             if net not in lpips_files:
                 raise UsageError(
-                    f"{name} needs weights that are not part of this project: give --lpips {net} BACKBONE HEADS "
+                    f"{name} needs weights that this project does not contain: give --lpips {net} BACKBONE HEADS "
                     f"(backbone: {BACKBONES[net].weights_from}, heads: {net}.pth of LPIPS v0.1), or leave it out with "
                     "--metrics"
                 )
-            made[name] = lpips_metric(net, *lpips_files[net], device)
+            metrics[name] = lpips_metric(net, *lpips_files[net], device)
         else:
-            made[name] = functools.partial(ssim, data_range=2.0 if name == "ssim_range2" else 1.0)
-    return made
+            metrics[name] = functools.partial(ssim, data_range=2.0 if name == "ssim_range2" else 1.0)
+    return metrics

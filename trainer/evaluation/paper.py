@@ -1,9 +1,9 @@
-"""Results that the V2V paper states: MSE, SSIM of range 2, LPIPS of AlexNet, each the mean over sequences."""
+"""List the results of the V2V paper: MSE, SSIM of range 2, LPIPS of AlexNet, each the mean over sequences."""
 
 from __future__ import annotations
 
 METRICS = ("mse", "ssim_range2", "lpips_alex")
-"""Names here of the paper's three columns."""
+"""Names of the paper's three columns in this project."""
 
 DATA_SETS = ("HQF", "EVAID", "IJRR", "MVSEC")
 

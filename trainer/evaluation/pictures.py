@@ -1,4 +1,4 @@
-"""What a network sees, what it makes of it, and what the camera saw.
+"""Draw a network's input, its reconstruction and the camera's picture side by side.
 
 Panels from left to right: the events of the window (positive red, negative blue on white), the reconstruction, the
 picture of the camera.
@@ -18,12 +18,12 @@ FONT_SCALE = 0.4
 
 
 def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) -> Image:
-    """The panels side by side with a line of text below.
+    """Draw the panels side by side, with a line of text below each.
 
     Args:
-        step: to draw.
-        origin_seconds: what times in the text count from.
-        with_camera: draw the third panel, white where there is no picture yet; False for recordings without pictures.
+        origin_seconds: origin of the times in the text.
+        with_camera: whether to draw the third panel, white before the first picture; False for recordings without
+            pictures.
     """
     height, width = step.prediction.shape
     camera = np.ones((height, width)) if step.camera is None else step.camera / 255
@@ -42,7 +42,7 @@ def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) ->
     return np.hstack(tiles)
 
 
-def chosen_steps(count: int, rows: int) -> frozenset[int]:
-    """``rows`` of ``count`` steps, evenly spaced; the last one among them, the first (the network starts blind) not."""
+def choose_steps(count: int, rows: int) -> frozenset[int]:
+    """Choose ``rows`` of ``count`` evenly spaced steps: with the last, without the first (memory is empty there)."""
     rows = min(rows, count)
     return frozenset(int(step) for step in np.linspace(count / rows, count, rows).round() - 1)

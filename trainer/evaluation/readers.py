@@ -1,9 +1,9 @@
-"""Reads recordings in the h5 layout (IJRR, MVSEC, HQF, EVAID, own ones), window by window, in bounded memory.
+"""Read recordings in the h5 layout (IJRR, MVSEC, HQF, EVAID, your own) window by window, in bounded memory.
 
-Which windows there are is said in :mod:`trainer.evaluation.windows`. Where they begin and end is found by the time
-stamps of the pictures. Two known faults of published files are mended so: ``event_idx`` one event early (HQF), and a
-picture whose time stamp goes back (HQF ``engineering_posters``, picture 528), which gets the mean of its neighbours.
-``as_published=True`` takes ``event_idx`` as it is stored; a window that ends before it begins is empty then.
+:mod:`trainer.evaluation.windows` defines the windows. Their first and last events are found by the time stamps of the
+pictures. This repairs two known faults of published files: ``event_idx`` one event early (HQF), and a picture whose
+time stamp goes back (HQF ``engineering_posters``, picture 528), which gets the mean of its neighbours.
+``as_published=True`` uses the stored ``event_idx`` instead; a window that ends before it begins is empty then.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CLOCK_SLACK_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class Image:
-    """A picture of a recording: its key in the file, its time (s), and the index of the first event that follows it."""
+    """Hold a picture's key in the file, its time in s, and the index of the first event at its time or later."""
 
     key: str
     time: float
@@ -40,7 +40,7 @@ class Image:
 
 @dataclass(frozen=True)
 class EventWindow:
-    """Events ``start:stop``, from ``begin`` to ``end`` seconds; ``target`` is the picture at the end, or None."""
+    """Hold a window: events ``start:stop``, from ``begin`` to ``end`` s, and the picture at its end, if any."""
 
     start: int
     stop: int
@@ -51,18 +51,18 @@ class EventWindow:
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Errors of h5py while it looks into a file or reads from it, as ours."""
+    """Convert errors of h5py in the block to UsageError."""
     try:
         yield
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         raise UsageError(
-            f"{path} cannot be read as HDF5: {error} (it is damaged, or compressed by a filter whose plugin is not "
-            "found in HDF5_PLUGIN_PATH)"
+            f"{path} cannot be read as HDF5: {error} (the file is damaged, or compressed by a filter whose plugin is "
+            "not in HDF5_PLUGIN_PATH)"
         ) from error
 
 
 class _Times(Sequence[float]):
-    """``events/ts`` as a sequence that bisection can search: reads blocks, keeps the last ones."""
+    """Give ``events/ts`` as a sequence for bisection. It reads blocks, and caches the last ones used."""
 
     def __init__(self, dataset: h5py.Dataset, path: Path) -> None:
         self._dataset, self._path = dataset, path
@@ -81,22 +81,22 @@ class _Times(Sequence[float]):
 
 
 class Recording:
-    """One h5 file. A context manager.
+    """Read one h5 file, as a context manager.
 
     Args:
-        path: of the file; opened for reading.
+        path: file, opened for reading.
         as_published: see the module.
-        size: height and width of the sensor, where there is no picture to tell them; None: what the file states.
+        size: height and width of the sensor, used if the file has no pictures; None takes those that the file states.
 
     Attributes:
-        name: of the sequence, the file's name without its ending.
+        name: name of the sequence, the file's name without its ending.
         size: height and width of the sensor.
-        images: in order; may be empty.
-        times: of the events, seconds; reads blocks of the file, for searching.
-        repaired_images: how many time stamps were mended.
+        images: the pictures in order; may be empty.
+        times: times of the events in s; reads blocks of the file, for searching.
+        repaired_images: number of repaired time stamps.
 
     Raises:
-        UsageError: no such file, not of this layout, or its clocks do not fit together.
+        UsageError: there is no such file, it has another layout, or its clocks disagree.
     """
 
     def __init__(self, path: str | Path, *, as_published: bool = False, size: tuple[int, int] | None = None) -> None:
@@ -112,10 +112,10 @@ class Recording:
         try:
             with _reading(self.path):
                 require_self_contained(self._file, self.path)
-                self._columns = self._checked_columns()
+                self._columns = self._check_columns()
                 self.times: Sequence[float] = _Times(self._columns["ts"], self.path)
                 self.repaired_images = 0
-                self.images = self._listed_images(as_published)
+                self.images = self._list_images(as_published)
                 self.size = self._sensor_size()
         except BaseException:
             self._file.close()
@@ -128,34 +128,36 @@ class Recording:
         self._file.close()
 
     def __len__(self) -> int:
-        """Number of events."""
+        """Return the number of events."""
         return len(self.times)
 
     @property
     def span(self) -> tuple[float, float]:
-        """Times of the first and the last event, seconds."""
+        """Return the times of the first and the last event, in s."""
         return self.times[0], self.times[len(self.times) - 1]
 
-    def _checked_columns(self) -> dict[str, h5py.Dataset]:
+    def _check_columns(self) -> dict[str, h5py.Dataset]:
         columns = {name: self._file.get(f"events/{name}") for name in layout.EVENT_COLUMNS}
         missing = [name for name, column in columns.items() if not isinstance(column, h5py.Dataset)]
         if missing:
             raise UsageError(
-                f"{self.path} has no events/{missing[0]}: it is not in the layout of v2v-eval. v2v-convert makes that "
-                "from raw recordings"
+                f"{self.path} has no events/{missing[0]}: it is not in the layout of v2v-eval. Convert raw recordings "
+                "with v2v-convert"
             )
         for name, column in columns.items():
             if column.ndim != 1 or (name in ("xs", "ys") and column.dtype.kind not in "iu"):
                 raise UsageError(
-                    f"{self.path}: events/{name} is {column.dtype} {list(column.shape)}, not a column [N], of whole "
-                    "numbers for coordinates"
+                    f"{self.path}: events/{name} is {column.dtype} {list(column.shape)}, not a column [N], which for "
+                    "coordinates is of integers"
                 )
         lengths = {len(column) for column in columns.values()}
         if lengths == {0} or len(lengths) > 1:
-            raise UsageError(f"{self.path}: columns of events have {sorted(lengths)} entries")
+            raise UsageError(
+                f"{self.path}: columns of events have {sorted(lengths)} entries; they must be of one length above 0"
+            )
         return columns
 
-    def _listed_images(self, as_published: bool) -> tuple[Image, ...]:
+    def _list_images(self, as_published: bool) -> tuple[Image, ...]:
         group = self._file.get("images", {})
         keys = sorted(group)
         if not keys:
@@ -163,7 +165,7 @@ class Recording:
         name = "event_idx_published" if as_published else "event_idx"
         indices, stamps = [], []
         for key in keys:
-            # Of one picture after the other: attributes keep their picture open, which takes 16 kB.
+            # One picture at a time: attributes keep their picture open, which takes 16 kB.
             attributes = group[key].attrs
             published = attributes.get(name)
             indices.append(attributes.get("event_idx") if published is None else published)
@@ -173,48 +175,48 @@ class Recording:
         stored = [int(index) for index in indices]
         if any(stamp is None for stamp in stamps):
             times = [self.times[min(index, len(self) - 1)] for index in stored]
-            return self._paired(keys, times, stored)
+            return self._make_images(keys, times, stored)
         times = [float(stamp) for stamp in stamps]
         if as_published:
-            return self._paired(keys, times, stored)
+            return self._make_images(keys, times, stored)
         first, last = self.span
         if times[-1] < first - CLOCK_SLACK_SECONDS or times[0] > last + CLOCK_SLACK_SECONDS:
-            raise self._two_clocks(times)
-        times = self._increasing(times)
+            raise self._clock_error(times)
+        times = self._repair_times(times)
         for time, index in zip(times, stored, strict=True):
-            # Beyond the events, and yet with events on either side, as where one clock counts microseconds.
+            # The picture's time is outside the events' times, but its index is not: for instance, one clock is in us.
             if (time < first - CLOCK_SLACK_SECONDS and index > 1) or (
                 time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
             ):
-                raise self._two_clocks(times)
-        return self._paired(keys, times, [bisect.bisect_left(self.times, time) for time in times])
+                raise self._clock_error(times)
+        return self._make_images(keys, times, [bisect.bisect_left(self.times, time) for time in times])
 
-    def _two_clocks(self, times: Sequence[float]) -> UsageError:
+    def _clock_error(self, times: Sequence[float]) -> UsageError:
         first, last = self.span
         return UsageError(
             f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
-            f"{last:.3f} s: not one clock. Convert the recording again with v2v-convert, or trust its event_idx with "
-            "--as-published"
+            f"{last:.3f} s: they have different clocks. Convert the recording again with v2v-convert, or trust its "
+            "event_idx with --as-published"
         )
 
-    def _paired(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
+    def _make_images(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
         return tuple(Image(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True))
 
-    def _increasing(self, times: Sequence[float]) -> list[float]:
-        """Each time that is not later than the one before becomes the mean of its neighbours."""
-        mended = list(times)
-        for index in range(1, len(mended)):
-            if mended[index] > mended[index - 1]:
+    def _repair_times(self, times: Sequence[float]) -> list[float]:
+        """Replace each time that is not later than its predecessor by the mean of its neighbours."""
+        fixed = list(times)
+        for index in range(1, len(fixed)):
+            if fixed[index] > fixed[index - 1]:
                 continue
-            after = mended[index + 1] if index + 1 < len(mended) else 2 * mended[index - 1] - mended[max(0, index - 2)]
-            if after <= mended[index - 1]:
+            after = fixed[index + 1] if index + 1 < len(fixed) else 2 * fixed[index - 1] - fixed[max(0, index - 2)]
+            if after <= fixed[index - 1]:
                 raise UsageError(
                     f"{self.path}: the times of pictures {index} and {index + 1} are not later than that of picture "
-                    f"{index - 1}, {mended[index - 1]:.6f} s; only single ones can be mended"
+                    f"{index - 1}, {fixed[index - 1]:.6f} s; only single times can be repaired"
                 )
-            mended[index] = (mended[index - 1] + after) / 2
+            fixed[index] = (fixed[index - 1] + after) / 2
             self.repaired_images += 1
-        return mended
+        return fixed
 
     def _sensor_size(self) -> tuple[int, int]:
         if self.images:
@@ -227,21 +229,21 @@ class Recording:
         stated = self._file.attrs.get("sensor_resolution", self._file.get("sensor_resolution"))
         if stated is None or len(stated) != 2:
             raise UsageError(
-                f"{self.path} has neither pictures nor sensor_resolution: say the sensor's size with --size WxH"
+                f"{self.path} has neither pictures nor sensor_resolution: give the sensor's size with --size WxH"
             )
         return int(stated[0]), int(stated[1])
 
     def flow_fields(self) -> list[Image]:
-        """The flow fields, in order of their keys; without the indices of events."""
+        """Return the flow fields in order of their keys. Their event indices are 0."""
         with _reading(self.path):
             group = self._file.get("flow", {})
             return [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
 
     def flow(self, window: EventWindow) -> npt.NDArray[np.float32]:
-        """The field that is the target of a window, [2, H, W] (x, y) px; NaN or 0 where it is not known.
+        """Read the field that is the target of a window, [2, H, W] (x, y) px; NaN or 0 where it is not known.
 
         Raises:
-            UsageError: it cannot be read, or is of another size.
+            UsageError: the field cannot be read or has another size.
         """
         assert window.target is not None
         with _reading(self.path):
@@ -251,10 +253,10 @@ class Recording:
         return field
 
     def events(self, window: EventWindow) -> Events:
-        """The events of a window, in order of time.
+        """Read the events of a window, sorted by time.
 
         Raises:
-            UsageError: they cannot be read, or come too late or too early to be of this window.
+            UsageError: they cannot be read, or an event lies too far outside the window.
         """
         part = slice(window.start, window.stop)
         with _reading(self.path):
@@ -267,10 +269,10 @@ class Recording:
         return _in_order(events, window, self.path)
 
     def image(self, image: Image) -> npt.NDArray[np.uint8]:
-        """Its pixels, uint8 [H, W].
+        """Read the pixels of a picture, uint8 [H, W].
 
         Raises:
-            UsageError: it cannot be read, or is of another dtype or size than the first picture.
+            UsageError: the picture cannot be read, or has another dtype or size than the first one.
         """
         with _reading(self.path):
             pixels = self._file[image.key][:]
@@ -282,8 +284,11 @@ class Recording:
 
 
 def _in_order(events: Events, window: EventWindow, path: Path) -> Events:
-    """Those that come a little late sorted in, as sensors and files have some; where one lies further outside of its
-    window than this is long, the file has no order in which windows could be searched.
+    """Sort the events of a window, since sensors and files have some slightly late ones.
+
+    Raises:
+        UsageError: an event lies further outside its window than the window is long. The file is then not sorted well
+            enough for searching windows.
     """
     t = events.t
     if (t[1:] >= t[:-1]).all():
@@ -293,7 +298,7 @@ def _in_order(events: Events, window: EventWindow, path: Path) -> Events:
     if not within.all():
         at = int(np.flatnonzero(~within)[0])
         raise UsageError(
-            f"{path}: events are not in order of time: event {window.start + at}, at {t[at]:.6f} s, lies among those "
+            f"{path}: events are not sorted by time: event {window.start + at}, at {t[at]:.6f} s, lies among those "
             f"from {window.begin:.6f} to {window.end:.6f} s. Sort the file"
         )
     order = np.argsort(t, kind="stable")

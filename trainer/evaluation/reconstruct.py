@@ -1,7 +1,7 @@
-"""Runs a network over the windows of a recording.
+"""Run a network over the windows of a recording.
 
-The memory of the network starts at zero with the first window and is carried to the last, as the published test code
-does; nothing is run before the first window to warm it up.
+The network's memory starts at zero before the first window and is kept until the last, as in the published test code.
+There is no warm-up before the first window.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from v2v_protocol.errors import UsageError
 
 Stretch = Literal["none", "min-max", "robust", "equalized"]
 WINDOWS_PER_CALL = 8
-"""Bounds the memory of activations; the result does not depend on it."""
+"""Windows in one call of the network. It bounds the memory of activations, and does not change the result."""
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One window, reconstructed.
+    """Hold the reconstruction of one window.
 
     Attributes:
-        window: which.
-        events: how many it has.
+        window: the window.
+        events: number of its events.
         voxels: float32 [bins, H, W].
         prediction: float32 [H, W], clamped to 0 .. 1.
-        camera: uint8 [H, W], the picture at the end of the window; where the window has none, the latest before it, or
-            None.
-        camera_time: of that picture, seconds.
+        camera: uint8 [H, W], the picture at the end of the window, or else the latest one before; None before the first
+            picture.
+        camera_time: time of that picture, in s.
     """
 
     window: EventWindow
@@ -57,17 +57,17 @@ def reconstruct(
     device: str = "cpu",
     stretch: Stretch = "none",
 ) -> Iterator[Step]:
-    """One step for each window, in order.
+    """Yield one step for each window, in order.
 
-    Events tell nothing of absolute brightness, so some stretch the values of each picture to 0 .. 1 before they score
-    it: ``stretch`` "min-max" from its least to its greatest, "robust" from its 1st to its 99th percentile, "equalized"
-    so that each of 256 values is as frequent (histogram equalisation).
+    Events do not determine absolute brightness, so some authors map the values of each picture to 0 .. 1 before scoring
+    it. ``stretch`` "min-max" maps from the minimum and maximum, "robust" from the 1st and 99th percentile, "equalized"
+    by histogram equalisation with 256 values; "none" does not map.
 
     Raises:
         UsageError: the network has another number of bins, events lie outside the sensor, or the output is not finite.
     """
     if network.bins != settings.bins:
-        raise UsageError(f"voxels of {settings.bins} bins, and the network takes {network.bins}")
+        raise UsageError(f"voxels have {settings.bins} bins, but the network takes {network.bins}")
     network = network.to(device).eval()
     state = None
     for first in range(0, len(windows), WINDOWS_PER_CALL):
@@ -82,10 +82,10 @@ def reconstruct(
         predictions = pictures[0, :, 0].float().cpu().numpy()
         if not np.isfinite(predictions).all():
             raise UsageError(
-                f"{recording.path}: the network gives values that are not finite in windows {first} to "
-                f"{first + len(piece) - 1}; are these its weights, and is its input normalised as in training?"
+                f"{recording.path}: the network's output is not finite in windows {first} to "
+                f"{first + len(piece) - 1}; check its weights, and whether its input is normalised as in training"
             )
-        for window, count, grid, prediction in zip(piece, counts, grids, _stretched(predictions, stretch), strict=True):
+        for window, count, grid, prediction in zip(piece, counts, grids, _stretch(predictions, stretch), strict=True):
             shown = window.target or _latest(recording.images, window.end)
             yield Step(
                 window,
@@ -97,8 +97,8 @@ def reconstruct(
             )
 
 
-def _stretched(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
-    """[N, H, W], each stretched by itself, then clamped to 0 .. 1."""
+def _stretch(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray[np.float32]:
+    """Map the values of each picture of [N, H, W] by ``stretch``, then clamp them to 0 .. 1."""
     if stretch == "equalized":
         equal = [equalize_hist(picture.clip(0, 1)) for picture in pictures]  # type: ignore[no-untyped-call]
         return np.stack(equal).astype(np.float32)
@@ -110,6 +110,6 @@ def _stretched(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArr
 
 
 def _latest(images: Sequence[Image], time: float) -> Image | None:
-    """The last picture that is not later than ``time``."""
+    """Return the last picture that is not later than ``time``; None before the first."""
     position = bisect.bisect_right(images, time, key=lambda image: image.time)
     return images[position - 1] if position else None

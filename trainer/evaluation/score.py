@@ -1,4 +1,4 @@
-"""Scores: means over the frames of a sequence, and over the sequences of a data set without weights (the paper's)."""
+"""Average scores over the frames of a sequence, and unweighted over the sequences of a data set, as the paper does."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from trainer.evaluation.reconstruct import Step
 
 @dataclass(frozen=True)
 class SequenceScore:
-    """One sequence.
+    """Hold the scores of one sequence.
 
     Attributes:
         data_set, sequence: names.
-        frames: windows reconstructed.
-        events: in them.
-        empty_windows: windows without an event.
-        repaired_images: time stamps that were mended.
-        means: mean over the frames by metric; empty where there was nothing to compare with.
-        blank: the same of a blank in the mean grey of each target, the best that one without any picture could score.
-        by_frame: of each window that was scored, its number, its end (s), its events, and each metric.
+        frames: number of reconstructed windows.
+        events: number of events in them.
+        empty_windows: number of windows without events.
+        repaired_images: number of repaired time stamps.
+        means: mean over the frames by metric; empty if the sequence has no pictures to compare with.
+        blank: the same scores for a blank picture in the mean grey of each target, as a baseline.
+        by_frame: for each scored window its number, its end (s), its number of events, and each metric.
     """
 
     data_set: str
@@ -39,9 +39,10 @@ class SequenceScore:
 
 @dataclass
 class SequenceScorer:
-    """Takes the steps of one sequence."""
+    """Collect the scores of one sequence step by step; ``score_blank`` adds those of the blank and doubles the work."""
 
     metrics: Mapping[str, Metric]
+    score_blank: bool = True
     values: dict[str, list[float]] = field(default_factory=dict)
     blank: dict[str, list[float]] = field(default_factory=dict)
     by_frame: list[dict[str, float]] = field(default_factory=list)
@@ -62,10 +63,11 @@ class SequenceScorer:
         for name, metric in self.metrics.items():
             scored[name] = metric(prediction, target)
             self.values.setdefault(name, []).append(scored[name])
-            self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
+            if self.score_blank:
+                self.blank.setdefault(name, []).append(metric(np.full_like(target, target.mean()), target))
 
     def score(self, data_set: str, sequence: str, repaired_images: int) -> SequenceScore:
-        """The means."""
+        """Return the means over the steps added so far."""
         means, blank = (
             {name: float(np.mean(each)) for name, each in kind.items()} for kind in (self.values, self.blank)
         )
@@ -74,7 +76,11 @@ class SequenceScorer:
 
 
 def mean_over_sequences(scores: Sequence[SequenceScore], *, blank: bool = False) -> dict[str, float]:
-    """Unweighted mean by metric, of the metrics that every sequence has; with ``blank``, of the blank pictures."""
-    found = [score.blank if blank else score.means for score in scores]
+    """Return the unweighted mean of each metric that every sequence has; with ``blank``, of the blank pictures."""
+    return mean_by_name([score.blank if blank else score.means for score in scores])
+
+
+def mean_by_name(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the unweighted mean by name, of the names that all of ``found`` have."""
     names = [name for name in found[0] if all(name in means for means in found)] if found else []
     return {name: float(np.mean([means[name] for means in found])) for name in names}

@@ -1,4 +1,4 @@
-"""Scores as tables beside the paper's, and as flat records for ``--json``."""
+"""Format scores as tables with the paper's results, and as flat records for ``--json``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from trainer.evaluation import paper
-from trainer.evaluation.cuts import DataSet
+from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError
 
@@ -27,33 +27,32 @@ TITLES = {
 
 
 def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence[str]) -> Table:
-    """
+    """Format the scores of a data set.
+
     Args:
-        data_set: the one whose scores these are.
-        scores: of its sequences.
-        compared: methods of :data:`trainer.evaluation.paper.RESULTS` to show below; shown where it has the data set.
+        compared: methods of :data:`trainer.evaluation.paper.RESULTS` to show below, if they have the data set.
     """
     means = mean_over_sequences(scores)
     names = list(dict.fromkeys(name for score in scores for name in score.means))
-    # Names in brackets would be taken for markup, and left out.
-    made = Table(title=escape(data_set.name), title_justify="left")
-    made.add_column("sequence", no_wrap=True)
-    made.add_column("frames", justify="right")
+    # Escaped, because rich would remove names in brackets as markup.
+    rows = Table(title=escape(data_set.name), title_justify="left")
+    rows.add_column("sequence", no_wrap=True)
+    rows.add_column("frames", justify="right")
     for name in names:
-        made.add_column(TITLES[name], justify="right")
+        rows.add_column(TITLES[name], justify="right")
     for score in scores:
-        made.add_row(escape(score.sequence), str(score.frames), *(_number(score.means, name) for name in names))
+        rows.add_row(escape(score.sequence), str(score.frames), *(_number(score.means, name) for name in names))
     if not names:
-        return made
-    made.add_section()
-    whole = "" if len(scores) == len(data_set.cuts) else f" of {len(scores)} of {len(data_set.cuts)}"
-    made.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
-    made.add_row("constant grey", "", *(_number(mean_over_sequences(scores, blank=True), name) for name in names))
+        return rows
+    rows.add_section()
+    whole = "" if len(scores) == len(data_set.time_ranges) else f" of {len(scores)} of {len(data_set.time_ranges)}"
+    rows.add_row(f"mean{whole}", "", *(_number(means, name) for name in names), style="bold")
+    rows.add_row("constant grey", "", *(_number(mean_over_sequences(scores, blank=True), name) for name in names))
     for method in compared:
         published = paper.RESULTS.get(method, {}).get(data_set.name)
         if published is not None:
-            made.add_row(f"paper: {method}", "", *(_number(published, name) for name in names), style="dim")
-    return made
+            rows.add_row(f"paper: {method}", "", *(_number(published, name) for name in names), style="dim")
+    return rows
 
 
 def _number(values: Mapping[str, float], name: str) -> str:
@@ -61,11 +60,13 @@ def _number(values: Mapping[str, float], name: str) -> str:
 
 
 def write_frames(file: Path, scores_by_set: Mapping[str, Sequence[SequenceScore]]) -> None:
-    """One line a window that was scored, CSV: data set, sequence, number of the window, its end in seconds of the
-    recording's clock, its events, and each metric.
+    """Write a CSV file with one line per scored window.
+
+    Its columns are data set, sequence, number of the window, its end in seconds of the recording's clock, its number of
+    events, and each metric.
 
     Raises:
-        UsageError: it cannot be written.
+        UsageError: the file cannot be written.
     """
     try:
         with file.open("w", newline="", encoding="utf-8") as out:
@@ -83,16 +84,16 @@ def write_frames(file: Path, scores_by_set: Mapping[str, Sequence[SequenceScore]
 
 
 def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One flat record a sequence, and one a data set (``sequence`` null) with the mean over its sequences.
+    """Return a flat record per sequence, and one per data set (``sequence`` None) with the mean over its sequences.
 
     Args:
         scores_by_set: scores by name of the data set.
-        settings: of the run; repeated in every record.
+        settings: settings of the run, repeated in every record.
     """
-    made: list[dict[str, Any]] = []
+    flat: list[dict[str, Any]] = []
     for name, scores in scores_by_set.items():
         for score in scores:
-            made.append(
+            flat.append(
                 {
                     "data_set": name,
                     "sequence": score.sequence,
@@ -106,7 +107,7 @@ def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapp
                     **settings,
                 }
             )
-        made.append(
+        flat.append(
             {
                 "data_set": name,
                 "sequence": None,
@@ -119,4 +120,4 @@ def records(scores_by_set: Mapping[str, Sequence[SequenceScore]], settings: Mapp
                 **settings,
             }
         )
-    return made
+    return flat

@@ -1,14 +1,15 @@
-"""Events of a window -> voxel grid: discrete, as V2V evaluates, or interpolated, as networks before it were trained.
+"""Convert the events of a window to a voxel grid: discrete, as V2V evaluates, or interpolated, as earlier networks do.
 
-With u the place of an event in its window, 0 at the first and just below 1 at the last, polarity p = +1 or -1, B bins:
+With u the position of an event in its window, 0 at the first and just below 1 at the last, polarity p = +1 or -1, and B
+bins:
 
     discrete       V[floor(B u), y, x]  += p
     interpolated   V[b, y, x]           += p max(0, 1 - |(B - 1) u - b|)        (Zhu et al. 2019)
 
-Published code takes u = tau / (D + delta) with tau in whole microseconds after the first event of the window and D
-that of the last; delta is 0.001 us (discrete) or 0.0001 us (interpolated). So bins span the events, not the time
-between the pictures. ``span="window"`` takes u = (t - start) / (end - start) instead: bins as in training, where they
-divide the time between two frames.
+Published code takes u = tau / (D + delta), where tau is in integer microseconds after the first event of the window and
+D is tau of the last; delta is 0.001 us (discrete) or 0.0001 us (interpolated). So bins span the events, not the time
+between the pictures. ``span="window"`` takes u = (t - start) / (end - start) instead: these are the bins of training,
+which divide the time between two frames.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ DELTA_US = {"discrete": 1e-3, "interpolated": 1e-4}
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Events of one window, in order of time.
+    """Hold the events of one window, sorted by time.
 
     Attributes:
         t: float64 [N], seconds.
@@ -47,17 +48,17 @@ class Events:
 
 @dataclass(frozen=True)
 class VoxelSettings:
-    """How windows become voxel grids.
+    """Hold how windows become voxel grids.
 
     Attributes:
         kind: "discrete" or "interpolated".
-        bins: of a grid.
+        bins: number of bins of a grid, at least 1.
         span: "events" (published) or "window", see the module.
-        truncate: cut times to whole microseconds, as the published code does, instead of rounding. Seconds in binary
-            are often just below the microsecond that they mean, which then counts as the one before.
+        truncate: truncate times to integer microseconds, as the published code does, instead of rounding. Binary
+            seconds are often just below the intended microsecond, so truncation gives the previous one.
 
     Raises:
-        UsageError: another kind or span, or no bins.
+        UsageError: the kind or span is unknown, or ``bins`` is below 1.
     """
 
     kind: Kind = "discrete"
@@ -78,18 +79,17 @@ class VoxelSettings:
 def voxel_grid(
     events: Events, size: tuple[int, int], settings: VoxelSettings, window: tuple[float, float]
 ) -> npt.NDArray[np.float32]:
-    """
+    """Convert the events of a window to a voxel grid.
+
     Args:
-        events: of the window.
         size: height and width of the sensor.
-        settings: the kind of voxels.
-        window: start and end in seconds; looked at where ``settings.span`` is "window".
+        window: start and end in seconds; used only if ``settings.span`` is "window".
 
     Returns:
         float32 [bins, H, W]; zeros without events.
 
     Raises:
-        UsageError: events outside the sensor.
+        UsageError: events lie outside the sensor.
     """
     height, width = size
     if not len(events):
@@ -110,15 +110,15 @@ def voxel_grid(
         lower = np.floor(position).astype(np.int64)
         upper_share = position - lower
         grid = _sum(lower, pixel, events.p * (1 - upper_share), settings.bins, size)
-        # One bin more: at the very end of the window the share above the last bin is 0.
+        # One extra bin for the end of the window, where the share above the last bin is 0.
         grid += _sum(lower + 1, pixel, events.p * upper_share, settings.bins + 1, size)[:-1]
     return grid.astype(np.float32)
 
 
 def _place(t: npt.NDArray[np.float64], settings: VoxelSettings, window: tuple[float, float]) -> npt.NDArray[np.float64]:
-    """u of each event, 0 <= u < 1."""
+    """Return u of each event, 0 <= u < 1."""
     if settings.span == "window":
-        # In whole microseconds as well: an event on an edge would otherwise fall on either side of it by rounding.
+        # In integer microseconds as well: otherwise rounding decides on which side of an edge an event falls.
         start, end = window
         tau, length = np.rint((t - start) * 1e6), max(1.0, np.rint((end - start) * 1e6))
         place: npt.NDArray[np.float64] = np.clip(tau / length, 0.0, np.nextafter(1.0, 0.0))

@@ -1,6 +1,6 @@
-"""How a recording is cut into windows: from picture to picture, by time, by number of events, or between flow fields.
+"""Divide a recording into windows: from picture to picture, by time, by number of events, or between flow fields.
 
-A window from picture to picture holds the events with t_i <= t < t_(i+1); its voxel grid is to become the later one.
+A window from picture to picture holds the events with t_i <= t < t_(i+1). Its target is the later picture.
 """
 
 from __future__ import annotations
@@ -10,35 +10,36 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
+from trainer.evaluation.data_sets import TimeRange
 from trainer.evaluation.readers import CLOCK_SLACK_SECONDS, EventWindow, Image, Recording
 from v2v_protocol.errors import UsageError
 
 
 def picture_windows(
-    recording: Recording, cut: tuple[float, float] | None = None, *, pictures: int = 1, later: int = 0
+    recording: Recording, time_range: TimeRange | None = None, *, pictures: int = 1, later: int = 0
 ) -> list[EventWindow]:
-    """Windows from picture to picture.
+    """Return the windows from picture to picture.
 
     Args:
-        cut: from which second on and before which, counted from the first picture of the recording; None takes
-            all pictures.
-        pictures: how many pictures on a window ends; those between are not looked at.
-        later: by how many pictures the cut begins and ends later.
+        time_range: (first, last) seconds from the first picture of the recording, the end excluded; None takes all
+            pictures.
+        pictures: number of pictures from one window's end to the next; those in between are ignored.
+        later: number of pictures by which both ends of the time range are moved later.
 
     Raises:
-        UsageError: fewer than two pictures in the cut, or the recording ends before the cut does; ``pictures`` not
-            above 0.
+        UsageError: fewer than two pictures in the time range, the recording ends before it does, or ``pictures`` is
+            below 1.
     """
     if pictures < 1:
         raise UsageError(f"windows of {pictures} pictures: give at least 1")
     if not recording.images:
-        raise UsageError(f"{recording.path} has no pictures to compare with; --fps reconstructs without")
-    found = _images_in(recording, cut, later)
+        raise UsageError(f"{recording.path} has no pictures to compare with; use --fps to reconstruct without them")
+    found = _images_in(recording, time_range, later)
     images = found[::pictures]
     if len(images) < 2:
+        within = "" if time_range is None else f" in the time range {time_range}"
         raise UsageError(
-            f"{recording.path}: {len(found)} pictures{'' if cut is None else f' in the cut {cut}'}; "
-            f"{pictures + 1} or more make a window"
+            f"{recording.path}: {len(found)} pictures{within}; a window needs at least {pictures + 1} of them"
         )
     return [
         EventWindow(one.event_index, max(one.event_index, other.event_index), one.time, other.time, other)
@@ -46,16 +47,16 @@ def picture_windows(
     ]
 
 
-def _images_in(recording: Recording, cut: tuple[float, float] | None, later: int = 0) -> list[Image]:
+def _images_in(recording: Recording, time_range: TimeRange | None, later: int = 0) -> list[Image]:
     images = list(recording.images)
-    if cut is not None and images:
-        start, end = cut
+    if time_range is not None and images:
+        start, end = time_range
         zero, last = images[0].time, images[-1].time - images[0].time
-        # A recording that was cut before would be cut twice. One that begins at 0 cannot be mistaken.
+        # A file that holds only the time range would be trimmed twice. If the range starts at 0, that is harmless.
         if start > 0 and last < end - CLOCK_SLACK_SECONDS:
             raise UsageError(
-                f"{recording.path} lasts {last:.2f} s, and the cut is from {start:g} to {end:g} s: if it is already "
-                "cut, give --cuts none"
+                f"{recording.path} lasts {last:.2f} s, and the time range is from {start:g} to {end:g} s: if the file "
+                "holds only that range, give --cuts none"
             )
         since = [image.time - zero for image in images]
         images = images[bisect.bisect_left(since, start) + later : bisect.bisect_left(since, end) + later]
@@ -63,39 +64,40 @@ def _images_in(recording: Recording, cut: tuple[float, float] | None, later: int
 
 
 def flow_windows(
-    recording: Recording, cut: tuple[float, float] | None = None, *, one_later: bool = False
+    recording: Recording, time_range: TimeRange | None = None, *, one_later: bool = False
 ) -> list[EventWindow]:
-    """Windows between the times of consecutive flow fields; the target is the field of the window.
+    """Return the windows between the times of consecutive flow fields. The target is the field of the window.
 
     Args:
-        cut: from which second on and before which, counted from the first picture of the recording, else its
-            first field.
-        one_later: pair each window with the field at its end, as V2V's released code does, not that at its start.
+        time_range: (first, last) seconds, the end excluded, counted from the first picture of the recording, or from
+            its first field if it has no pictures; None takes all fields.
+        one_later: pair each window with the field at its end, as V2V's released code does, not the one at its start.
 
     Raises:
-        UsageError: fewer than two fields in the cut.
+        UsageError: fewer than two fields in the time range.
     """
     fields = recording.flow_fields()
-    if cut is not None and fields:
+    if time_range is not None and fields:
         zero = recording.images[0].time if recording.images else fields[0].time
-        fields = [each for each in fields if cut[0] <= each.time - zero < cut[1]]
+        fields = [each for each in fields if time_range[0] <= each.time - zero < time_range[1]]
     if len(fields) < 2:
+        within = f" in the time range {time_range}" if time_range else ""
         raise UsageError(
-            f"{recording.path} has {len(fields)} flow fields{f' in the cut {cut}' if cut else ''}; two or more make a "
-            "window. v2v-convert takes MVSEC's from *_gt.hdf5 beside *_data.hdf5"
+            f"{recording.path} has {len(fields)} flow fields{within}; a window needs at least 2. v2v-convert reads "
+            "MVSEC's from *_gt.hdf5 beside *_data.hdf5"
         )
-    made = []
+    windows = []
     for one, other in itertools.pairwise(fields):
         start, stop = (bisect.bisect_left(recording.times, each.time) for each in (one, other))
-        made.append(EventWindow(start, max(start, stop), one.time, other.time, other if one_later else one))
-    return made
+        windows.append(EventWindow(start, max(start, stop), one.time, other.time, other if one_later else one))
+    return windows
 
 
 def regular_windows(recording: Recording, fps: float) -> list[EventWindow]:
-    """Windows of equal length from the first event to the last; without targets.
+    """Return windows of 1 / ``fps`` seconds from the first event to the last, without targets.
 
     Raises:
-        UsageError: ``fps`` not above 0, or the recording is shorter than one window.
+        UsageError: ``fps`` is not above 0, or the recording is shorter than one window.
     """
     if not fps > 0:
         raise UsageError(f"{fps:g} windows a second: give more than 0")
@@ -108,23 +110,21 @@ def regular_windows(recording: Recording, fps: float) -> list[EventWindow]:
     return [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]
 
 
-def windows_of_seconds(
-    recording: Recording, seconds: float, cut: tuple[float, float] | None = None
-) -> list[EventWindow]:
-    """Windows of equal length in time, without regard to pictures.
+def windows_of_seconds(recording: Recording, seconds: float, time_range: TimeRange | None = None) -> list[EventWindow]:
+    """Return windows of ``seconds`` each, independent of the pictures' times.
 
     A picture is scored against the window whose end is nearest to it, at most half a window away.
 
     Args:
-        seconds: of each.
-        cut: as for :func:`picture_windows`; None takes all events.
+        seconds: length of each window.
+        time_range: as for :func:`picture_windows`; None takes all events.
 
     Raises:
-        UsageError: ``seconds`` not above 0, or less than one window.
+        UsageError: ``seconds`` is not above 0, or the recording is shorter than one window.
     """
     if not seconds > 0:
         raise UsageError(f"windows of {seconds:g} s: give more than 0")
-    first, last, images = _scored_span(recording, cut)
+    first, last, images = _scored_span(recording, time_range)
     count = int((last - first) / seconds + 1e-9)
     if count < 1:
         raise UsageError(f"{recording.path}: {last - first:.3f} s are less than one window of {seconds:g} s")
@@ -135,19 +135,19 @@ def windows_of_seconds(
     )
 
 
-def windows_of_events(recording: Recording, events: int, cut: tuple[float, float] | None = None) -> list[EventWindow]:
-    """Windows of as many events each, which are short where much moves; the rest at the end is left out.
+def windows_of_events(recording: Recording, events: int, time_range: TimeRange | None = None) -> list[EventWindow]:
+    """Return windows of ``events`` events each. Fast motion makes them short; surplus events at the end are dropped.
 
     Args:
-        events: of each.
-        cut: as for :func:`picture_windows`; None takes all events.
+        events: number of events in each window.
+        time_range: as for :func:`picture_windows`; None takes all events.
 
     Raises:
-        UsageError: ``events`` not above 0, or less than one window.
+        UsageError: ``events`` is not above 0, or the recording has fewer events than one window.
     """
     if events < 1:
         raise UsageError(f"windows of {events} events: give at least 1")
-    first, last, images = _scored_span(recording, cut)
+    first, last, images = _scored_span(recording, time_range)
     begin, end = bisect.bisect_left(recording.times, first), bisect.bisect_right(recording.times, last)
     if end - begin < events:
         raise UsageError(f"{recording.path}: {end - begin} events are less than one window of {events}")
@@ -163,18 +163,20 @@ def windows_of_events(recording: Recording, events: int, cut: tuple[float, float
     )
 
 
-def _scored_span(recording: Recording, cut: tuple[float, float] | None) -> tuple[float, float, list[Image]]:
+def _scored_span(recording: Recording, time_range: TimeRange | None) -> tuple[float, float, list[Image]]:
     first, last = recording.span
-    images = _images_in(recording, cut)
-    if cut is not None and recording.images:
+    images = _images_in(recording, time_range)
+    if time_range is not None and recording.images:
         zero = recording.images[0].time
-        first, last = max(first, zero + cut[0]), min(last, zero + cut[1])
+        first, last = max(first, zero + time_range[0]), min(last, zero + time_range[1])
     return first, last, images
 
 
 def _with_targets(windows: Sequence[EventWindow], images: Sequence[Image]) -> list[EventWindow]:
-    """Each picture is the target of the window whose end is nearest to it, if that is at most half a window away;
-    of several for one window, the nearest."""
+    """Make each picture the target of the window whose end is nearest to it, at most half a window away.
+
+    If several pictures have the same window, the nearest becomes its target.
+    """
     ends = [window.end for window in windows]
     nearest: dict[int, tuple[float, Image]] = {}
     for image in images:

@@ -1,6 +1,6 @@
-"""The ImageNet networks under LPIPS, up to the last layer it looks at: VGG16, AlexNet, SqueezeNet 1.1.
+"""Define LPIPS's ImageNet networks up to the last layer that it uses: VGG16, AlexNet, SqueezeNet 1.1.
 
-Layers stand at the positions that they have in torchvision's ``features``, so that its weight files fit.
+Layers have the positions of torchvision's ``features``, so that its weight files fit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block: 1x1 to few channels, then 1x1 and 3x3 side by side (Iandola et al. 2016)."""
+    """Apply SqueezeNet's block: 1x1 to few channels, then 1x1 and 3x3 in parallel (Iandola et al. 2016)."""
 
     def __init__(self, inputs: int, squeeze: int, expand: int) -> None:
         super().__init__()
@@ -63,14 +63,14 @@ def _squeezenet() -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class Backbone:
-    """One of the networks that LPIPS has heads for.
+    """Describe a network for which LPIPS has heads.
 
     Attributes:
-        layers: makes the layers, untrained.
+        layers: creates the layers, untrained.
         taps: positions of the layers whose output LPIPS compares.
-        channels: channels of each of them.
-        smallest_px: the smallest height and width that reach the last layer.
-        weights_from: where a user gets torchvision's weights.
+        channels: number of channels at each tap.
+        smallest_px: the smallest height and width for which the last layer has an output.
+        weights_from: URL of torchvision's weights.
     """
 
     layers: Callable[[], list[nn.Module]]
@@ -103,4 +103,4 @@ BACKBONES = {
         weights_from="https://download.pytorch.org/models/squeezenet1_1-b8a52dc0.pth",
     ),
 }
-"""By the name that LPIPS gives them."""
+"""Networks by their names in LPIPS."""

@@ -1,13 +1,13 @@
-"""LPIPS v0.1: distance of two pictures in the features of an ImageNet network (Zhang et al., CVPR 2018).
+"""Compute LPIPS v0.1, the distance of two pictures in the features of an ImageNet network (Zhang et al., CVPR 2018).
 
 Features of both pictures are taken after several ReLUs, divided by their length over the channels, subtracted and
-squared; a trained non-negative weight per channel makes one number of them, averaged over the picture and added over
+squared. Trained non-negative weights sum them over the channels; the sum is averaged over the picture and added over
 the layers:
 
     d(a, b) = sum_l mean_(h,w) sum_c w_lc (a_l / (|a_l| + 1e-10) - b_l / (|b_l| + 1e-10))_c^2
 
-Nothing is downloaded: the weights of the network and of the heads are files that the caller has. V2V trains with VGG16
-and evaluates with AlexNet.
+The weights of the network and of the heads are files of the caller; they are not downloaded. V2V trains with VGG16 and
+evaluates with AlexNet.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ SMALLEST_SQUARE = 1e-30
 
 
 def unit_length(features: Tensor) -> Tensor:
-    """Features divided by their length over the channels, as LPIPS defines it; zero stays zero.
+    """Divide features by their length over the channels, as LPIPS defines it. Zero stays zero.
 
-    The published |f| = sqrt(sum f^2) has an infinite derivative where all channels are 0, and infinity times the 0 of
-    the squares is NaN: one such position, common after a ReLU, spoils the whole gradient. SMALLEST_SQUARE under the
-    root makes that derivative finite. It is too small to show in any value: beside LENGTH_FLOOR its root is 1e-5 of
-    the divisor at most.
+    The published |f| = sqrt(sum f^2) has an infinite derivative where all channels are 0, and infinity times the
+    squares' derivative of 0 is NaN. A single such position, common after a ReLU, makes the whole gradient NaN.
+    SMALLEST_SQUARE under the root makes the derivative finite. It is too small to change values: its root is at most
+    1e-5 of the divisor, which includes LENGTH_FLOOR.
     """
     length = (features.square().sum(dim=1, keepdim=True) + SMALLEST_SQUARE).sqrt()
     return features / (length + LENGTH_FLOOR)
 
 
 def _layer_distance(first: Tensor, second: Tensor, head: Tensor) -> Tensor:
-    """[N, C, H, W] features of both pictures and [C] weights -> [N]."""
+    """Return the distance [N] from features [N, C, H, W] of both pictures and weights [C]."""
     difference = unit_length(first.to(head.dtype)) - unit_length(second.to(head.dtype))
     return (difference.square() * head[:, None, None]).sum(dim=1).mean(dim=(1, 2))
 
 
 class LPIPS(nn.Module):
-    """The metric, frozen: no parameter of it is ever trained, and gradients reach only the prediction.
+    """Compute the metric with frozen parameters. Gradients reach only the prediction.
+
+    The constructor leaves the weights at their random initial values; use :meth:`from_files`.
 
     Args:
         net: "vgg", "alex" or "squeeze".
 
-    The weights are whatever the layers start with; use :meth:`from_files`.
-
     Raises:
-        UsageError: another network.
+        UsageError: ``net`` is another name.
     """
 
     shift: Tensor
@@ -80,15 +80,16 @@ class LPIPS(nn.Module):
 
     @classmethod
     def from_files(cls, net: str, backbone: str | Path, heads: str | Path) -> LPIPS:
-        """The metric with its published weights.
+        """Create the metric with its published weights.
 
         Args:
             net: "vgg", "alex" or "squeeze".
-            backbone: torchvision's state dict of that network, whole (the classifier is left out) or ``features`` only.
-            heads: the state dict ``lin0.model.1.weight`` ... of LPIPS v0.1.
+            backbone: file with torchvision's state dict of that network, whole (its classifier is ignored) or
+                ``features`` only.
+            heads: file with the state dict ``lin0.model.1.weight`` ... of LPIPS v0.1.
 
         Raises:
-            UsageError: a file is missing or is not what it should be; the message says where to get the right one.
+            UsageError: a file is missing or has other tensors; the message says where to get the right one.
         """
         metric = cls(net)
         origin = metric.backbone.weights_from
@@ -109,7 +110,7 @@ class LPIPS(nn.Module):
         return metric
 
     def _taps(self, pictures: Tensor) -> list[Tensor]:
-        x = (2 * pictures - 1 - self.shift) / self.scale  # one channel becomes three
+        x = (2 * pictures - 1 - self.shift) / self.scale  # broadcasts one channel to three
         taps = []
         for position, layer in enumerate(self.features):
             x = layer(x)
@@ -118,18 +119,19 @@ class LPIPS(nn.Module):
         return taps
 
     def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Distance of each picture to its target.
+        """Return the distance of each picture to its target.
 
         Args:
-            prediction: [..., C, H, W] in 0 .. 1 (not enforced), C = 1 (grey, repeated) or 3; any number of leading
+            prediction: [..., C, H, W] in 0 .. 1 (not enforced), C = 1 (grey, repeated) or 3, with any number of leading
                 dimensions: [B, T, 1, H, W] is one pass over B*T pictures.
             target: same shape; gets no gradient.
 
         Returns:
-            [...], one distance per picture. Under autocast the features are half precision, their comparison is not.
+            [...], one distance per picture. Under autocast the features are in half precision, but their comparison is
+            in full precision.
 
         Raises:
-            UsageError: shapes differ, or pictures too small for the network.
+            UsageError: the shapes differ, or the pictures are too small for the network.
         """
         leading, (channels, height, width) = prediction.shape[:-3], prediction.shape[-3:]
         if prediction.shape != target.shape or channels not in (1, 3):
@@ -145,7 +147,7 @@ class LPIPS(nn.Module):
         with torch.autocast(prediction.device.type, enabled=False):
             distance = torch.zeros((), dtype=self.shift.dtype, device=prediction.device)
             for layer, (first, second) in enumerate(zip(taps, target_taps, strict=True)):
-                # Recomputed in the backward pass: what it would save is several times the features themselves.
+                # Recomputed in the backward pass: its saved tensors would be several times the size of the features.
                 distance = distance + checkpoint(
                     _layer_distance,
                     first,
@@ -159,7 +161,7 @@ class LPIPS(nn.Module):
 
 def _read(path: str | Path, what: str, origin: str) -> dict[str, Tensor]:
     if not Path(path).is_file():
-        raise UsageError(f"LPIPS {what}: no file {path}. Nothing is downloaded; get it from {origin}")
+        raise UsageError(f"LPIPS {what}: no file {path}. It is not downloaded automatically; get it from {origin}")
     return read_tensors(path)
 
 

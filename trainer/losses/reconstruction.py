@@ -1,4 +1,4 @@
-"""The training loss of the reconstruction networks: LPIPS + L1 + temporal consistency."""
+"""Compute the training loss of the reconstruction networks: LPIPS + L1 + temporal consistency."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from v2v_protocol.errors import UsageError
 
 
 def l1_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference over everything, in float32 at least.
+    """Return the mean absolute difference over all elements, in float32 or wider.
 
     Raises:
-        UsageError: shapes differ (broadcasting would hide it).
+        UsageError: the shapes differ; broadcasting would hide that.
     """
     if prediction.shape != target.shape:
         raise UsageError(f"prediction {list(prediction.shape)} and target {list(target.shape)}: give equal shapes")
@@ -23,15 +23,15 @@ def l1_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 class ReconstructionLoss(nn.Module):
-    """Weighted sum of the terms whose weight is not 0; the others cost nothing.
+    """Sum the weighted terms. Terms with weight 0 are not computed.
 
     Args:
-        lpips: the metric, where ``lpips_weight`` is not 0.
-        temporal: the loss, where ``temporal_weight`` is not 0.
-        lpips_weight, l1_weight, temporal_weight: 1 each in the paper.
+        lpips: the metric; required if ``lpips_weight`` is not 0.
+        temporal: the loss; required if ``temporal_weight`` is not 0.
+        lpips_weight, l1_weight, temporal_weight: 0 or more; 1 each in the paper.
 
     Raises:
-        UsageError: a negative weight, none at all, or a weighted term that is missing.
+        UsageError: a weight is negative, all are 0, or a weighted term is missing.
     """
 
     def __init__(
@@ -58,18 +58,19 @@ class ReconstructionLoss(nn.Module):
         self.temporal_weight = temporal_weight
 
     def forward(self, prediction: Tensor, target: Tensor, flow: Tensor | None = None) -> dict[str, Tensor]:
-        """
+        """Compute the terms and their sum.
+
         Args:
             prediction: [B, T, 1, H, W], not clamped.
             target: pictures in 0 .. 1, same shape.
             flow: see :meth:`TemporalConsistency.forward`; only needed with ``temporal_weight``.
 
         Returns:
-            The weighted terms by name ("lpips", "l1", "temporal", as far as they are on), and their sum as "total". The
-            terms are detached, ``total`` is what to differentiate; nothing is copied to the host.
+            The weighted terms by name ("lpips", "l1", "temporal", those with a weight), and their sum as "total". Only
+            ``total`` has a gradient; the terms are detached. All stay on the device.
 
         Raises:
-            UsageError: shapes that do not fit together, or flow missing.
+            UsageError: the shapes do not match, or flow is missing.
         """
         terms: dict[str, Tensor] = {}
         if self.lpips is not None and self.lpips_weight:

@@ -1,4 +1,4 @@
-"""Temporal consistency: what moves with the flow keeps its brightness from one reconstruction to the next.
+"""Compute temporal consistency: points that move with the flow keep their brightness between reconstructions.
 
 For the step from t-1 to t, with pictures I (true) and P (reconstructed), and W the warp onto the grid of t:
 
@@ -8,9 +8,9 @@ For the step from t-1 to t, with pictures I (true) and P (reconstructed), and W 
 (Lai et al., ECCV 2018; as in E2VID, E2VID+ and V2V.) M hides pixels whose true brightness does not follow the flow:
 occlusions, and errors of the flow. Gradients reach both P_t and P_(t-1).
 
-The published loss departs from this in three ways, kept behind ``as_published``: negated forward flow stands in for
-backward flow; pixels that come from outside the picture count (as black) unless M happens to hide them; and P_(t-1) is
-clamped to 0 .. 255, which on pictures in 0 .. 1 only removes its negative values.
+The published loss differs in three ways, which ``as_published`` selects. It uses negated forward flow in place of
+backward flow. Pixels that come from outside the picture count (as black) unless M happens to hide them. P_(t-1) is
+clamped to 0 .. 255, which on pictures in 0 .. 1 only removes negative values.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ ALPHA = 50.0
 
 
 class TemporalConsistency(nn.Module):
-    """The loss over the steps ``first_step`` .. T-1 of a clip, all at once.
+    """Compute the loss over the steps ``first_step`` .. T-1 of a clip in one pass.
 
     Args:
-        first_step: the first t that counts (L0), at least 1. The recurrent networks need some steps to settle.
-        rule: how the steps are averaged. "half": their sum divided by T, so that the uncounted steps weigh in as zeros
-            (the paper's; at T = 40 and L0 = 20 it is half of the other). "full": the mean over the counted steps.
+        first_step: the first t that counts (L0), at least 1. Recurrent networks need some steps to settle.
+        rule: how the steps are averaged. "half" divides their sum by T, so uncounted steps count as zeros (the paper's
+            rule; at T = 40 and L0 = 20 it gives half of the other). "full" is the mean over the counted steps.
         as_published: see the module; ``flow`` is then the forward flow.
 
     Raises:
-        UsageError: ``first_step`` below 1 or an unknown rule.
+        UsageError: ``first_step`` is below 1, or the rule is unknown.
     """
 
     def __init__(
@@ -53,7 +53,8 @@ class TemporalConsistency(nn.Module):
         self.as_published = as_published
 
     def forward(self, prediction: Tensor, target: Tensor, flow: Tensor) -> Tensor:
-        """
+        """Compute the loss of a batch of clips.
+
         Args:
             prediction: [B, T, 1, H, W].
             target: true pictures in 0 .. 1, same shape.
@@ -65,7 +66,7 @@ class TemporalConsistency(nn.Module):
             A scalar, float32 or wider.
 
         Raises:
-            UsageError: shapes that do not fit together, or no step left to count.
+            UsageError: the shapes do not match, or no step is left to count.
         """
         if prediction.ndim != 5 or prediction.shape != target.shape:
             raise UsageError(f"prediction {list(prediction.shape)}, target {list(target.shape)}: both [B, T, 1, H, W]")

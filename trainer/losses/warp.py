@@ -1,4 +1,4 @@
-"""Pictures moved by a displacement field.
+"""Warp pictures by a displacement field.
 
     warp(I, d)(x) = I(x + d(x))
 
@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 
 
 def sampling_points(displacement: Tensor) -> tuple[Tensor, Tensor]:
-    """Where each pixel of the result looks: (x, y) in px, each [N, H, W], for a displacement [N, 2, H, W]."""
+    """Return the position (x, y) in px, each [N, H, W], that each pixel samples for a displacement [N, 2, H, W]."""
     height, width = displacement.shape[-2:]
     columns = torch.arange(width, device=displacement.device, dtype=displacement.dtype)
     rows = torch.arange(height, device=displacement.device, dtype=displacement.dtype)
@@ -27,7 +27,7 @@ def sampling_points(displacement: Tensor) -> tuple[Tensor, Tensor]:
 def warp(pictures: Tensor, displacement: Tensor) -> Tensor:
     """Sample each picture at displaced positions: bilinear between pixel centres, 0 outside the picture.
 
-    Computed in float32 at least, whatever autocast says: half-precision coordinates are off by whole pixels.
+    It computes in float32 or wider, even under autocast: half-precision coordinates are off by whole pixels.
 
     Args:
         pictures: [N, C, H, W].
@@ -37,7 +37,7 @@ def warp(pictures: Tensor, displacement: Tensor) -> Tensor:
         [N, C, H, W]; gradients flow to both arguments.
 
     Raises:
-        UsageError: shapes that do not fit together.
+        UsageError: the shapes do not match.
     """
     count, _, height, width = pictures.shape
     if displacement.shape != (count, 2, height, width):
@@ -54,7 +54,7 @@ def warp(pictures: Tensor, displacement: Tensor) -> Tensor:
 
 
 def inside(displacement: Tensor) -> Tensor:
-    """Which pixels of the result look at a position within the picture: bool [N, 1, H, W]."""
+    """Return which pixels of the result sample a position inside the picture: bool [N, 1, H, W]."""
     height, width = displacement.shape[-2:]
     x, y = sampling_points(displacement.to(torch.promote_types(displacement.dtype, torch.float32)))
     return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).unsqueeze(1)

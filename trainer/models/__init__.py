@@ -1,4 +1,4 @@
-"""The networks, one a file. Every one takes [B, T, bins, H, W] voxel grids and gives a sequence of pictures or flow."""
+"""Define the networks, one per file. Each maps voxel grids [B, T, bins, H, W] to a sequence of pictures or flow."""
 
 from trainer.models.e2vid import E2VID
 from trainer.models.eraft import ERAFT
@@ -16,7 +16,7 @@ NETWORKS: dict[str, type[VoxelNetwork]] = {
     "evflownet": EVFlowNet,
     "eraft": ERAFT,
 }
-"""Networks by the name that a configuration file gives them."""
+"""Networks by their names in configuration files."""
 
 __all__ = [
     "E2VID",

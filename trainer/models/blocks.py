@@ -1,11 +1,11 @@
-"""Layers of the recurrent reconstruction networks, unrolled over a whole sequence at once.
+"""Define the layers of the recurrent reconstruction networks, which process a whole sequence at once.
 
-Only the recurrence itself has to walk through time. Everything else (convolutions, residual blocks, upsampling, and the
-half of every gate convolution that sees the input) has no memory, so it runs once on all T x B frames. This is the same
-arithmetic as a loop over t with one large convolution in place of T small ones.
+Only the recurrence itself loops over time. Everything else (convolutions, residual blocks, upsampling, and the half of
+every gate convolution that sees the input) has no memory, so it runs once on all T x B frames. The arithmetic is that
+of a loop over t, with one large convolution in place of T small ones.
 
 Shapes: a *sequence* is [T*B, C, H, W], time-major (frame t of batch entry b at row t*B + b), so that the frames of one
-time step are contiguous, in either memory format. Attribute names are those of the published state dicts.
+time step are contiguous in either memory format. Attribute names are those of the published state dicts.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torch.nn import functional as F
 
 
 class LSTMState(NamedTuple):
-    """Memory of a :class:`ConvLSTM`: ``hidden`` in the dtype of the convolutions, ``cell`` in float32 or wider."""
+    """Hold the memory of a :class:`ConvLSTM`: ``hidden`` in the convolutions' dtype, ``cell`` in float32 or wider."""
 
     hidden: Tensor
     cell: Tensor
 
 
 class ConvLayer(nn.Module):
-    """Convolution of odd kernel size with "same" padding, optional batch norm, optional ReLU."""
+    """Apply a convolution of odd kernel size with "same" padding, optional batch norm, optional ReLU."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel_size: int, *, stride: int = 1, relu: bool = True, norm: bool = False
@@ -46,14 +46,14 @@ class ConvLayer(nn.Module):
 
 
 class UpsampleConvLayer(ConvLayer):
-    """Bilinear upsampling by 2 (``align_corners=False``), then :class:`ConvLayer`."""
+    """Apply bilinear upsampling by 2 (``align_corners=False``), then :class:`ConvLayer`."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False))
 
 
 class TransposedConvLayer(nn.Module):
-    """Transposed convolution that doubles height and width, optional batch norm, ReLU."""
+    """Apply a transposed convolution that doubles height and width, optional batch norm, ReLU."""
 
     def __init__(self, inputs: int, outputs: int, kernel_size: int, *, norm: bool = False) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class TransposedConvLayer(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """ReLU(x + conv3(ReLU(conv3(x)))), with optional batch norm after each convolution."""
+    """Compute ReLU(x + conv3(ReLU(conv3(x)))), with optional batch norm after each convolution."""
 
     def __init__(self, channels: int, *, norm: bool = False) -> None:
         super().__init__()
@@ -89,10 +89,10 @@ class ResidualBlock(nn.Module):
 
 
 def _split(weight: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """The part of a convolution that sees the input, and the part that sees the hidden state.
+    """Split a convolution's weight into the part for the input and the part for the hidden state.
 
-    Each is made contiguous once, here, in the memory format of the whole: the convolution of every time step would
-    otherwise copy it again.
+    Both are made contiguous here, in the memory format of the whole, because otherwise the convolution of every time
+    step would copy them.
     """
     last = weight.is_contiguous(memory_format=torch.channels_last) and not weight.is_contiguous()
     memory_format = torch.channels_last if last else torch.contiguous_format
@@ -101,16 +101,16 @@ def _split(weight: Tensor, channels: int) -> tuple[Tensor, Tensor]:
 
 
 def _by_step(sequence: Tensor, steps: int) -> tuple[Tensor, ...]:
-    """[T*B, C, H, W] -> T views [B, C, H, W]."""
-    # Not T indexings: the gradient of one unbind is a single stack, theirs a sum of T tensors of mostly zeros.
+    """Split [T*B, C, H, W] into T views [B, C, H, W]."""
+    # One unbind, not T indexings: its gradient is a single stack, theirs would be a sum of T tensors of mostly zeros.
     return torch.unflatten(sequence, 0, (steps, -1)).unbind(0)
 
 
 class Loop:
-    """What a module has that does the same again and again: over time, or over improvements of an estimate.
+    """Let a module compile one iteration of its loop over time, or over refinements of an estimate.
 
-    One turn of the loop can be compiled by itself, which takes seconds where the whole loop, unrolled, takes minutes.
-    A subclass gives ``_turn``.
+    Compiling one iteration takes seconds; compiling the unrolled loop takes minutes. A subclass implements ``_turn``,
+    one iteration.
     """
 
     training: bool
@@ -119,16 +119,16 @@ class Loop:
 
     @property
     def turn(self) -> Callable[..., Any]:
-        """``_turn``, or in training what :meth:`compile_turn` made of it."""
+        """Return ``_turn``, or in training its compiled form if :meth:`compile_turn` was called."""
         return self._compiled if self._compiled is not None and self.training else self._turn
 
     def compile_turn(self) -> None:
-        """From now on :attr:`turn` is compiled in training, when it is first called with tensors of new shapes."""
+        """Compile :attr:`turn` in training. It is compiled when it is first called with tensors of new shapes."""
         self._compiled = torch.compile(self._turn, dynamic=False, fullgraph=True)
 
 
 class ConvLSTM(Loop, nn.Module):
-    """Convolutional LSTM, kernel 3, hidden channels = input channels; gate order in, forget, out, candidate.
+    """Apply a convolutional LSTM: kernel 3, hidden channels = input channels; gate order in, forget, out, candidate.
 
     c_t = sigmoid(f) c_(t-1) + sigmoid(i) tanh(g),    h_t = sigmoid(o) tanh(c_t)     (Shi et al. 2015, no peepholes)
     """
@@ -139,7 +139,8 @@ class ConvLSTM(Loop, nn.Module):
         self.Gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1)
 
     def forward(self, x: Tensor, state: LSTMState | None, steps: int) -> tuple[Tensor, LSTMState]:
-        """
+        """Run the recurrence over a sequence.
+
         Args:
             x: sequence [T*B, C, H, W].
             state: memory before the first step, each [B, C, H, W]; None means zeros.
@@ -164,7 +165,7 @@ class ConvLSTM(Loop, nn.Module):
         channels = gates.shape[1] // 4
         switches, candidate = torch.split(gates, [3 * channels, channels], dim=1)
         admit, keep, emit = switches.sigmoid().chunk(3, dim=1)
-        # In float32 even under autocast: the cell is a running sum, and a bfloat16 sum forgets small increments.
+        # In float32 even under autocast: the cell is a running sum, and a bfloat16 sum loses small increments.
         cell = (admit * candidate.tanh()).to(torch.promote_types(gates.dtype, torch.float32))
         if state is not None:
             cell = cell + keep * state.cell
@@ -172,7 +173,7 @@ class ConvLSTM(Loop, nn.Module):
 
 
 class ConvGRU(Loop, nn.Module):
-    """Convolutional GRU, kernel 3, hidden channels = input channels (Ballas et al. 2016).
+    """Apply a convolutional GRU: kernel 3, hidden channels = input channels (Ballas et al. 2016).
 
     u, r = sigmoid(conv([x, h])),    n = tanh(conv([x, r h])),    h' = (1 - u) h + u n
     """
@@ -188,7 +189,7 @@ class ConvGRU(Loop, nn.Module):
             nn.init.zeros_(gate.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor, state: Tensor | None, steps: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ConvLSTM.forward`; the state is the hidden state alone, in float32 or wider."""
+        """Run the recurrence as :meth:`ConvLSTM.forward`. The state is the hidden state alone, in float32 or wider."""
         gates = (self.update_gate, self.reset_gate, self.out_gate)
         to_input, to_hidden = zip(*(_split(gate.weight, self.channels) for gate in gates), strict=True)
         bias = torch.cat([gate.bias for gate in gates])  # type: ignore[misc]
@@ -215,7 +216,7 @@ class ConvGRU(Loop, nn.Module):
 
 
 class RecurrentLayer(nn.Module):
-    """A layer without memory, followed by a recurrent one."""
+    """Apply a layer without memory, then a recurrent one."""
 
     def __init__(self, conv: nn.Module, recurrent_block: nn.Module) -> None:
         super().__init__()
@@ -223,6 +224,6 @@ class RecurrentLayer(nn.Module):
         self.recurrent_block = recurrent_block
 
     def forward(self, x: Tensor, state: Any, steps: int) -> tuple[Tensor, Any]:
-        """As :meth:`ConvLSTM.forward`, with the state of the recurrent block."""
+        """Run both layers as :meth:`ConvLSTM.forward`, with the state of the recurrent block."""
         hiddens, state = self.recurrent_block(self.conv(x), state, steps)
         return hiddens, state

@@ -1,4 +1,4 @@
-"""E2VID: a recurrent U-Net from voxel grids to pictures (Rebecq et al., CVPR 2019; layers as in E2VID+ and V2V).
+"""Define E2VID, a recurrent U-Net from voxel grids to pictures (Rebecq et al., CVPR 2019; layers of E2VID+ and V2V).
 
 head      conv5, ReLU                                   5 -> 32
 encoder i conv5 stride 2, ReLU, ConvLSTM               32 -> 64 -> 128 -> 256,  1/2, 1/4, 1/8 of the size
@@ -36,7 +36,7 @@ PREDICTION = re.compile(r"unetrecurrent\.pred\.conv2d\.(weight|bias)")
 
 
 class UNetRecurrent(nn.Module):
-    """U-Net with a :class:`ConvLSTM` in every encoder and skip connections that add."""
+    """Apply a U-Net with a :class:`ConvLSTM` in every encoder and additive skip connections."""
 
     def __init__(
         self, bins: int, base_channels: int, encoders: int, residual_blocks: int, *, norm: bool, transposed: bool
@@ -58,7 +58,7 @@ class UNetRecurrent(nn.Module):
     def encode(
         self, x: Tensor, states: Sequence[LSTMState | None] | None, steps: int
     ) -> tuple[Tensor, list[Tensor], tuple[LSTMState, ...]]:
-        """Everything in front of the decoders.
+        """Run the head, the encoders and the residual blocks.
 
         Args:
             x: [T*B, bins, H, W].
@@ -66,7 +66,7 @@ class UNetRecurrent(nn.Module):
             steps: T.
 
         Returns:
-            The output of the residual blocks; what the decoders add (head, then the hidden states of the encoders); the
+            The output of the residual blocks; the skip connections (head, then the hidden states of the encoders); the
             states after the last step.
         """
         x = self.head(x)
@@ -82,7 +82,7 @@ class UNetRecurrent(nn.Module):
     def forward(
         self, x: Tensor, states: Sequence[LSTMState | None] | None, steps: int
     ) -> tuple[Tensor, tuple[LSTMState, ...]]:
-        """[T*B, bins, H, W] and one state per encoder -> [T*B, 1, H, W] and the states after the last step."""
+        """Map [T*B, bins, H, W] and one state per encoder to [T*B, 1, H, W] and the states after the last step."""
         x, skips, after = self.encode(x, states, steps)
         for decoder in self.decoders:
             x = decoder(x + skips.pop())
@@ -90,7 +90,7 @@ class UNetRecurrent(nn.Module):
 
 
 class E2VID(VoxelNetwork):
-    """Recurrent E2VID.
+    """Reconstruct pictures with recurrent E2VID.
 
     Args:
         bins: bins of a voxel grid.
@@ -104,7 +104,7 @@ class E2VID(VoxelNetwork):
         padding: see :class:`VoxelNetwork`; "centred" for the first release and E2VID+.
 
     Raises:
-        UsageError: a setting that is none of these.
+        UsageError: a setting has another value, or a size is too small.
     """
 
     signature: ClassVar[tuple[str, ...]] = (
@@ -133,8 +133,11 @@ class E2VID(VoxelNetwork):
             if value not in known:
                 raise UsageError(f"E2VID {name} = {value!r}: give one of {', '.join(known)}")
         if min(bins, base_channels, encoders) < 1 or residual_blocks < 0:
-            raise UsageError("E2VID bins, base_channels and encoders are at least 1, residual_blocks at least 0")
-        # V2V pads to 16, although three encoders ask for 8 only: published figures were made with this padding.
+            raise UsageError(
+                f"E2VID bins = {bins}, base_channels = {base_channels}, encoders = {encoders}, residual_blocks = "
+                f"{residual_blocks}: give at least 1 of the first three, and 0 or more residual blocks"
+            )
+        # V2V pads to 16, although three encoders need only 8: its published results use this padding.
         multiple = max(16, 2**encoders) if padding == "bottom-right" else 2**encoders
         super().__init__(bins=bins, size_multiple=multiple, normalizes=normalize_voxels, padding=padding)
         self.unetrecurrent = UNetRecurrent(
@@ -150,26 +153,26 @@ class E2VID(VoxelNetwork):
     def unroll(
         self, x: Tensor, state: tuple[LSTMState, ...] | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, tuple[LSTMState, ...]]:
-        """See :meth:`VoxelNetwork.unroll`; one :class:`LSTMState` per encoder."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`. The state is one :class:`LSTMState` per encoder."""
         pictures, after = self.unetrecurrent(x, state, steps)
         return torch.sigmoid(pictures) if self.sigmoid else pictures, after
 
     @classmethod
     def own_name(cls, name: str) -> str:
-        """E2VID+ calls itself ``unetflow``."""
+        """Replace E2VID+'s prefix ``unetflow``."""
         return re.sub(r"^unetflow\.", "unetrecurrent.", name)
 
     @classmethod
     def own_tensor(cls, name: str, tensor: Tensor) -> Tensor:
-        """E2VID+ also predicts flow; the picture is channel 0."""
+        """Keep channel 0, the picture, of E2VID+'s prediction layer, which also predicts flow."""
         return tensor[:1].clone() if PREDICTION.fullmatch(name) and len(tensor) == 3 else tensor
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Sizes, norm and upsampling from the tensors; the sigmoid of the first release from the settings."""
+        """Derive sizes, norm and upsampling from the tensors, and the first release's sigmoid from the settings."""
         for name, built in (("skip_type", "sum"), ("recurrent_block_type", "convlstm")):
             if settings.get(name, built) != built:
-                raise UsageError(f"E2VID with {name} = {settings[name]!r} is not built here, only {built!r}")
+                raise UsageError(f"E2VID with {name} = {settings[name]!r} is not implemented, only {built!r}")
         head = state["unetrecurrent.head.conv2d.weight"]
         sigmoid = settings.get("final_activation") == "sigmoid"
         return {

@@ -1,8 +1,8 @@
-"""E-RAFT: RAFT between the voxel grids of two windows (Gehrig et al., 3DV 2021).
+"""Define E-RAFT: RAFT between the voxel grids of two windows (Gehrig et al., 3DV 2021).
 
-It is RAFT, large (:mod:`trainer.models.raft`), with three changes: pictures are voxel grids; the context is that of the
-later grid, whose flow it is; and the flow of the window before, carried along by itself, is where the search begins.
-So a sequence of T outputs takes T + 1 grids.
+It is the large RAFT (:mod:`trainer.models.raft`) with three changes. Pictures are voxel grids. The context comes from
+the later grid, because the flow is that of its window. The search starts from the previous window's flow, propagated
+along itself. So a sequence of T outputs takes T + 1 grids.
 
 5,270,080 parameters with 5 bins, 5,332,800 with 15.
 """
@@ -22,25 +22,25 @@ from v2v_protocol.errors import UsageError
 UPDATES = 12
 SIZE_MULTIPLE_PX = 32
 SMALLEST_SIDE_PX = 64
-"""The coarsest of four correlations has a pixel then."""
+"""With this size the coarsest of four correlations has one pixel."""
 
 
 class ERAFTState(NamedTuple):
-    """Memory: the last voxel grid as the network saw it [B, bins, H, W], and the first flow [B, 2, H / 8, W / 8]."""
+    """Hold the last voxel grid after padding [B, bins, H, W], and the flow to start from [B, 2, H / 8, W / 8]."""
 
     voxel: Tensor
     start: Tensor | None
 
 
 class ERAFT(VoxelNetwork):
-    """E-RAFT. In training it gives the flow after each of 12 updates, otherwise that after the last one.
+    """Estimate flow with E-RAFT. In training it returns the flow after each of 12 updates, otherwise after the last.
 
     Args:
         bins: bins of a voxel grid; the published network has 15.
-        warm_start: begin where the window before leads, else with no flow.
-        context_by_window: in training, batch norm of the context has the statistics of each window by itself, as in the
-            published code, instead of those of all windows of the batch.
-        normalize_voxels: see :class:`VoxelNetwork`; the published network was trained so.
+        warm_start: start from the propagated flow of the previous window, else from zero flow.
+        context_by_window: in training, compute the batch norm statistics of the context for each window separately, as
+            the published code does, instead of over all windows of the batch.
+        normalize_voxels: see :class:`VoxelNetwork`; True for the published network.
         padding: see :class:`VoxelNetwork`.
     """
 
@@ -67,11 +67,11 @@ class ERAFT(VoxelNetwork):
     def unroll(
         self, x: Tensor, state: ERAFTState | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, ERAFTState]:
-        """See :meth:`VoxelNetwork.unroll`."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`."""
         start = None if state is None else state.start
         batch = len(x) // steps
         voxels = x if state is None else torch.cat([state.voxel, x])
-        # What has no memory runs on all windows at once.
+        # The encoders have no memory, so they run on all windows at once.
         features = torch.split(self.raft.features(voxels), batch)
         windows = voxels[batch:]
         found = [
@@ -84,7 +84,7 @@ class ERAFT(VoxelNetwork):
             refined = list(self.raft.refine(pyramid, hidden[step], context[step], UPDATES, start))
             if self.warm_start:
                 start = forward_splat(refined[-1][0].detach())
-            outputs.append([self.raft.upsampled(*each) for each in (refined if self.training else refined[-1:])])
+            outputs.append([self.raft.upsample(*each) for each in (refined if self.training else refined[-1:])])
         flow = torch.stack([torch.cat(of_update) for of_update in zip(*outputs, strict=True)])
         return flow if self.training else flow[0], ERAFTState(voxels[-batch:], start)
 
@@ -97,11 +97,11 @@ class ERAFT(VoxelNetwork):
 
     @classmethod
     def own_name(cls, name: str) -> str:
-        """The authors use the names of RAFT's authors."""
+        """Translate the published names, which are those of RAFT's authors."""
         return name if name.startswith("raft.") else f"raft.{torchvision_name(name)}"
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Bins from the tensors."""
+        """Derive the number of bins from the tensors."""
         bins = state["raft.feature_encoder.convnormrelu.0.weight"].shape[1]
         return {"bins": bins, "normalize_voxels": bool(settings.get("normalize", bins == 15))}

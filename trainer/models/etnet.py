@@ -1,10 +1,10 @@
-"""ET-Net: E2VID's encoders, then transformers over all places of the picture (Weng et al., ICCV 2021).
+"""Define ET-Net: E2VID's encoders, then transformers over all positions of the picture (Weng et al., ICCV 2021).
 
 head, encoders   as E2VID                                5 -> 32 -> 64 -> 128 -> 256
-tokens           the encoders' outputs brought to 1/8 of the size with 256 channels: scale 0 is encoder 2 as it is,
-                 scale 1 encoder 1 through conv2 stride 2, scale 2 encoder 0 through conv4 stride 4; one token a place
-transformers     encoder s on scale s, plus its position; decoder 0 from scale 0 to itself, decoder 1 from scale 1 to
-                 scale 0, decoder 2 from scale 2 to scale 1; the mean of all six goes on
+tokens           the encoders' outputs at 1/8 of the size with 256 channels: scale 0 is encoder 2, scale 1 is encoder 1
+                 through conv2 stride 2, scale 2 is encoder 0 through conv4 stride 4; one token per position
+transformers     encoder s on scale s, with position embedding; decoder 0 attends from scale 0 to itself, decoder 1 from
+                 scale 1 to scale 0, decoder 2 from scale 2 to scale 1; the mean of all six outputs goes on
 decoders, pred   as E2VID, then a sigmoid
 
 22,175,361 parameters. Attribute names are those of the published state dicts.
@@ -27,11 +27,11 @@ ENCODER_LAYERS = 3
 DECODER_LAYERS = 2
 DROPOUT = 0.1
 POSITIONS = 20_000
-"""V2V's table; the original's has 8000 rows and is in no file."""
+"""Rows of V2V's table of positions. The original's has 8000 rows and is not stored in its files."""
 
 
 class _Layer(nn.Module):
-    """Pre-norm transformer layer over tokens [L, B, C]; with ``cross``, it also attends to a memory."""
+    """Apply a pre-norm transformer layer to tokens [L, B, C]. With ``cross`` it also attends to a memory."""
 
     def __init__(self, channels: int, *, cross: bool) -> None:
         super().__init__()
@@ -55,8 +55,8 @@ class _Layer(nn.Module):
             other = self.norm22(memory)
             x = x + self.dropout(self.cross_attn(self.norm21(x), other, other, need_weights=False)[0])
         normed = self.norm2(x) if memory is None else self.norm3(x)
-        told: Tensor = x + self.dropout(self.linear2(self.dropout(self.linear1(normed).relu())))
-        return told
+        result: Tensor = x + self.dropout(self.linear2(self.dropout(self.linear1(normed).relu())))
+        return result
 
 
 class _Layers(nn.Module):
@@ -71,7 +71,7 @@ class _Layers(nn.Module):
 
 
 class _Transformer(nn.Module):
-    """The layers under the name that the state dicts give them; matrices begin as Glorot's."""
+    """Apply the layers, under their names in the state dicts. Matrices are initialised by Glorot's rule."""
 
     def __init__(self, channels: int, *, decodes: bool) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class _Transformer(nn.Module):
 
 
 class _Positions(nn.Module):
-    """sin and cos of the place in raster order, [1, places, C] (Vaswani et al. 2017)."""
+    """Hold sin and cos of the position in raster order, [1, positions, C] (Vaswani et al. 2017)."""
 
     pos_table: Tensor
 
@@ -100,7 +100,7 @@ class _Positions(nn.Module):
 
 
 class ETNet(VoxelNetwork):
-    """ET-Net.
+    """Reconstruct pictures with ET-Net.
 
     Args:
         bins: bins of a voxel grid.
@@ -139,40 +139,45 @@ class ETNet(VoxelNetwork):
     def unroll(
         self, x: Tensor, state: tuple[LSTMState, ...] | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, tuple[LSTMState, ...]]:
-        """See :meth:`VoxelNetwork.unroll`; one :class:`LSTMState` per encoder. Transformers have no memory."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`.
+
+        The state is one :class:`LSTMState` per encoder. Transformers have no memory.
+        """
         head = x = self.head(x)
         skips, after = [], []
         for number, encoder in enumerate(self.DownsampleConv):
             x, memory = encoder(x, None if state is None else state[number], steps)
             skips.append(x)
             after.append(memory)
-        x = self._attended(skips)
+        x = self._attend(skips)
         for decoder in self.UpsampleConv:
             x = decoder(x + skips.pop())
         return predict(self.pred, x + head).sigmoid(), tuple(after)
 
-    def _attended(self, skips: list[Tensor]) -> Tensor:
-        """[N, C, H / 8, W / 8] of what the encoders gave."""
+    def _attend(self, skips: list[Tensor]) -> Tensor:
+        """Apply the transformers to the encoders' outputs and return [N, C, H / 8, W / 8]."""
         fine, middle, coarse = skips
         shape = coarse.shape[2:]
         places = shape[0] * shape[1]
         if places > POSITIONS:
-            raise UsageError(f"ETNet has {POSITIONS} positions of 8 x 8 px, and the picture has {places}")
+            raise UsageError(
+                f"the picture has {places} positions of 8 x 8 px, and ETNet at most {POSITIONS}: give a smaller picture"
+            )
         position = self.position_embedding.pos_table[:, :places].transpose(0, 1)
         scales = (coarse, self.split1(middle), self.split2(fine))
         tokens = [scale.flatten(2).permute(2, 0, 1) + position for scale in scales]  # [places, N, C]
-        heard = [self.get_submodule(f"trans_encoder{scale}")(x) for scale, x in enumerate(tokens)]
-        memories = (heard[0], heard[0], heard[1])
-        told = [
+        encoded = [self.get_submodule(f"trans_encoder{scale}")(x) for scale, x in enumerate(tokens)]
+        memories = (encoded[0], encoded[0], encoded[1])
+        decoded = [
             self.get_submodule(f"trans_decoder{scale}")(x, memory)
-            for scale, (x, memory) in enumerate(zip(heard, memories, strict=True))
+            for scale, (x, memory) in enumerate(zip(encoded, memories, strict=True))
         ]
-        mean = torch.stack([*heard, *told]).mean(dim=0)
+        mean = torch.stack([*encoded, *decoded]).mean(dim=0)
         return torch.unflatten(mean.permute(1, 2, 0), 2, shape)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Sizes from the tensors."""
+        """Derive the sizes from the tensors."""
         channels, bins = state["head.conv2d.weight"].shape[:2]
         return {
             "bins": bins,

@@ -1,8 +1,9 @@
-"""EVFlowNet: a U-Net from one voxel grid to optical flow (Zhu et al., RSS 2018; layers as in EvFlow+ and V2V).
+"""Define EVFlowNet, a U-Net from one voxel grid to optical flow (Zhu et al., RSS 2018; layers of EvFlow+ and V2V).
 
 encoder i conv3 stride 2, ReLU                          5 -> 64 -> 128 -> 256 -> 512,  1/2 ... 1/16 of the size
 residual  two blocks                                  512
-decoder j (x beside encoder 3-j), bilinear upsampling, conv3, ReLU        1024 -> 256, 512 -> 128, 256 -> 64, 128 -> 32
+decoder j (x concatenated with encoder 3-j), bilinear upsampling, conv3, ReLU
+                                                     1024 -> 256, 512 -> 128, 256 -> 64, 128 -> 32
 pred      conv1, linear                                32 -> 2: px in (x, y) over the voxel grid
 
 14,125,346 parameters, no memory: all grids of a sequence are one batch. Attribute names are those of the published
@@ -25,7 +26,7 @@ LEVELS = 4
 
 
 class _UNet(nn.Module):
-    """The layers; skip connections put channels beside each other."""
+    """Apply a U-Net whose skip connections concatenate channels."""
 
     def __init__(self, bins: int, base_channels: int) -> None:
         super().__init__()
@@ -52,7 +53,7 @@ class _UNet(nn.Module):
 
 
 class EVFlowNet(VoxelNetwork):
-    """EVFlowNet, with one output at full size.
+    """Estimate flow with EVFlowNet, with one output at full size.
 
     Args:
         bins: bins of a voxel grid.
@@ -75,12 +76,12 @@ class EVFlowNet(VoxelNetwork):
         self.unet = _UNet(bins, base_channels)
 
     def unroll(self, x: Tensor, _state: Any, _steps: int, _guide: Guide | None) -> tuple[Tensor, tuple[()]]:
-        """See :meth:`VoxelNetwork.unroll`; the state says only that the sequence has begun."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`. The state only marks that the sequence has begun."""
         return self.unet(x), ()
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Sizes from the tensors."""
+        """Derive the sizes from the tensors."""
         return {
             "bins": state["unet.encoders.0.conv2d.weight"].shape[1],
             "base_channels": state["unet.pred.conv2d.weight"].shape[1],

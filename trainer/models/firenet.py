@@ -1,4 +1,4 @@
-"""FireNet: a small recurrent network from voxel grids to pictures (Scheerlinck et al., WACV 2020).
+"""Define FireNet, a small recurrent network from voxel grids to pictures (Scheerlinck et al., WACV 2020).
 
 conv3 + ReLU -> ConvGRU -> residual block -> ConvGRU -> residual block -> conv1, all at full size with 16 channels:
 37,777 parameters. Attribute names are those of the published state dict (``net.head.conv.conv2d.weight`` ...).
@@ -16,7 +16,7 @@ from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork, pred
 from v2v_protocol.errors import UsageError
 
 GREY = 0.5
-"""What an untrained network predicts on average: the middle of the range of pictures."""
+"""Initial bias of the prediction: the middle of the range of pictures."""
 
 PLUS = {
     "head.conv2d": "net.head.conv.conv2d",
@@ -26,11 +26,11 @@ PLUS = {
     "R2": "net.resblocks.1",
     "pred.conv2d": "net.pred.conv2d",
 }
-"""FireNet+ is FireNet with its layers under other names."""
+"""Names of the layers here by their names in FireNet+, which is otherwise FireNet."""
 
 
 class _FireUNet(nn.Module):
-    """The layers, under the names of the published state dict."""
+    """Apply the layers, under the names of the published state dict."""
 
     def __init__(self, bins: int, base_channels: int) -> None:
         super().__init__()
@@ -50,18 +50,18 @@ class _FireUNet(nn.Module):
 
 
 class FireNet(VoxelNetwork):
-    """FireNet.
+    """Reconstruct pictures with FireNet.
 
     Args:
         bins: bins of a voxel grid.
         base_channels: channels of every layer.
         normalize_voxels: see :func:`trainer.models.sequence.normalize_voxels`; True for the published FireNet, False
             for FireNet+ and for networks trained on the stream.
-        padding: "bottom-right" adds nothing, the network takes all sizes. "centred" pads to multiples of 16, as the
-            code did with which the first FireNet was published.
+        padding: "bottom-right" adds no padding, because the network takes all sizes. "centred" pads to multiples of 16,
+            as the code of the first published FireNet does.
 
     Raises:
-        UsageError: ``bins`` or ``base_channels`` below 1.
+        UsageError: ``bins`` or ``base_channels`` is below 1.
     """
 
     signature = ("net.head.recurrent_block.reset_gate.weight",)
@@ -83,19 +83,19 @@ class FireNet(VoxelNetwork):
     def unroll(
         self, x: Tensor, state: tuple[Tensor, Tensor] | None, steps: int, _guide: Guide | None
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """See :meth:`VoxelNetwork.unroll`; two hidden states [B, 16, H, W]."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`. The state is two hidden states [B, 16, H, W]."""
         pictures, after = self.net(x, (None, None) if state is None else state, steps)
         return pictures, after
 
     @classmethod
     def own_name(cls, name: str) -> str:
-        """See :data:`PLUS`."""
+        """Replace the layer names of FireNet+, see :data:`PLUS`."""
         layer = next((layer for layer in PLUS if name.startswith(f"{layer}.")), None)
         return name if layer is None else PLUS[layer] + name.removeprefix(layer)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Sizes from the tensors. The first FireNet normalises its input, and its file says so."""
+        """Derive the sizes from the tensors. The first FireNet's file states that it normalises its input."""
         base_channels, bins = state["net.head.conv.conv2d.weight"].shape[:2]
         first = bool(settings.get("normalize", False))
         padding = "centred" if first else "bottom-right"

@@ -1,15 +1,15 @@
-"""HyperE2VID: E2VID whose first decoder has another kernel at every pixel (Ercan et al., TIP 2024).
+"""Define HyperE2VID: E2VID whose first decoder has another kernel at every pixel (Ercan et al., TIP 2024).
 
-The kernels depend on a context, which is the voxel grid beside the network's own last picture:
+The kernels depend on a context, the voxel grid concatenated with the network's own last picture:
 
 context        bilinear to 1/4 of the size, conv3                             5 + 1 -> 32
 coefficients   conv3, batch norm, tanh, conv3, batch norm, tanh              32 -> 64 -> 6 x 12
 atoms          6 kernels of 5 x 5 at each pixel: sums of 12 fixed Fourier-Bessel functions, by the coefficients
 decoder 0      bilinear upsampling, convolution with the atoms (256 -> 256 x 6), conv1 (-> 128), ReLU
 
-Everything else is E2VID. 10,149,881 parameters, and 574 values that are not trained (the functions, and what batch norm
-counts). Only the decoders loop over time, because only they see the last picture. Attribute names are those of the
-published state dicts.
+Everything else is E2VID. 10,149,881 parameters, and 574 values that are not trained (the functions, and the statistics
+of batch norm). Only the decoders loop over time, because only they see the last picture. Attribute names are those of
+the published state dicts.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ CONTEXT_SCALE = 0.25
 
 
 def fourier_bessel(reach: int, bandwidth: float) -> npt.NDArray[np.float64]:
-    """The smoothest functions on a disc, sampled at whole pixels.
+    """Return the smoothest functions on a disc, sampled at integer pixels.
 
         psi(rho, phi) = J_k(z rho) / |J_(k+1)(z)| * {1, sqrt(2) cos(k phi), sqrt(2) sin(k phi)},  z a zero of J_k
 
-    for rho < 1, else 0; rho is the distance to the centre in units of R = reach + 1/2. Those of lowest z come first;
-    k = 0 gives one function, others two. (Qiu et al., "DCFNet", ICML 2018.)
+    for rho < 1, else 0; rho is the distance to the centre in units of R = reach + 1/2. The functions are sorted by z;
+    k = 0 gives one function, other k give two. (Qiu et al., "DCFNet", ICML 2018.)
 
     Args:
         reach: pixels from the centre to the edge.
         bandwidth: a zero counts if the next one of its J_k is at most pi R bandwidth.
 
     Returns:
-        [(2 reach + 1)^2 - 1, 2 reach + 1, 2 reach + 1], of mean square norm 1 over the functions.
+        [(2 reach + 1)^2 - 1, 2 reach + 1, 2 reach + 1], with a mean square norm of 1 over the functions.
     """
     radius = reach + 0.5
     places = np.arange(-reach - 1, reach + 2) / radius
@@ -75,7 +75,7 @@ def fourier_bessel(reach: int, bandwidth: float) -> npt.NDArray[np.float64]:
 
 
 def bases() -> Tensor:
-    """The fixed functions [12, 25]: six of a 3 x 3 neighbourhood, then six of 5 x 5."""
+    """Return the fixed functions [12, 25]: six of a 3 x 3 neighbourhood, then six of 5 x 5."""
     narrow = np.pad(fourier_bessel(1, 2.0)[:PER_SCALE], ((0, 0), (1, 1), (1, 1)))
     wide = fourier_bessel(2, 1.5)[:PER_SCALE]
     return torch.from_numpy(np.concatenate([narrow, wide]).reshape(2 * PER_SCALE, SIDE_PX**2)).float()
@@ -94,7 +94,7 @@ class _ContextFusion(nn.Module):
 
 
 class _AtomGeneration(nn.Module):
-    """Context -> coefficients of the fixed functions, [B, atoms, functions, h, w]."""
+    """Map the context to coefficients of the fixed functions, [B, atoms, functions, h, w]."""
 
     bases: Tensor
 
@@ -116,7 +116,7 @@ class _AtomGeneration(nn.Module):
 
 
 class _DynamicConv(nn.Module):
-    """Convolution with the atoms of each pixel, then a 1 x 1 convolution over all of their results."""
+    """Convolve with the atoms of each pixel, then apply a 1 x 1 convolution over all of their results."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -125,8 +125,8 @@ class _DynamicConv(nn.Module):
         nn.init.kaiming_normal_(self.compositional_coefficients, mode="fan_out", nonlinearity="relu")
 
     def forward(self, x: Tensor, coefficients: Tensor, functions: Tensor) -> Tensor:
-        # An atom is a sum of functions, and convolution is linear: the fixed functions go first, over all of the
-        # picture at once, and the sum over them is taken at each pixel. No 25 copies of x are needed.
+        # An atom is a sum of functions, and convolution is linear. So the fixed functions are applied first, to the
+        # whole picture at once, and the sum over them is taken at each pixel. This avoids 25 copies of x.
         kernels = functions.view(-1, 1, SIDE_PX, SIDE_PX).to(x.dtype)
         filtered = F.conv2d(x.flatten(0, 1).unsqueeze(1), kernels, padding=SIDE_PX // 2)
         filtered = torch.unflatten(filtered, 0, x.shape[:2])
@@ -135,7 +135,7 @@ class _DynamicConv(nn.Module):
 
 
 class DynamicDecoder(nn.Module):
-    """Upsampling by 2, dynamic convolution, ReLU."""
+    """Apply upsampling by 2, dynamic convolution, ReLU."""
 
     def __init__(self, bins: int, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -144,11 +144,12 @@ class DynamicDecoder(nn.Module):
         self.dynamic_conv = _DynamicConv(inputs, outputs)
 
     def forward(self, x: Tensor, voxel: Tensor, picture: Tensor) -> Tensor:
-        """
+        """Decode one time step to [B, outputs, H / 4, W / 4].
+
         Args:
             x: [B, inputs, H / 8, W / 8].
             voxel: [B, bins, H, W].
-            picture: [B, 1, H, W], the last one.
+            picture: [B, 1, H, W], the network's last picture.
         """
         coefficients = self.dynamic_atom_generation(self.context_fusion(voxel, picture))
         x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
@@ -156,14 +157,14 @@ class DynamicDecoder(nn.Module):
 
 
 class HyperState(NamedTuple):
-    """Memory: one :class:`LSTMState` per encoder, and the last picture [B, 1, H, W]."""
+    """Hold one :class:`LSTMState` per encoder, and the last picture [B, 1, H, W]."""
 
     encoders: tuple[LSTMState, ...]
     picture: Tensor
 
 
 class HyperE2VID(Loop, E2VID):
-    """HyperE2VID.
+    """Reconstruct pictures with HyperE2VID.
 
     Args:
         bins: bins of a voxel grid.
@@ -187,13 +188,13 @@ class HyperE2VID(Loop, E2VID):
     def unroll(  # type: ignore[override]
         self, x: Tensor, state: HyperState | None, steps: int, guide: Guide | None
     ) -> tuple[Tensor, HyperState]:
-        """See :meth:`VoxelNetwork.unroll`."""
+        """Run the network, see :meth:`VoxelNetwork.unroll`."""
         net = self.unetrecurrent
         features, skips, after = net.encode(x, None if state is None else state.encoders, steps)
         voxels = x.chunk(steps)
         picture = torch.zeros_like(voxels[0][:, :1]) if state is None else state.picture
         shown = None if guide is None else guide.pictures.chunk(steps)
-        # Decoder by decoder, from the coarsest skip to the head, each cut into its time steps.
+        # In the order of the decoders, from the coarsest skip to the head, each split into its time steps.
         by_step = zip(voxels, features.chunk(steps), *(skip.chunk(steps) for skip in reversed(skips)), strict=True)
         pictures = []
         for step, (voxel, z, *added) in enumerate(by_step):
@@ -204,7 +205,7 @@ class HyperE2VID(Loop, E2VID):
         return torch.cat(pictures), HyperState(after, picture)
 
     def _turn(self, voxel: Tensor, picture: Tensor, z: Tensor, *added: Tensor) -> Tensor:
-        """The picture of one time step; ``added`` goes into the decoders and into the last layer."""
+        """Return the picture of one time step. ``added`` are the skip connections, in the order of use."""
         net = self.unetrecurrent
         z = net.decoders[0](z + added[0], voxel, picture)
         for decoder, skip in zip(list(net.decoders)[1:], added[1:-1], strict=True):
@@ -213,6 +214,6 @@ class HyperE2VID(Loop, E2VID):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """As E2VID, of which everything else is fixed."""
-        told = super().from_state(state, settings)
-        return {name: told[name] for name in ("bins", "base_channels", "normalize_voxels", "padding")}
+        """Derive the arguments as E2VID does; HyperE2VID fixes all others."""
+        arguments = super().from_state(state, settings)
+        return {name: arguments[name] for name in ("bins", "base_channels", "normalize_voxels", "padding")}

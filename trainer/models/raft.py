@@ -1,9 +1,11 @@
-"""RAFT, small and large (Teed and Deng, "RAFT: Recurrent All-Pairs Field Transforms for Optical Flow", ECCV 2020).
+"""Define RAFT, small and large.
 
-Both encoders make features at an eighth of the picture's size. The correlation of every pixel of one picture with every
-pixel of the other is kept as a pyramid; a recurrent unit looks it up around where the current flow points and corrects
-the flow, twelve times. Parameters carry torchvision's names, so that its weight files load as they are; those of the
-authors' repository are renamed by :func:`torchvision_names`.
+Source: Teed and Deng, "RAFT: Recurrent All-Pairs Field Transforms for Optical Flow", ECCV 2020.
+
+Both encoders compute features at an eighth of the picture's size. The correlation of every pixel of one picture with
+every pixel of the other forms a pyramid. Twelve times, a recurrent unit looks it up around the target of the current
+flow and updates the flow. Parameters have torchvision's names, so that its weight files load unchanged;
+:func:`torchvision_name` translates those of the authors' repository.
 
     size   features  context       correlation radius   recurrent unit            upsampling
     small  128       96 + 64       3                    3 x 3                     bilinear
@@ -25,12 +27,12 @@ from trainer.models.blocks import Loop
 DOWNSCALE = 8
 LEVELS = 4
 SMALLEST_SIDE_PX = DOWNSCALE * 2**LEVELS
-"""The coarsest correlation needs two pixels a side."""
+"""The coarsest correlation needs at least 2 x 2 pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Widths of one variant, channels."""
+    """Hold the layer sizes of one variant, in channels."""
 
     features: tuple[int, int, int, int, int]
     context: int
@@ -71,7 +73,7 @@ def _convolution(
 
 
 class _Block(nn.Module):
-    """Residual block: two 3 x 3 convolutions, or (bottleneck) 1 x 1, 3 x 3, 1 x 1 over a quarter of the channels."""
+    """Apply a residual block: two 3 x 3 convolutions, or (bottleneck) 1 x 1, 3 x 3, 1 x 1 on C / 4."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, norm: str, bottleneck: bool) -> None:
         super().__init__()
@@ -93,7 +95,7 @@ class _Block(nn.Module):
 
 
 class _Encoder(nn.Module):
-    """[N, inputs, H, W] -> [N, outputs, H / 8, W / 8]."""
+    """Map [N, inputs, H, W] to [N, outputs, H / 8, W / 8]."""
 
     def __init__(self, size: Size, inputs: int, outputs: int, norm: str) -> None:
         super().__init__()
@@ -177,7 +179,7 @@ class _UpdateBlock(nn.Module):
 
 
 class _MaskPredictor(nn.Module):
-    """Weights of the 3 x 3 neighbours of each of the 8 x 8 pixels that one coarse pixel becomes."""
+    """Predict weights of the 3 x 3 coarse neighbours for each of the 8 x 8 fine pixels of a coarse pixel."""
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
@@ -185,13 +187,13 @@ class _MaskPredictor(nn.Module):
         self.conv = nn.Conv2d(256, 9 * DOWNSCALE**2, 1)
 
     def forward(self, hidden: Tensor) -> Tensor:
-        # A quarter, to balance gradients in training; the weights were trained with it.
+        # The factor 0.25 balances gradients in training; the weights were trained with it.
         weights: Tensor = 0.25 * self.conv(self.convrelu(hidden))
         return weights
 
 
 class RAFT(Loop, nn.Module):
-    """The network.
+    """Estimate the flow between two pictures.
 
     Args:
         size: "small" (990,162 parameters) or "large" (5,257,536).
@@ -207,26 +209,26 @@ class RAFT(Loop, nn.Module):
         self.mask_predictor = _MaskPredictor(self.size.hidden) if self.size.learned_upsampling else None
 
     def forward(self, first: Tensor, second: Tensor, updates: int = 12) -> Tensor:
-        """Flow from ``first`` to ``second``.
+        """Return the flow from ``first`` to ``second``.
 
         Args:
             first, second: [N, inputs, H, W], pictures in -1 .. 1; H and W multiples of 8, at least 128.
-            updates: corrections of the flow.
+            updates: number of updates of the flow.
 
         Returns:
-            [N, 2, H, W] float32, (x, y), px: after the last correction.
+            [N, 2, H, W] float32, (x, y), px, after the last update.
         """
         features = self.features(torch.cat([first, second])).chunk(2)
         *_, (flow, hidden) = self.refine(correlation_pyramid(*features), *self.context(first), updates)
-        return self.upsampled(flow, hidden)
+        return self.upsample(flow, hidden)
 
     def features(self, pictures: Tensor) -> Tensor:
-        """What is compared: [N, inputs, H, W] -> [N, C, H / 8, W / 8], float32 or wider."""
+        """Compute the features to correlate: [N, inputs, H, W] -> [N, C, H / 8, W / 8], float32 or wider."""
         found: Tensor = self.feature_encoder(pictures)
         return found.to(torch.promote_types(found.dtype, torch.float32))
 
     def context(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """The first hidden state, and what the recurrent unit is told each time, both [N, C, H / 8, W / 8]."""
+        """Return the initial hidden state and the context, an input of every update, both [N, C, H / 8, W / 8]."""
         split = [self.size.hidden, self.size.context - self.size.hidden]
         hidden, context = self.context_encoder(picture).split(split, dim=1)
         return torch.tanh(hidden), functional.relu(context)
@@ -234,31 +236,33 @@ class RAFT(Loop, nn.Module):
     def refine(
         self, pyramid: list[Tensor], hidden: Tensor, context: Tensor, updates: int, flow: Tensor | None = None
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Flow at an eighth of the size, with the hidden state, after each correction.
+        """Yield the flow at an eighth of the size and the hidden state, after each update.
 
         Args:
-            pyramid: of :func:`correlation_pyramid`.
-            hidden, context: of :meth:`context`.
-            updates: corrections.
-            flow: to start from, [N, 2, H / 8, W / 8]; None: none.
+            pyramid: from :func:`correlation_pyramid`.
+            hidden, context: from :meth:`context`.
+            updates: number of updates.
+            flow: initial flow [N, 2, H / 8, W / 8], px of that size; None starts from zero.
         """
         count, _, height, width = hidden.shape
         grid = _grid(height, width, pyramid[0]).expand(count, 2, height, width)
         flow = torch.zeros_like(grid) if flow is None else flow
         for _ in range(updates):
-            flow, hidden = self.turn(pyramid, grid, context, hidden, flow.detach())  # each correction by itself
+            flow, hidden = self.turn(
+                pyramid, grid, context, hidden, flow.detach()
+            )  # no gradient through earlier updates
             yield flow, hidden
 
     def _turn(
         self, pyramid: list[Tensor], grid: Tensor, context: Tensor, hidden: Tensor, flow: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """One correction of the flow."""
+        """Update the flow once."""
         correlation = look_up(pyramid, grid + flow, self.size.radius)
         hidden, correction = self.update_block(hidden, context, correlation, flow)
         return flow + correction.to(flow.dtype), hidden
 
-    def upsampled(self, flow: Tensor, hidden: Tensor) -> Tensor:
-        """Flow of :meth:`refine` at full size."""
+    def upsample(self, flow: Tensor, hidden: Tensor) -> Tensor:
+        """Return the flow of :meth:`refine` at full size."""
         if self.mask_predictor is None:
             shape = [DOWNSCALE * side for side in flow.shape[2:]]
             return DOWNSCALE * functional.interpolate(flow, shape, mode="bilinear", align_corners=True)
@@ -266,16 +270,16 @@ class RAFT(Loop, nn.Module):
 
 
 def correlation_pyramid(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Correlation of all pixels with all, the second picture's averaged over 1, 2, 4 and 8 pixels.
+    """Correlate all pairs of pixels, with the second picture averaged over 1, 2, 4 and 8 pixels.
 
     Args:
-        first, second: [N, C, h, w] features.
+        first, second: features [N, C, h, w].
 
     Returns:
         LEVELS tensors [N h w, 1, h / 2^l, w / 2^l].
     """
     count, channels, height, width = first.shape
-    # Sums of up to 256 products: too many for the eight bits of bfloat16.
+    # Sums of up to 256 products exceed the 8 bits of precision of bfloat16.
     with torch.autocast(first.device.type, enabled=False):
         product = torch.matmul(first.flatten(2).transpose(1, 2), second.flatten(2)) / channels**0.5
     pyramid = [product.reshape(count * height * width, 1, height, width)]
@@ -285,15 +289,17 @@ def correlation_pyramid(first: Tensor, second: Tensor) -> list[Tensor]:
 
 
 def look_up(pyramid: list[Tensor], centre: Tensor, radius: int) -> Tensor:
-    """Correlations around a position of the second picture for each pixel of the first, bilinear, zero outside.
+    """Sample, for each pixel of the first picture, the correlations around a position of the second.
+
+    Sampling is bilinear, and zero outside the picture.
 
     Args:
-        pyramid: of :func:`correlation_pyramid`.
+        pyramid: from :func:`correlation_pyramid`.
         centre: [N, 2, h, w] (x, y), pixels of the finest level.
-        radius: neighbours in each direction, pixels of each level.
+        radius: neighbours in each direction, in pixels of each level.
 
     Returns:
-        [N, LEVELS (2 radius + 1)^2, h, w]. As in the published networks the offset that varies faster is that in y.
+        [N, LEVELS (2 radius + 1)^2, h, w]. As in the published networks, the y offset varies fastest.
     """
     count, _, height, width = centre.shape
     steps = torch.arange(-radius, radius + 1, dtype=centre.dtype, device=centre.device)
@@ -301,7 +307,7 @@ def look_up(pyramid: list[Tensor], centre: Tensor, radius: int) -> Tensor:
     centre = centre.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2)
     found = []
     for level, plane in enumerate(pyramid):
-        # In the convention in which -1 and 1 are the outer edges of the plane: it may then be one pixel wide.
+        # align_corners=False, where -1 and 1 are the outer edges, because a plane may be one pixel wide.
         x, y = (centre / 2**level + offsets).unbind(-1)
         where = torch.stack([(2 * x + 1) / plane.shape[-1] - 1, (2 * y + 1) / plane.shape[-2] - 1], dim=-1)
         found.append(functional.grid_sample(plane, where, align_corners=False).reshape(count, height, width, -1))
@@ -309,17 +315,17 @@ def look_up(pyramid: list[Tensor], centre: Tensor, radius: int) -> Tensor:
 
 
 def _grid(height: int, width: int, like: Tensor) -> Tensor:
-    """(x, y) of every pixel, [2, height, width]."""
+    """Return (x, y) of every pixel, [2, height, width]."""
     rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in (height, width))
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack([x, y])
 
 
 def forward_splat(flow: Tensor) -> Tensor:
-    """Flow carried along by itself: what the flow of the next step probably is, if everything goes on as it does.
+    """Propagate flow along itself: predict the next step's flow under constant motion.
 
-    Every vector is laid down where it points to, on the four pixels around, by bilinear weights; a pixel takes the
-    weighted mean of what lands on it, and 0 where nothing does.
+    Every vector is added at its target, to the four surrounding pixels with bilinear weights. A pixel takes
+    the weighted mean of the vectors that reach it, or 0 without any.
 
     Args:
         flow: [N, 2, H, W] (x, y), px.
@@ -338,7 +344,7 @@ def forward_splat(flow: Tensor) -> Tensor:
 
 
 def convex_upsampling(flow: Tensor, weights: Tensor) -> Tensor:
-    """Each fine pixel's flow is a convex combination of its 3 x 3 coarse neighbours (section 3.3 of the paper)."""
+    """Upsample flow by 8: fine pixels are convex combinations of 3 x 3 coarse neighbours (paper, section 3.3)."""
     count, _, height, width = flow.shape
     share = weights.view(count, 1, 9, DOWNSCALE, DOWNSCALE, height, width).softmax(dim=2)
     near = functional.unfold(DOWNSCALE * flow, 3, padding=1).view(count, 2, 9, 1, 1, height, width)
@@ -366,10 +372,10 @@ _RENAMED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 
 
 def torchvision_name(name: str, *, bottleneck: bool = False) -> str:
-    """The name that torchvision gives to a tensor of the authors' repository (princeton-vl/RAFT); its own pass.
+    """Return torchvision's name for a tensor of the authors' repository (princeton-vl/RAFT); its own names stay.
 
     The authors' blocks register the norm of their shortcut twice, as ``norm3`` (``norm4`` in bottlenecks) and as
-    ``downsample.1``: both have the same name here.
+    ``downsample.1``. Both get the same name here.
     """
     name = re.sub(rf"\.norm{4 if bottleneck else 3}\.", ".downsample.1.", name)
     for pattern, replacement in _RENAMED:

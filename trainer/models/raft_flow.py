@@ -1,8 +1,7 @@
-"""Optical flow in the trainer: RAFT without gradients.
+"""Estimate optical flow in the trainer, with RAFT and without gradients.
 
-Frames are [N, 1, H, W] in 0 .. 1, flow [N, 2, H, W] (x, y) in px; forward flow lies on the grid of the first picture:
-second(x + flow(x)) = first(x). What ``trainer.losses.warp`` takes is the flow from the later picture to the earlier
-one.
+Frames are [N, 1, H, W] in 0 .. 1, flow is [N, 2, H, W] (x, y) in px. Forward flow lies on the first picture's grid:
+second(x + flow(x)) = first(x). ``trainer.losses.warp`` takes the flow from the later picture to the earlier one.
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ WHERE_TO_GET_WEIGHTS = {
 
 
 class RaftFlow:
-    """Flow by RAFT, without gradients, over any number of pairs.
+    """Estimate flow by RAFT, without gradients, for any number of pairs.
 
-    Frames are mapped to -1 .. 1 and repeated to three channels; the picture is padded below and on the right with 0,
-    which is mid-grey, to multiples of 8 and at least 128; of twelve corrections the last one counts.
+    Frames are mapped to -1 .. 1 and repeated to three channels. They are padded at the bottom and the right with 0,
+    which is mid-grey, to multiples of 8 and at least 128 px. The flow is that after twelve updates.
 
     Args:
         size: "small" or "large".
-        weights: file in torchvision's or the authors' layout. Nothing is downloaded.
-        device: where to compute.
+        weights: file in torchvision's or the authors' layout. It is not downloaded automatically.
+        device: device to compute on.
         bfloat16: run the convolutions in bfloat16; correlation, positions and flow stay float32.
         pairs_at_once: bounds memory: a pair takes about 1.33 * 4 * (H W / 64)^2 bytes for the correlation (350 kB at
-            128 x 128), and some 10 kB a pixel in the encoders of the large network. Many small batches keep a GPU
-            waiting for the processor: 64 pairs at a time made four times as many kernels as 240.
+            128 x 128), and about 10 kB per pixel in the encoders of the large network. With many small batches a GPU
+            waits for the processor: 64 pairs at a time launch four times as many kernels as 240.
 
     Raises:
-        UsageError: an unknown size; a file that is missing, unreadable or of another network.
+        UsageError: the size is unknown, or the file is missing, unreadable or of another network.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class RaftFlow:
 
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
-        """Flow from each first picture to its second.
+        """Estimate the flow from each first picture to its second.
 
         Args:
             first, second: [N, 1, H, W], float in 0 .. 1 or uint8.
@@ -79,7 +78,7 @@ class RaftFlow:
             [N, 2, H, W] float32 on the device, px.
 
         Raises:
-            UsageError: the shapes are not these.
+            UsageError: the pictures have other shapes.
         """
         if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 1:
             raise UsageError(f"RAFT takes two [N, 1, H, W]; got {list(first.shape)} and {list(second.shape)}")
@@ -91,10 +90,10 @@ class RaftFlow:
     def _estimate(self, first: Tensor, second: Tensor) -> Tensor:
         height, width = first.shape[2:]
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bfloat16):
-            flow: Tensor = self._network(self._prepared(first), self._prepared(second))
+            flow: Tensor = self._network(self._prepare(first), self._prepare(second))
         return flow[:, :, :height, :width]
 
-    def _prepared(self, frames: Tensor) -> Tensor:
+    def _prepare(self, frames: Tensor) -> Tensor:
         frames = frames.to(self._device)
         scaled = frames.float() / 255.0 if frames.dtype == torch.uint8 else frames.float()
         height, width = frames.shape[2:]
@@ -116,7 +115,7 @@ def _check_fit(state: dict[str, Tensor], network: RAFT, path: Path, size: str) -
     if wrong:
         name = wrong[0]
         raise UsageError(
-            f"RAFT weights {path}: not those of the {size} network: {len(wrong)} of {len(wanted)} entries differ, "
-            f"first {name} (shape {given.get(name, 'missing')}, wanted {wanted.get(name, 'none')}). "
+            f"RAFT weights {path} do not fit the {size} network: {len(wrong)} of {len(wanted)} entries differ, "
+            f"first {name} (shape {given.get(name, 'missing')}, expected {wanted.get(name, 'none')}). "
             f"Get them from {WHERE_TO_GET_WEIGHTS[size]}"
         )

@@ -161,7 +161,12 @@ def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
     Raises:
         UsageError: a setting that would make it another run differs; the message names all of them with both values.
     """
-    changed = differences(checkpoint.config, config.to_dict())
+    # Keys that are newer than the checkpoint had their default in its run.
+    saved = {
+        section: {**dataclasses.asdict(type(getattr(config, section))()), **checkpoint.config.get(section, {})}
+        for section in config.to_dict()
+    }
+    changed = differences(saved, config.to_dict())
     shown = {
         key: f"{key}: {old!r} -> {new!r}" for key, (old, new) in changed.items() if key not in (*MAY_DIFFER, "run.out")
     }
@@ -199,6 +204,16 @@ def require_writable(out: Path) -> None:
             pass
     except OSError as error:
         raise _unusable(out, error) from error
+
+
+def unwritable(out: Path, name: str, error: OSError) -> UsageError:
+    """Return the error to raise when the file or folder ``name`` of the run in ``out`` cannot be written."""
+    last = out / LAST
+    then = f"continue with --resume {last}" if os.path.exists(last) else "start the run again"
+    return UsageError(
+        f"{out / name}: {error.strerror or error}; the checkpoints there are intact. Free space or allow writing, "
+        f"then {then}"
+    )
 
 
 def _unusable(out: Path, error: OSError) -> UsageError:

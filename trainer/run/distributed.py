@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any
 
 import torch
@@ -64,6 +65,22 @@ class Ranks:
         distributed.broadcast_object_list(carrier, src=0, device=torch.device("cpu"))
         return carrier[0]
 
+    def gather(self, value: Any) -> list[Any]:
+        """Return the values (plain ones) of all ranks, in their order; all ranks call it."""
+        if self.world_size == 1:
+            return [value]
+        values: list[Any] = [None] * self.world_size
+        distributed.all_gather_object(values, value)
+        return values
+
+    def copy_from_first(self, tensors: Iterable[Tensor]) -> None:
+        """Overwrite tensors with those of the first rank; all ranks call it with equally many of equal shapes."""
+        if self.world_size > 1:
+            for tensor in tensors:
+                dense = tensor.contiguous()  # exchanges refuse other memory formats
+                distributed.broadcast(dense, src=0)
+                tensor.copy_(dense)
+
 
 def on_gpu(device: str) -> bool:
     """Whether ``compute.device`` = ``device`` is a GPU here."""
@@ -71,7 +88,7 @@ def on_gpu(device: str) -> bool:
 
 
 @contextmanager
-def ranks(device: str) -> Iterator[Ranks]:
+def ranks(device: str, timeout_seconds: float) -> Iterator[Ranks]:
     """This process's place, from the variables that torchrun sets.
 
     Whatever knows the group (a DistributedDataParallel above all) must be out of scope at the end of the block: the
@@ -79,6 +96,7 @@ def ranks(device: str) -> Iterator[Ranks]:
 
     Args:
         device: "auto", "cpu" or "cuda".
+        timeout_seconds: time that a rank waits for the others in one exchange before it raises.
 
     Raises:
         UsageError: "cuda" without a GPU, or more ranks on this host than GPUs.
@@ -98,7 +116,9 @@ def ranks(device: str) -> Iterator[Ranks]:
     if world_size == 1:
         yield Ranks(0, 1, mine)
         return
-    distributed.init_process_group("cpu:gloo,cuda:nccl" if with_gpu else "gloo")
+    distributed.init_process_group(
+        "cpu:gloo,cuda:nccl" if with_gpu else "gloo", timeout=timedelta(seconds=timeout_seconds)
+    )
     yield Ranks(distributed.get_rank(), world_size, mine, hosts=-(-world_size // here))
     # The group's threads free the tensors of the last exchange, for which they need the interpreter. One that is late
     # and finds it ending aborts the process ("terminate called without an active exception"). So the group must be

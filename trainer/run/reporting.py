@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,14 +15,15 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
 from trainer.config import TrainConfig
 from trainer.config_file import show_config
-from trainer.pictures import Image, Video, contact_sheet, headed, write_png
-from trainer.run.checkpoint import replacing
+from trainer.pictures import Image, Video, add_header, contact_sheet
+from trainer.run.board import Board
+from trainer.run.checkpoint import replacing, unwritable
 from trainer.run.distributed import Ranks
 from v2v_client import V2VStreamDataset
+from v2v_pictures.files import png_bytes
 from v2v_protocol.errors import UsageError
 
 METRICS = "metrics.jsonl"
@@ -81,16 +83,17 @@ class Reporter:
     Args:
         out: folder of the run.
         speaks: this is the first rank.
-        step: where the run goes on; what an earlier one wrote of later steps is dropped.
+        step: where the run goes on; what an earlier one wrote of later steps is dropped, with 0 all of it.
 
     Raises:
-        UsageError: what an earlier one wrote is damaged, and not merely torn at its end.
+        UsageError: the folder cannot be written, by this and every method; or what an earlier run wrote is damaged, and
+            not merely torn at its end.
     """
 
     def __init__(self, out: Path, *, speaks: bool, step: int = 0) -> None:
         self._out = out
         self._console = Console(highlight=False, quiet=not speaks)
-        self._board: SummaryWriter | None = None
+        self._board: Board | None = None
         self._first = self._step = step
         self._planned = False
         self._total: int | None = None
@@ -107,20 +110,35 @@ class Reporter:
         )
         self._task = self._bar.add_task("training", total=None, note="", completed=step)
         if speaks:
-            out.mkdir(parents=True, exist_ok=True)
-            _drop_after(out / METRICS, step)
-            self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1)
+            with self._writing(METRICS):
+                out.mkdir(parents=True, exist_ok=True)
+                _drop_after(out / METRICS, step)
+            with self._writing("tensorboard"):
+                self._board = Board(out / "tensorboard", step + 1 if step else 0)
 
     def __enter__(self) -> Reporter:
         self._bar.start()
         return self
 
     def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+        self, _kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
     ) -> None:
         self._bar.stop()
-        if self._board is not None:
+        if self._board is None:
+            return
+        try:
             self._board.close()
+        except OSError as refused:
+            if error is None:  # else the first error is the one to report
+                raise unwritable(self._out, "tensorboard", refused) from refused
+
+    @contextlib.contextmanager
+    def _writing(self, name: str) -> Iterator[None]:
+        """A block that writes ``name`` in the folder of the run."""
+        try:
+            yield
+        except OSError as error:
+            raise unwritable(self._out, name, error) from error
 
     def advance(self, step: int, dataset: V2VStreamDataset, config: TrainConfig) -> None:
         """One more step was queued; the first one tells how many there will be."""
@@ -130,11 +148,7 @@ class Reporter:
         self._bar.update(self._task, completed=step, total=self._total)
 
     def metrics(self, step: int, epoch: int, learning_rate: float, values: Mapping[str, float]) -> None:
-        """A reading of the meter.
-
-        Raises:
-            UsageError: it cannot be written down.
-        """
+        """Record a reading of the meter."""
         if self._board is None:
             return
         self._write({"step": step, "epoch": epoch, "learning_rate": learning_rate, **values})
@@ -146,63 +160,62 @@ class Reporter:
             )
 
     def held_out(self, step: int, values: Mapping[str, float]) -> None:
-        """Losses of the batch that is not trained on.
-
-        Raises:
-            UsageError: they cannot be written down.
-        """
+        """Record the losses of the batch that is not trained on."""
         self._held_out = values["total"]
         self._write({"step": step} | {f"held_out_{name}": value for name, value in values.items()})
 
     def validated(self, step: int, scores: Mapping[str, float]) -> bool:
-        """Scores on recordings; whether the first of them is the lowest of this run so far.
+        """Record scores on recordings; return whether the first of them is the lowest of this run so far.
 
-        Raises:
-            UsageError: they cannot be written down.
+        False on all ranks but the first.
         """
+        if self._board is None:
+            return False
         decisive = f"validation_{next(iter(scores))}"
-        before = [record[decisive] for record in read_metrics(self._out / METRICS) if decisive in record]
+        before = [record[decisive] for record in self._records() if decisive in record]
         self._write({"step": step} | {f"validation_{name}": value for name, value in scores.items()})
         return all(scores[decisive.removeprefix("validation_")] < value for value in before)
 
-    def configuration(self, config: TrainConfig) -> None:
-        """All keys of the run, as a file that ``v2v-train`` takes.
+    def is_validated(self, step: int) -> bool:
+        """Return whether there are scores of this step on recordings."""
+        names = [name for record in self._records() if record["step"] == step for name in record]
+        return any(name.startswith("validation_") for name in names)
 
-        Raises:
-            UsageError: it cannot be written down.
-        """
+    def _records(self) -> list[dict[str, Any]]:
+        with self._writing(METRICS):
+            return read_metrics(self._out / METRICS) if (self._out / METRICS).exists() else []
+
+    def configuration(self, config: TrainConfig) -> None:
+        """Write all keys of the run to a file that ``v2v-train`` takes."""
         if self._board is not None:
-            try:
+            with self._writing(CONFIGURATION):
                 (self._out / CONFIGURATION).write_text(show_config(config), "utf-8")
-            except OSError as error:
-                raise UsageError(f"{self._out / CONFIGURATION}: {error.strerror}") from error
 
     def _write(self, record: Mapping[str, Any]) -> None:
         if self._board is None:
             return
-        try:
-            with (self._out / METRICS).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record) + "\n")
-        except OSError as error:
-            raise UsageError(f"{self._out / METRICS}: {error.strerror}") from error
-        for name, value in record.items():
-            if name != "step":
-                group = "held_out" if name.startswith("held_out_") else _GROUPS.get(name, "loss")
-                self._board.add_scalar(f"{group}/{name.removeprefix('held_out_')}", value, record["step"])
+        with self._writing(METRICS), (self._out / METRICS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+        with self._writing("tensorboard"):
+            for name, value in record.items():
+                if name != "step":
+                    group = "held_out" if name.startswith("held_out_") else _GROUPS.get(name, "loss")
+                    self._board.scalar(f"{group}/{name.removeprefix('held_out_')}", value, record["step"])
 
     def preview(self, step: int, films: Sequence[Image], panels: Sequence[str]) -> None:
-        """Films of a task, one per sample, equally large; ``panels`` names what they show side by side."""
+        """Write films of a task, one per sample, equally large; ``panels`` names what they show side by side."""
         if self._board is None:
             return
-        name = f"step-{step:07d}"
-        for number, film in enumerate(films):
-            sheet = headed(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
-            write_png(self._out / "previews" / f"{name}-{number}.png", sheet)
-            with Video(self._out / "previews" / f"{name}-{number}.mp4", FRAMES_PER_SECOND) as video:
-                for image in film:
-                    video.add(headed(image, panels))
-            self._board.add_image(f"preview/{number}", sheet, step, dataformats="HWC")
-        self._board.flush()
+        with self._writing("previews"):
+            (self._out / "previews").mkdir(exist_ok=True)
+            for number, film in enumerate(films):
+                sheet = add_header(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
+                path = self._out / "previews" / f"step-{step:07d}-{number}"
+                path.with_suffix(".png").write_bytes(png_bytes(sheet))
+                with Video(path.with_suffix(".mp4"), FRAMES_PER_SECOND) as video:
+                    for image in film:
+                        video.add(add_header(image, panels))
+                self._board.picture(f"preview/{number}", sheet, step)
 
     def _note(self, values: Mapping[str, float]) -> str:
         wait = values["data_wait_seconds"]
@@ -210,8 +223,10 @@ class Reporter:
         left = self._seconds - spent if self._seconds else math.inf
         if self._total:
             left = min(left, (self._total - self._step) * spent / max(1, self._step - self._first))
-        # The loss of a step swings with its samples; that of the held-out batch shows what is learnt.
+        # The loss of a step swings with its samples; that of the held-out batch shows what is learnt. It is shown once:
+        # later readings would repeat a value that was not measured then.
         held_out = "" if self._held_out is None else f"held out {self._held_out:.4f}  "
+        self._held_out = None
         return (
             f"{held_out}loss {values['total']:.4f}  {values['steps_per_second']:.2f} it/s  "
             f"data wait {wait * values['steps_per_second']:.0%}  ETA {_clock(max(0.0, left))}"
@@ -260,9 +275,10 @@ def _planned_steps(dataset: V2VStreamDataset, config: TrainConfig) -> int | None
 
 
 def _drop_after(path: Path, step: int) -> None:
-    """A run that goes on from an earlier checkpoint repeats the steps after it."""
+    """Drop the records that a run will write again: those after ``step``, and with 0 all of them."""
     if path.exists():
-        kept = [json.dumps(record) + "\n" for record in read_metrics(path) if record["step"] <= step]
+        records = read_metrics(path) if step else []
+        kept = [json.dumps(record) + "\n" for record in records if record["step"] <= step]
         with replacing(path) as file:
             file.write("".join(kept).encode())
 

@@ -6,19 +6,16 @@ this device. Both lie on the grid of a step's earlier frame, [2, H, W] (x, y) in
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from trainer import pictures
-from trainer.evaluation.config import folder_config
-from trainer.evaluation.evaluate import find_recordings
-from trainer.evaluation.flow import TITLES, FlowRun, evaluate_flow
+from trainer.evaluation.data_sets import DataSet
+from trainer.evaluation.flow import FlowRun, evaluate_flow
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.evaluation.windows import flow_windows
@@ -26,7 +23,6 @@ from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.models.sequence import VoxelNetwork
 from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
 from v2v_client import Batch
-from v2v_protocol.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,27 +122,9 @@ class Flow(Task):
             error = torch.linalg.vector_norm(last - truth, dim=2).mean()
         return {"end_point_error_px": error, "total": total}
 
-    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
-        """See :meth:`Task.validator`: AEE and 3PE on recordings with known flow, as ``v2v-eval`` gives them."""
-        if not recordings.exists():
-            raise UsageError(f"run.validate = {recordings}: no such file or folder")
-        (data_set,) = folder_config(recordings).data_sets
-        files = list(find_recordings(recordings, data_set).values())
-        for file in files:
-            with Recording(file) as recording:
-                flow_windows(recording)
-        run = FlowRun(network, VoxelSettings(bins=network.bins), str(self.device))
-
-        def scores() -> dict[str, float]:
-            training = network.training
-            found = [evaluate_flow(run, file, None)["network"].means for file in files]
-            network.train(training)
-            names = [name for name in TITLES if all(name in means for means in found)]
-            if not names:
-                raise UsageError(f"run.validate = {recordings}: no pixel with known flow")
-            return {name: float(np.mean([means[name] for means in found])) for name in names}
-
-        return scores
+    def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> FlowScorer:
+        """See :meth:`Task.recording_scorer`: AEE and 3PE as ``v2v-eval`` gives them; the baseline is no motion."""
+        return FlowScorer(FlowRun(network, voxels, str(self.device)))
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
         """Events, flow to be found, flow found; both in the colours of one scale."""
@@ -154,3 +132,21 @@ class Flow(Task):
         events = pictures.draw_events(voxels[sample, -len(truth) :].cpu().numpy())
         scale = pictures.flow_scale(truth)
         return pictures.side_by_side([events, pictures.draw_flow(truth, scale), pictures.draw_flow(found, scale)])
+
+
+@dataclass(frozen=True, slots=True)
+class FlowScorer:
+    """See :class:`trainer.tasks.task.RecordingScorer`."""
+
+    run: FlowRun
+
+    def check(self, path: Path, data_set: DataSet) -> None:
+        """Check that the recording has flow in the cut."""
+        with Recording(path) as recording:
+            flow_windows(recording, data_set.time_ranges[path.stem])
+
+    def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> dict[str, float]:
+        """Return means over the windows."""
+        found = evaluate_flow(self.run, path, data_set.time_ranges[path.stem])
+        zeros = {f"zeros_{name}": value for name, value in found["zeros"].means.items()} if baseline else {}
+        return found["network"].means | zeros

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,10 +10,9 @@ import torch
 from torch import Tensor
 
 from trainer import pictures
-from trainer.evaluation.config import folder_config
-from trainer.evaluation.evaluate import Run, check_data_set, evaluate_data_set
+from trainer.evaluation.data_sets import DataSet
+from trainer.evaluation.evaluate import Run, check_recording, evaluate_sequence
 from trainer.evaluation.metrics import make_metrics
-from trainer.evaluation.score import mean_over_sequences
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.losses.backbones import BACKBONES
 from trainer.losses.lpips import HEADS_FROM, LPIPS
@@ -113,29 +111,17 @@ class Reconstruction(Task):
             truth["flow"] = self._flow(batch, frames)
         return Work(voxels=batch.arrays["voxels"].to(self.device), truth=truth, guide=self._guide(frames, epoch))
 
-    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
-        """See :meth:`Task.validator`: LPIPS by the network that the loss names, where its files are given; MSE and how
-        much pictures lack in correlation."""
-        if not recordings.exists():
-            raise UsageError(f"run.validate = {recordings}: no such file or folder")
+    def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> PictureScorer:
+        """See :meth:`Task.recording_scorer`.
+
+        Scores are LPIPS by the network that the loss names, if its files are given, MSE, and 1 - correlation as
+        ``correlation_lacking``. The baseline is a blank picture in the mean grey of each target.
+        """
         chosen, files = self.settings, {}
         if chosen.lpips_backbone and chosen.lpips_heads:
             files[chosen.lpips_network] = (chosen.lpips_backbone, chosen.lpips_heads)
         metrics = make_metrics([*(f"lpips_{net}" for net in files), "mse", "correlation"], files, str(self.device))
-        (data_set,) = folder_config(recordings).data_sets
-        run = Run(network, VoxelSettings(bins=network.bins), metrics, str(self.device))
-        check_data_set(run, recordings, data_set)
-
-        def scores() -> dict[str, float]:
-            training = network.training
-            means = mean_over_sequences(list(evaluate_data_set(run, recordings, data_set)))
-            network.train(training)
-            if not means:
-                raise UsageError(f"run.validate = {recordings}: no recording has pictures to compare with")
-            means["correlation_lacking"] = 1 - means.pop("correlation")
-            return means
-
-        return scores
+        return PictureScorer(Run(network, voxels, metrics, str(self.device)))
 
     def _flow(self, batch: Batch, frames: Tensor) -> Tensor:
         first = self.settings.temporal_first_step
@@ -165,6 +151,27 @@ class Reconstruction(Task):
             *(pictures.draw_grey(x[sample, :, 0].cpu().numpy()) for x in (work.truth["frames"], prediction)),
         ]
         return pictures.side_by_side(panels)
+
+
+@dataclass(frozen=True, slots=True)
+class PictureScorer:
+    """See :class:`trainer.tasks.task.RecordingScorer`."""
+
+    run: Run
+
+    def check(self, path: Path, data_set: DataSet) -> None:
+        """Check that the recording has the pictures of the cut."""
+        check_recording(self.run, path, data_set)
+
+    def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> dict[str, float]:
+        """Return means over the pictures."""
+        found = evaluate_sequence(replace(self.run, score_blank=baseline), path, data_set)
+        scores = {"": found.means, "constant_grey_": found.blank}
+        return {
+            prefix + name.replace("correlation", "correlation_lacking"): 1 - value if name == "correlation" else value
+            for prefix, means in scores.items()
+            for name, value in means.items()
+        }
 
 
 def _loss(settings: ReconstructionSettings) -> ReconstructionLoss:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
+from trainer.evaluation.data_sets import DataSet
+from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models.sequence import Guide, VoxelNetwork
 from trainer.pictures import Image
 from trainer.precision import ieee_products
@@ -70,6 +72,26 @@ class Work:
             )
             for i in range(count)
         ]
+
+
+class RecordingScorer(Protocol):
+    """Scores a network on single recordings of a data set, within its cuts."""
+
+    def check(self, path: Path, data_set: DataSet) -> None:
+        """Check, without running the network, that a recording can be scored.
+
+        Raises:
+            UsageError: it cannot, and why.
+        """
+
+    def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> Mapping[str, float]:
+        """Return the scores by name, lower is better, the decisive one first.
+
+        With ``baseline``, scores of what needs no network follow.
+
+        Raises:
+            UsageError: the recording is damaged, or the output of the network is not finite.
+        """
 
 
 class Task(abc.ABC):
@@ -133,20 +155,14 @@ class Task(abc.ABC):
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> Image:
         """What the network saw of one sample, made of it, and should have made: [T, height, width, 3] uint8 RGB."""
 
-    def validator(self, network: VoxelNetwork, recordings: Path) -> Callable[[], dict[str, float]]:
-        """What scores a network on recordings.
-
-        Args:
-            network: as it is whenever the function is called.
-            recordings: a file, or a folder of them, as ``v2v-eval --data`` takes.
-
-        Returns:
-            a function that gives scores by name. The first decides which network is the best; lower is better.
+    def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> RecordingScorer:
+        """Return what scores ``network``, as it is at each call, on recordings in voxel grids of that kind.
 
         Raises:
-            UsageError: there are none, or this task has no such scores.
+            UsageError: this task has no such scores.
         """
-        raise UsageError(f"run.validate = {recordings}: {type(self).__name__} has no such scores")
+        del network, voxels
+        raise UsageError(f"run.validate: {type(self).__name__} does not score recordings; leave the key out")
 
     @torch.no_grad()
     @ieee_products()

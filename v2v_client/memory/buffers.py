@@ -1,10 +1,10 @@
-"""Memory for batches that is used again, but never while anything still looks at it.
+"""Reuse memory of earlier batches, but never while it is still referenced.
 
-Fresh memory costs more than the copy into it: the kernel hands out zeroed pages one fault at a time. So memory whose
-last user is gone (:func:`v2v_client.memory.arena.lend`) is kept for the next batch.
+Fresh memory costs more than the copy into it, because the kernel hands out zeroed pages one fault at a time. So memory
+whose last user is gone (:func:`v2v_client.memory.arena.lend`) is kept for the next batch.
 
-A process that was forked while somebody looked at an arena may look at it for as long as it likes, and nobody here
-would know: such an arena is not used again.
+An arena that was in use during a fork is not reused: the child may refer to it indefinitely, and this process cannot
+find out.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from v2v_protocol.sample import Layout
 
 
 class BatchMemory:
-    """The rows of one batch that is being filled.
+    """Hold the rows of one batch that is being filled.
 
-    Its workers may put samples into the slots of an arena. Where a sample came otherwise, and a worker may still write
-    to its slot, the batch leaves the arena for memory that no other process can reach.
+    Workers may write samples into the slots of an arena. If a sample arrives in a message while a worker may still
+    write to its slot, the batch moves from the arena to private memory, which no other process can reach.
 
     Args:
-        buffers: where memory of its own comes from.
-        arena: where workers may put samples; None for memory of its own from the beginning.
+        buffers: source of private memory.
+        arena: memory with slots for workers; None uses private memory from the beginning.
 
     Attributes:
-        lent: whether there were slots.
-        in_place: samples that a worker put into their row.
+        has_slots: whether the batch started with an arena.
+        in_place: number of samples that a worker wrote into their row.
     """
 
     def __init__(self, buffers: BatchBuffers, arena: Arena | None) -> None:
@@ -43,20 +43,20 @@ class BatchMemory:
         self._own = buffers.arrays() if arena is None else {}
         self._left: Arena | None = None
         self._filled: list[int] = []
-        self.lent = arena is not None
+        self.has_slots = arena is not None
         self.in_place = 0
 
     def slot(self, row: int) -> Slot | None:
-        """Where a worker of this host may put the sample of that row."""
+        """Return where a worker on this host may write the sample of that row; None without an arena."""
         return None if self._arena is None else self._arena.slot(row)
 
     def fill(self, row: int, arrays: Mapping[str, npt.NDArray[Any]] | None, *, slot_is_free: bool = True) -> None:
-        """A sample has come.
+        """Store an arrived sample.
 
         Args:
-            row: of the batch.
-            arrays: copied into it; None where a worker has put them into the row's slot.
-            slot_is_free: whether no worker writes to that slot any more.
+            row: 0 .. batch size - 1.
+            arrays: copied into the row; None if a worker has written them into the row's slot.
+            slot_is_free: False if a worker may still write to that slot.
         """
         if not slot_is_free and self._arena is not None:
             self._left, self._arena, self._own = self._arena, None, self._buffers.arrays()
@@ -77,13 +77,13 @@ class BatchMemory:
         for name, array in arrays.items():
             self._own[name][row] = array
 
-    def whole(self) -> dict[str, npt.NDArray[Any]]:
-        """All rows of each array, once they are filled. To be called once, and nothing else after it."""
-        return self._own if self._arena is None else self._buffers.lent_arrays(self._arena)
+    def finish(self) -> dict[str, npt.NDArray[Any]]:
+        """Return all rows of each array, once they are filled. Call this once, as the last call."""
+        return self._own if self._arena is None else self._buffers.lend_arrays(self._arena)
 
 
 class BatchBuffers:
-    """The memory of a dataset's batches, which one iteration leaves to the next."""
+    """Keep the memory of a dataset's batches from one iteration to the next."""
 
     def __init__(self) -> None:
         self._form: tuple[Layout, int, int] = {}, 0, 0
@@ -92,12 +92,12 @@ class BatchBuffers:
         self._arenas: deque[Arena] = deque()
 
     def shape(self, layout: Layout, batch_size: int, spare: int) -> None:
-        """What is taken from now on is for batches of that many samples; memory of another form is let go.
+        """Set the form of the batches taken from now on; memory of another form is released.
 
         Args:
-            layout: of one sample.
+            layout: dtype and shape of each array of one sample.
             batch_size: samples of a batch.
-            spare: most batches kept while nobody uses them.
+            spare: maximum number of unused batches to keep.
         """
         form = dict(layout), batch_size, spare
         if form != self._form:
@@ -105,15 +105,15 @@ class BatchBuffers:
             self._free, self._arenas = deque(maxlen=spare), deque(maxlen=spare)
 
     def take(self, *, shared: bool) -> BatchMemory:
-        """Memory for a batch, of unspecified content.
+        """Return memory for a batch, with unspecified content.
 
         Args:
-            shared: with slots for the workers of this host, where the system has such memory.
+            shared: whether it has slots for workers on this host, if the system supports that.
         """
         return BatchMemory(self, self._take_arena() if shared else None)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays for a batch that no other process can reach; they come back when nothing looks at them any more."""
+        """Return private arrays for a batch. Their memory comes back once nothing refers to them."""
         layout, batch_size, _ = self._form
         try:
             memory = self._free.pop()
@@ -124,13 +124,15 @@ class BatchBuffers:
     def _take_arena(self) -> Arena | None:
         while self._arenas:
             arena = self._arenas.pop()
-            if arena.process == os.getpid():  # otherwise the process that this one was forked from may go on with it
+            if arena.process == os.getpid():  # otherwise the parent, from which this process was forked, may use it
                 return arena
         return open_arena(*self._form[:2])
 
-    def lent_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
-        """The arrays of an arena whose batch is whole; it comes back when nothing looks at them any more. One whose
-        batch never became whole does not."""
+    def lend_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
+        """Return the arrays of an arena whose batch is complete. The arena comes back once nothing refers to them.
+
+        An arena whose batch was never completed does not come back.
+        """
         free, forks = self._arenas, _forks
 
         def unused() -> None:

@@ -1,6 +1,7 @@
-"""Which slot a sample may come to lie in, and what its arrival means for that (:mod:`v2v_protocol.arena`). Pure.
+"""Track which slot each sample may be written to, and what its arrival means for the slot. Pure.
 
-Where none are offered (the system has no such memory, or it is not wanted) samples come in messages.
+See :mod:`v2v_protocol.arena`. If no slots are offered (not supported by the system, or disabled), samples arrive in
+messages.
 """
 
 from __future__ import annotations
@@ -13,29 +14,29 @@ from v2v_protocol.messages import Want
 
 
 class Answer(Enum):
-    """What an arrival means for the slot of its sample."""
+    """Say what an arrival means for the slot of its sample."""
 
-    THERE = auto()  # the arrays lie in it, and nobody writes there any more
-    MESSAGE = auto()  # the arrays came in the message, and nobody writes to the slot, if there was one
-    ABANDONED = auto()  # the same, but a worker may still write to the slot
-    NOWHERE = auto()  # the arrays were put into a slot that is not this sample's: nobody can read them
+    THERE = auto()  # the arrays are in the slot, and no worker writes there any more
+    MESSAGE = auto()  # the arrays came in the message, and no worker writes to the slot, if there was one
+    ABANDONED = auto()  # the arrays came in the message, but a worker may still write to the slot
+    NOWHERE = auto()  # the arrays were written to another sample's slot and cannot be read
 
 
 class Slots:
-    """Keeps account of the slots that the requests of one connection name, not of their bytes."""
+    """Track the slots named in the requests of one connection, without their bytes."""
 
     def __init__(self) -> None:
         self._offered: dict[int, Slot] = {}
         self._named: dict[int, Slot] = {}
 
     def offer(self, slots: Mapping[int, Slot]) -> None:
-        """Where samples may come to lie that were never asked for yet, by index."""
+        """Offer slots, by index, for samples that were never requested yet."""
         self._offered.update(slots)
 
     def want(self, epoch: int, indices: Sequence[int]) -> Want:
-        """A request for samples, each with the slot that was offered for it.
+        """Build a request for samples, each with the slot that was offered for it.
 
-        One that was asked for before is asked for without: its first worker may be at it still, and has one.
+        A repeated request names no slot, because the first worker may still be writing to it.
         """
         slots = [self._offered.pop(index, None) for index in indices]
         self._named.update({index: slot for index, slot in zip(indices, slots, strict=True) if slot is not None})
@@ -48,13 +49,13 @@ class Slots:
             tuple(NO_SLOT if slot is None else slot.number for slot in slots),
         )
 
-    def answered(self, index: int, number: int, *, in_message: bool) -> Answer:
-        """A sample arrived.
+    def record_arrival(self, index: int, number: int, *, in_message: bool) -> Answer:
+        """Record that a sample arrived, and return what that means for its slot.
 
         Args:
-            index: which.
-            number: of the slot that its header names.
-            in_message: whether the arrays came with it.
+            index: global index of the sample.
+            number: slot number in the sample's header.
+            in_message: whether the message contained the arrays.
         """
         slot = self._named.get(index)
         returned = slot is not None and number == slot.number

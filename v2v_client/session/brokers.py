@@ -1,9 +1,9 @@
-"""Which of several brokers a consumer takes from, and whose turn it is when that one is lost. Pure.
+"""Choose which of several brokers a consumer uses, and in which order it tries the others. Pure.
 
-All of them make the same samples, so the choice moves load and nothing else. Consumers (the loader workers of all
-ranks, in the order of the ranks) are dealt to the list in blocks of neighbours: where launchers number the ranks host
-by host, and the list has a broker for each host in that order, every host takes from its own. The consumers of a lost
-broker are spread over all others.
+All brokers make the same samples, so the choice only distributes load. Consumers (the loader workers of all ranks, in
+the order of the ranks) are assigned to the list in contiguous blocks. If the launcher numbers ranks host by host, and
+the list has one broker per host in the same order, every host uses its own broker. The consumers of a lost broker are
+spread over all others.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from v2v_protocol.errors import UsageError
 
 
 def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
-    """The addresses in a list, or in a text with commas between them.
+    """Return the addresses of a list or of a comma-separated text.
 
     Raises:
-        UsageError: there is none, or one comes twice.
+        UsageError: there is no address, or one occurs twice.
     """
     texts = given.split(",") if isinstance(given, str) else given
     found = tuple(text.strip() for text in texts)
     if not found or not all(found):
         raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
     if len(set(found)) < len(found):
-        raise UsageError(f"address {given!r}: the same broker twice")
+        raise UsageError(f"address {given!r}: a broker occurs twice; give each once")
     return found
 
 
 def order(brokers: Sequence[str], consumer: int, consumers: int) -> tuple[str, ...]:
-    """All brokers, in the order in which a consumer turns to them.
+    """Return all brokers, in the order in which a consumer tries them.
 
     Args:
         brokers: their addresses, the same list for every consumer.
-        consumer: its number, 0 <= consumer < consumers.
-        consumers: how many there are.
+        consumer: the consumer's number, 0 <= consumer < consumers.
+        consumers: number of consumers.
     """
     home = consumer * len(brokers) // consumers
     others = [*brokers[home + 1 :], *brokers[:home]]

@@ -1,10 +1,10 @@
-"""The consumer's end of the wire: a conversation (:mod:`v2v_client.session.conversation`) held over a link.
+"""Run a conversation (:mod:`v2v_client.session.conversation`) with a server over a link.
 
-Memory: the socket has no high-water mark, because the credit is the limit: the server never has more than ``credit``
-answers under way, so at most credit x sample bytes wait here, twice that in the moments after asking again. Workers on
-this host put them into slots that are lent to them (:mod:`v2v_client.memory`).
+Memory: the socket has no high-water mark, because the credit is the limit. The server never has more than ``credit``
+answers under way, so at most credit x sample bytes wait here, or twice that shortly after requests were repeated.
+Workers on this host write samples into slots of this process (:mod:`v2v_client.memory`) instead.
 
-A connection belongs to the process that made it; its ZeroMQ context is made when it is opened, never before a fork.
+A connection belongs to the process that opened it. Its ZeroMQ context is created on opening, never before a fork.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import WAITS_TOLD_SECONDS, Arrival, Conversation, Event, State
+from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, State
 from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_protocol.arena import Slot
@@ -28,25 +28,25 @@ from v2v_protocol.sample import Layout, Provenance
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
-"""How long closing may take to get the Goodbye out: without it the server would go on with what was asked for."""
+"""Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""
 _NO_SLOTS: Mapping[int, Slot] = {}
 
 _log = logging.getLogger(__name__)
 
 
 class Connection:
-    """A consumer's session with a server, for one epoch.
+    """Hold a consumer's session with a server for one epoch.
 
     Args:
-        address: ``tcp://host:port``; or several, in the order in which they are turned to. Where one is silent for
+        address: ``tcp://host:port``, or several in the order in which they are tried. If one is silent for
             ``patience.takeover_seconds``, or has no worker, the next takes over.
-        hello: what to ask for.
-        epoch: of the samples to ask for.
-        pinned: the stream that the server must offer; None takes what it offers.
-        pinned_by: what pinned it, in words, for the message of a mismatch.
-        patience: when to ping, to ask again and to give up.
-        clock: seconds, never going back.
-        transport: makes the link to an address.
+        hello: the first message, with the requested spec and arrays.
+        epoch: epoch of the samples to request.
+        pinned: the stream that the server must offer; None accepts any.
+        pinned_by: what pinned it, in words for the message of a mismatch.
+        patience: timeouts for pinging, repeating requests and giving up; None for the defaults.
+        clock: monotonic, in seconds.
+        transport: creates the link to an address.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Connection:
     ) -> None:
         hello = replace(hello, secret=secrets.token_bytes(32))
         self._brokers = (address,) if isinstance(address, str) else tuple(address)
-        self._moves = 0  # from one broker to the next since the last sample
+        self._moves = 0  # changes of broker since the last sample
         self._address = self._brokers[0]
         self._is_pinned = pinned is not None
         self._patience = patience or Patience()
@@ -76,26 +76,26 @@ class Connection:
         self._conversation = Conversation(
             self._address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
         )
-        self._last_sample = self._now()  # or the beginning
+        self._last_sample = self._now()  # initially the time of creation
 
     @property
     def address(self) -> str:
-        """Of the broker that is spoken to."""
+        """Return the address of the current broker."""
         return self._address
 
     @property
     def stream(self) -> StreamIdentity:
-        """What the server offers; known once this is open."""
+        """Return the stream that the server offers; available once the connection is open."""
         return self._conversation.stream
 
     @property
     def credit(self) -> int:
-        """Most samples asked for and not received."""
+        """Return the maximum number of samples requested and not received."""
         return self._conversation.credit
 
     @property
     def layout(self) -> Layout:
-        """Dtype and shape of each array of one sample."""
+        """Return dtype and shape of each array of one sample."""
         return self._conversation.layout
 
     def provenance(self, header: SampleHeader) -> Provenance:
@@ -108,16 +108,16 @@ class Connection:
     # --- opening and closing ------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Says Hello and waits for the Welcome.
+        """Send Hello and wait for the Welcome.
 
-        The largest frame the socket accepts is known only with the layout. So where no stream is pinned yet, a first
-        socket that accepts nothing larger than a header asks for it.
+        The largest frame that the socket may accept follows from the layout. So if no stream is pinned yet, a first
+        socket, which accepts frames no larger than a header, requests the layout.
 
         Raises:
             ServerLost: no answer within the deadline.
             RemoteError: the server refuses the spec.
-            StateMismatch: it offers another stream than the pinned one.
-            UsageError: the address, or the arrays, are not understood.
+            StateMismatch: the server offers another stream than the pinned one.
+            UsageError: the address is malformed, or an array is unknown.
         """
         self._link = self._transport(self._address)
         try:
@@ -128,28 +128,27 @@ class Connection:
             self._largest_frame_bytes = largest_frame_bytes(self._conversation.form.sizes)
             self._open_link().connect(self._largest_frame_bytes)
             self._await_welcome()
-            self._listening.pause(self._clock())  # until here we listened
+            self._listening.pause(self._clock())  # opening counts as listening
         except BaseException:
             self.close()
             raise
 
     def _await_welcome(self) -> None:
-        self._conversation.happens(Event.OPENED, self._now())
+        self._conversation.handle_event(Event.OPENED, self._now())
         while self._conversation.state is not State.WELCOMED:
             self._step(wait=True)
 
     def _leave(self, link: Transport) -> None:
-        """Tells the server, where that does not take long."""
+        """Send Goodbye, without waiting for a silent server."""
         quiet = self._conversation.silence(self._now()) >= self._patience.ping_seconds
         self._conversation.outbox.clear()
-        self._conversation.happens(Event.LEFT, self._now())
-        with suppress(ServerLost):  # nobody to tell
+        self._conversation.handle_event(Event.LEFT, self._now())
+        with suppress(ServerLost):  # no server to send it to
             self._send(link)
         link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
 
     def close(self) -> None:
-        """Leaves the server and frees socket, context and thread. May be called again, and in a forked child, where it
-        does nothing."""
+        """Leave the server and free socket, context and thread. Later calls and calls in a forked child do nothing."""
         if os.getpid() != self._process:
             return
         link, self._link = self._link, None
@@ -162,30 +161,30 @@ class Connection:
     # --- asking and receiving -----------------------------------------------------------------------------------------
 
     def want(self, indices: Iterable[int], slots: Mapping[int, Slot] = _NO_SLOTS) -> None:
-        """Asks for samples, as soon as the credit allows.
+        """Request samples as soon as the credit allows.
 
         Args:
-            indices: of the samples.
-            slots: where some of them may come to lie, if they were never asked for before.
+            indices: global indices of the samples.
+            slots: by index, where workers may write samples that were never requested before.
 
         Raises:
             ServerLost: this connection was closed.
-            UsageError: it was opened by another process, from which this one was forked.
+            UsageError: another process opened it, from which this one was forked.
         """
         link = self._open_link()
         self._conversation.want(indices, slots)
         self._send(link)
 
     def receive(self, *, wait: bool = True) -> Arrival | None:
-        """The next sample to arrive, whichever it is.
+        """Return the next sample to arrive, in any order.
 
         Args:
-            wait: False returns None when none is here yet.
+            wait: False returns None if no sample has arrived yet.
 
         Raises:
-            ServerLost: nothing was heard for ``timeout_seconds``, or this connection was closed.
-            UsageError: the connection was opened by another process, from which this one was forked.
-            V2VError: see :meth:`Conversation.hear`.
+            ServerLost: nothing was received for ``timeout_seconds``, or this connection was closed.
+            UsageError: another process opened the connection, from which this one was forked.
+            V2VError: see :meth:`Conversation.handle_message`.
         """
         began = self._clock()
         self._listening.listen(began)
@@ -194,14 +193,14 @@ class Connection:
                 arrival, idle = self._step(wait=wait)
                 if wait:
                     began, before = self._clock(), began
-                    self._conversation.waits(began - before, self._now())
+                    self._conversation.record_wait(began - before, self._now())
                 if arrival is not None or (idle and not wait):
                     return arrival
         finally:
             self._listening.pause(self._clock())
 
     def _step(self, *, wait: bool) -> tuple[Arrival | None, bool]:
-        """Does what is due, then handles one message: (a sample if it was one, whether no message came)."""
+        """Run due timers, then handle one message. Return (a sample, if one arrived; whether no message came)."""
         if len(self._brokers) > 1 and self._conversation.silence(self._now()) >= self._patience.takeover_seconds:
             self._take_over("silent")
         try:
@@ -216,10 +215,10 @@ class Connection:
         return arrival, idle
 
     def _take_over(self, reason: str) -> None:
-        """The next broker's turn. It is asked for all that is unanswered: where we stand, no broker has to know.
+        """Switch to the next broker and send it all unanswered requests. Brokers need no state of this consumer.
 
         Raises:
-            ServerLost: all of them had their turn, and the time is over.
+            ServerLost: all brokers had their turn, and ``timeout_seconds`` have passed.
         """
         now, waited = self._now(), self._now() - self._last_sample
         if self._moves >= len(self._brokers) - 1 and waited >= self._patience.timeout_seconds:
@@ -241,15 +240,15 @@ class Connection:
         if conversation.tick(self._now()):
             link.connect(self._largest_frame_bytes, again=True)
         self._send(link)
-        seconds = min(conversation.next_due(self._now()), WAITS_TOLD_SECONDS) if wait else 0.0
+        seconds = min(conversation.next_due(self._now()), WAIT_REPORT_SECONDS) if wait else 0.0
         due = self._clock() + seconds
         frames = link.receive(seconds)
-        self._listening.woke(self._clock(), due)
+        self._listening.wake(self._clock(), due)
         arrival = None
         if frames is not None:
-            arrival = conversation.hear(decode(frames[0]), frames[1:], self._now())
-        elif link.remade():
-            conversation.happens(Event.CUT, self._now())
+            arrival = conversation.handle_message(decode(frames[0]), frames[1:], self._now())
+        elif link.has_reconnected():
+            conversation.handle_event(Event.DISCONNECTED, self._now())
         self._send(link)
         return arrival, frames is None
 

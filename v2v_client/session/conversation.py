@@ -1,17 +1,20 @@
-"""What a consumer and its server say to each other, as a machine of three states. Pure: messages in, messages out, and
-the time is passed in, in seconds of listening (:class:`v2v_client.session.liveness.ListeningClock`).
+"""Implement the consumer's side of the protocol as a state machine with three states.
 
-Entering a state, be it from itself, is what makes us speak:
+It is pure: messages in, messages out. The time is passed in, as seconds of listening
+(:class:`v2v_client.session.liveness.ListeningClock`).
 
-    GREETING    says Hello, and again, ever more rarely, until Welcome comes: either may have been lost
-    WELCOMED    asks for everything that is unanswered; may ask for more
+Entering a state, even from itself, sends messages:
 
-:data:`TRANSITIONS` has what leads where. An event that a state has no entry for changes nothing. After a restart, a
-server that does not know us denies what we send; we say Hello with the resolved spec, and it must offer the same stream
-as before. That everything is asked for again can make a sample twice; the reorder window drops the second.
+    GREETING    sends Hello, and repeats it at growing intervals until Welcome arrives, because either may be lost
+    WELCOMED    sends all unanswered requests again, and may send more
 
-Three things are no events but errors: nothing heard for ``timeout_seconds`` (ServerLost); for as long, a server that
-answers, but has no worker that could make a sample (NoWorkers); and whatever no server of ours says (ProtocolError).
+:data:`TRANSITIONS` defines which event leads from one state to another. Events without an entry change nothing. After a
+restart, the server does not know the consumer and denies its requests. The consumer then sends Hello with the resolved
+spec, and the server must offer the same stream as before. Repeated requests can make a sample arrive twice; the reorder
+window drops the second one.
+
+Three conditions raise errors: nothing received for ``timeout_seconds`` (ServerLost); for the same time, a server that
+answers but has no worker to make a sample (NoWorkers); and messages that break the protocol (ProtocolError).
 """
 
 from __future__ import annotations
@@ -50,23 +53,23 @@ from v2v_protocol.wire import Buffer, decode_map, decode_sample, layout_of
 
 
 class State(Enum):
-    """Where a conversation stands."""
+    """List the states of a conversation."""
 
-    CLOSED = auto()  # nobody was spoken to yet, or not any more
-    GREETING = auto()  # Hello was said
-    WELCOMED = auto()  # the server knows us
+    CLOSED = auto()  # before Hello, or after Goodbye
+    GREETING = auto()  # Hello was sent
+    WELCOMED = auto()  # the server has answered Hello
 
 
 class Event(Enum):
-    """What moves it."""
+    """List the events that change the state."""
 
-    OPENED = auto()  # there is a link
+    OPENED = auto()  # a link is open
     WELCOME = auto()  # the server answered Hello
-    FORGOTTEN = auto()  # it does not know us: it was restarted, or we were silent for too long
-    CUT = auto()  # the network was cut and is back: what was under way in either direction may be lost
-    UNANSWERED = auto()  # the server lives, but no request was answered for long: messages may be lost
-    SILENCE = auto()  # nothing at all was heard for as long: the link itself is suspect, and is made anew
-    LEFT = auto()  # we said Goodbye
+    FORGOTTEN = auto()  # the server does not know the session: it was restarted, or the consumer was silent too long
+    DISCONNECTED = auto()  # the network was interrupted and is back: messages under way in either direction may be lost
+    UNANSWERED = auto()  # the server is alive, but no request was answered for a while: messages may be lost
+    SILENCE = auto()  # nothing was received for the same time: the link may be broken and is opened again
+    LEFT = auto()  # the consumer leaves: Goodbye
 
 
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
@@ -75,25 +78,25 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     },
     State.GREETING: {
         Event.WELCOME: State.WELCOMED,
-        Event.CUT: State.GREETING,
+        Event.DISCONNECTED: State.GREETING,
         Event.SILENCE: State.GREETING,
         Event.LEFT: State.CLOSED,
     },
     State.WELCOMED: {
         Event.WELCOME: State.WELCOMED,
         Event.FORGOTTEN: State.GREETING,
-        Event.CUT: State.WELCOMED,
+        Event.DISCONNECTED: State.WELCOMED,
         Event.UNANSWERED: State.WELCOMED,
         Event.SILENCE: State.GREETING,
         Event.LEFT: State.CLOSED,
     },
 }
 
-WAITS_TOLD_SECONDS = 1.0
-"""From one word about how long samples are waited for to the next."""
+WAIT_REPORT_SECONDS = 1.0
+"""Interval at which the server is told how long this consumer has waited for samples."""
 _MOST_CREDIT_DENIALS = 3
 _WARN_SECONDS = 5.0
-"""So long after the last sign of hope a server without workers is worth a word."""
+"""A server without workers is logged after this time."""
 _NO_SLOTS: Mapping[int, Slot] = {}
 
 _log = logging.getLogger(__name__)
@@ -101,12 +104,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """One sample.
+    """Hold one received sample.
 
     Attributes:
-        header: what is said of it; its provenance is opened by :meth:`Conversation.provenance`.
-        arrays: read-only views of what was received, by name; None where a worker put them into their slot.
-        slot_is_free: whether no worker writes to its slot any more.
+        header: the sample's header; :meth:`Conversation.provenance` decodes its provenance.
+        arrays: read-only views of the received message, by name; None if a worker wrote them into the sample's slot.
+        slot_is_free: False if a worker may still write to the sample's slot.
     """
 
     header: SampleHeader
@@ -115,26 +118,26 @@ class Arrival:
 
 
 class Conversation:
-    """A consumer's side of a session, for one epoch.
+    """Hold a consumer's side of a session, for one epoch.
 
     Args:
-        address: of the server, for messages of errors.
-        hello: what to ask for.
-        epoch: of the samples to ask for.
-        pinned: the stream that the server must offer; None takes what it offers, and keeps to it.
-        pinned_by: what pinned it, in words, for the message of a mismatch.
-        patience: when to ping, to ask again and to give up.
-        now: the time.
+        address: of the server, for error messages.
+        hello: the first message, with the requested spec and arrays.
+        epoch: epoch of the samples to request.
+        pinned: the stream that the server must offer; None accepts the first offer and pins it.
+        pinned_by: what pinned it, in words for the message of a mismatch.
+        patience: timeouts for pinging, repeating requests and giving up.
+        now: the time, in seconds of listening.
 
     Attributes:
-        state: where it stands.
-        outbox: messages to be sent, in order; whoever sends them empties it.
-        stream: what the server offers, once welcomed.
-        layout: dtype and shape of each array of one sample, once welcomed.
-        credit: most samples asked for and not received.
-        strays: samples of another epoch, dropped.
-        waited_seconds: for how long samples were waited for since the last Hello; the server is told with each request,
-            while they are waited for once a second, and at the end.
+        state: the current state.
+        outbox: messages to send, in order; the caller sends them and empties it.
+        stream: the stream that the server offers; set in WELCOMED.
+        layout: dtype and shape of each array of one sample; set in WELCOMED.
+        credit: maximum number of samples requested and not received.
+        strays: number of dropped samples: of another epoch, or that cannot be read.
+        waited_seconds: time spent waiting for samples since the last Hello. It is sent with each request, once a second
+            while waiting, and with Goodbye.
     """
 
     stream: StreamIdentity
@@ -161,42 +164,42 @@ class Conversation:
         self._server = Liveness(
             now,
             gone_seconds=patience.timeout_seconds,
-            # Nobody is given up unasked.
+            # A server is always pinged before it counts as lost.
             ping_seconds=min(patience.ping_seconds, patience.timeout_seconds / 2),
         )
         self._rewant_seconds = min(patience.rewant_seconds, patience.timeout_seconds)
-        self._answered = now  # a request, or all were asked again
-        self._hope = now  # the last time that nothing spoke against a sample to come
+        self._answered = now  # last time that a request was answered, or all were repeated
+        self._available_at = now  # last time that the server had no obstacle to making samples
         self._warned = False
-        self._moved = False  # from a broker that had offered the stream
-        self._asked: dict[int, None] = {}  # sent and not answered, in that order
-        self._queued: deque[int] = deque()  # to be sent when the credit allows
+        self._moved = False  # whether the stream was offered by an earlier broker
+        self._asked: dict[int, None] = {}  # sent and not answered, in the order sent
+        self._queued: deque[int] = deque()  # to send when the credit allows
         self._hello_due = 0.0
         self._hello_wait = 0.0
         self._asked_again = False
-        self._owed = False  # a request was denied for credit since everything was asked again
+        self._owed = False  # whether a request was denied for credit since all requests were repeated
         self._credit_denials = 0
-        self._last: int | None = None  # last sample received
+        self._last: int | None = None  # index of the last sample received
         self._pinned: StreamIdentity | None = None
         self.state = State.CLOSED
         self.outbox: list[Message] = []
         self.credit = 0
         self.strays = 0
         self.waited_seconds = 0.0
-        self._waits_told_at = now
+        self._wait_reported_at = now
         if pinned is not None:
             self._pin(pinned)
 
     def move(self, address: str, now: float) -> None:
-        """Goes on with the broker at ``address``, over a link that was just made: it must offer the same stream."""
+        """Continue with the broker at ``address``, over a new link. It must offer the same stream."""
         if self._pinned is not None and not self._moved:
             self._pinned_by += f", begun at {self._address},"
             self._moved = True
         self._address = address
-        self._server.heard(now)
-        self._answered = self._hope = now
+        self._server.mark_heard(now)
+        self._answered = self._available_at = now
         self.outbox.clear()
-        self.happens(Event.SILENCE, now)
+        self.handle_event(Event.SILENCE, now)
 
     def _pin(self, stream: StreamIdentity) -> None:
         spec = stream.resolved
@@ -207,8 +210,8 @@ class Conversation:
 
     # --- states -------------------------------------------------------------------------------------------------------
 
-    def happens(self, event: Event, now: float) -> None:
-        """Moves on."""
+    def handle_event(self, event: Event, now: float) -> None:
+        """Change the state and queue the messages of the new one. Events without a transition do nothing."""
         state = TRANSITIONS[self.state].get(event)
         if state is None:
             return
@@ -225,25 +228,24 @@ class Conversation:
                 self.outbox.append(Goodbye(self.waited_seconds))
 
     def tick(self, now: float) -> bool:
-        """Does what the time demands.
+        """Run the timers that are due at ``now``.
 
         Returns:
-            whether the link is to be connected anew before the outbox is sent.
+            whether the link must be connected again before the outbox is sent.
 
         Raises:
-            ServerLost: nothing was heard for ``timeout_seconds``.
-            NoWorkers: for as long, nobody was there to make a sample.
+            ServerLost: nothing was received for ``timeout_seconds``.
         """
         if self._server.is_gone(now):
-            raise self._lost(now)
+            raise self._server_lost(now)
         if now - self._answered >= self._rewant_seconds:
             silent = self._server.silence(now) >= self._rewant_seconds
             self._answered = now
             self._rewant_seconds = min(2 * self._rewant_seconds, self._patience.timeout_seconds)
             if silent:
-                self.happens(Event.SILENCE, now)
+                self.handle_event(Event.SILENCE, now)
                 return True
-            self.happens(Event.UNANSWERED, now)
+            self.handle_event(Event.UNANSWERED, now)
         ping = self._server.ping_due(now)
         if self.state is State.GREETING:
             if now >= self._hello_due:
@@ -253,45 +255,45 @@ class Conversation:
         elif ping:
             if self._owed:
                 self._want_again()
-            # A server answers anybody's Ping; that it forgot us shows only when something is asked, be it nothing.
+            # A server answers every Ping, even of an unknown session. An empty request shows whether it knows this one.
             self.outbox += [Want(self._epoch, (), waited_seconds=self.waited_seconds), Ping()]
         return False
 
-    def waits(self, seconds: float, now: float) -> None:
-        """Samples have been waited for, so long since the last call, and still are."""
+    def record_wait(self, seconds: float, now: float) -> None:
+        """Add ``seconds`` spent waiting for samples since the last call, and report them once a second."""
         self.waited_seconds += seconds
-        if self.state is State.WELCOMED and now - self._waits_told_at >= WAITS_TOLD_SECONDS:
-            self._waits_told_at = now
+        if self.state is State.WELCOMED and now - self._wait_reported_at >= WAIT_REPORT_SECONDS:
+            self._wait_reported_at = now
             self.outbox.append(Want(self._epoch, (), waited_seconds=self.waited_seconds))
 
     def next_due(self, now: float) -> float:
-        """Seconds until :meth:`tick` has something to do, at least 0."""
+        """Return the seconds until :meth:`tick` has something to do, at least 0."""
         due = [self._server.next_due(now), self._answered + self._rewant_seconds - now]
         if self.state is State.GREETING:
             due.append(self._hello_due - now)
         return max(0.0, min(due))
 
     def silence(self, now: float) -> float:
-        """Seconds for which nothing was heard."""
+        """Return the seconds since the last message from the server."""
         return self._server.silence(now)
 
-    def _lost(self, now: float) -> ServerLost:
+    def _server_lost(self, now: float) -> ServerLost:
         last = (
             "no sample was received" if self._last is None else f"last sample: epoch {self._epoch}, index {self._last}"
         )
         return ServerLost(
-            f"{self._address}: nothing heard for {self._server.silence(now):.0f} s; {last}; start v2v-serve there, "
+            f"{self._address}: nothing received for {self._server.silence(now):.0f} s; {last}; start v2v-serve there, "
             f"or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
         )
 
     # --- asking -------------------------------------------------------------------------------------------------------
 
     def want(self, indices: Iterable[int], slots: Mapping[int, Slot] = _NO_SLOTS) -> None:
-        """Asks for samples, as soon as the credit allows.
+        """Request samples as soon as the credit allows.
 
         Args:
-            indices: of the samples.
-            slots: where some of them may come to lie, if they were never asked for before.
+            indices: global indices of the samples.
+            slots: by index, where workers may write samples that were never requested before.
         """
         self._queued.extend(indices)
         self._slots.offer(slots)
@@ -301,57 +303,58 @@ class Conversation:
         now = [self._queued.popleft() for _ in range(min(room, len(self._queued)))]
         if now:
             self._asked.update(dict.fromkeys(now))
-            # In one message: siblings are decoded together only if they are asked for together.
+            # In one message: siblings are decoded together only if they are requested together.
             self.outbox.append(replace(self._slots.want(self._epoch, now), waited_seconds=self.waited_seconds))
 
     def _want_again(self) -> None:
-        # In the order they were asked; after a Welcome with less credit, the rest waits its turn.
+        # In the original order. After a Welcome with less credit, the rest stays queued.
         self._asked_again = self._asked_again or bool(self._asked)
         self._queued.extendleft(reversed(self._asked))
         self._asked.clear()
         self._owed = False
         self.want(())
 
-    # --- hearing ------------------------------------------------------------------------------------------------------
+    # --- receiving ----------------------------------------------------------------------------------------------------
 
-    def hear(self, message: Message, arrays: list[Buffer], now: float) -> Arrival | None:
-        """A message came.
+    def handle_message(self, message: Message, arrays: list[Buffer], now: float) -> Arrival | None:
+        """Handle a received message.
 
         Args:
-            message: its first frame.
-            arrays: the raw frames behind it.
-            now: the time.
+            message: the decoded first frame.
+            arrays: the raw frames after it.
+            now: the time, in seconds of listening.
 
         Returns:
-            the sample, if it was one that was asked for.
+            the sample, if the message was a sample of this epoch; otherwise None.
 
         Raises:
-            NoWorkers: nobody has been there to make a sample for ``timeout_seconds``.
-            SampleUnavailable: the server cannot make a sample that was asked for.
+            NoWorkers: for ``timeout_seconds`` the server had no worker to make a sample.
+            SampleUnavailable: the server cannot make a requested sample.
             RemoteError: the server denies a request.
-            StateMismatch: it offers another stream than the pinned one.
-            ProtocolError: it sent what no server of ours sends.
+            StateMismatch: the server offers another stream than the pinned one.
+            ProtocolError: the message breaks the protocol.
         """
-        self._server.heard(now)
+        self._server.mark_heard(now)
         if isinstance(message, Pong):
-            self._hope_or_not(message.trouble, now)
+            self._check_for_workers(message.trouble, now)
         else:
-            self._answered = self._hope = now
+            self._answered = self._available_at = now
         if isinstance(message, SampleHeader):
             return self._sample(message, arrays)
         if arrays:
-            raise ProtocolError(f"{self._address} sent {type(message).__name__} with {len(arrays)} frames too many")
+            raise ProtocolError(f"{self._address} sent {type(message).__name__} with {len(arrays)} surplus frames")
         match message:
             case Pong():
                 pass
             case Welcome():
-                self._welcomed(message, now)
+                self._accept_welcome(message, now)
             case Denied(code=ErrorCode.UNKNOWN_SESSION):
-                # Every request that was under way is denied: one Hello answers them all.
-                self.happens(Event.FORGOTTEN, now)
+                # Every request under way is denied; a single Hello recovers all of them.
+                self.handle_event(Event.FORGOTTEN, now)
             case Denied(code=ErrorCode.CREDIT) if self._may_exceed_credit():
-                # It makes again what it had sent, on the way to us, when we asked again. What it denied stays asked
-                # for, in our account, and goes out again with the rest when such a sample comes, or when all is quiet.
+                # The server makes samples again that were already on their way when the requests were repeated, and
+                # these use up credit. The denied requests stay in _asked; they are sent again when such a sample
+                # arrives a second time, or with the next ping.
                 self._credit_denials += 1
                 self._owed = True
             case Denied():
@@ -364,26 +367,28 @@ class Conversation:
                     )
                 self.strays += 1
             case _:
-                raise ProtocolError(f"{self._address} sent {type(message).__name__}, which no server sends a consumer")
+                raise ProtocolError(
+                    f"{self._address} sent {type(message).__name__}, which servers do not send to consumers"
+                )
         return None
 
-    def _hope_or_not(self, trouble: str, now: float) -> None:
+    def _check_for_workers(self, trouble: str, now: float) -> None:
         if not trouble or not self._asked:
-            self._hope, self._warned = now, False
+            self._available_at, self._warned = now, False
             return
-        waited = now - self._hope
+        waited = now - self._available_at
         limit = self._patience.timeout_seconds
         text = f"{self._address}: no sample for {waited:.0f} s, because {trouble}"
         if waited >= limit:
             raise NoWorkers(f"{text}; or wait longer with timeout_seconds (now {limit:g})")
         if waited >= _WARN_SECONDS and not self._warned:
             self._warned = True
-            _log.warning("%s; this is waited for until %g s have passed (timeout_seconds)", text, limit)
+            _log.warning("%s; giving up after %g s (timeout_seconds)", text, limit)
 
     def _may_exceed_credit(self) -> bool:
         return self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS
 
-    def _welcomed(self, welcome: Welcome, now: float) -> None:
+    def _accept_welcome(self, welcome: Welcome, now: float) -> None:
         stream = StreamIdentity.of(welcome)
         if welcome.credit < 1:
             raise ProtocolError(f"{self._address} grants a credit of {welcome.credit} samples")
@@ -392,9 +397,9 @@ class Conversation:
         else:
             self._pinned.require_same(stream, ours=self._pinned_by, theirs=self._address)
         self.stream, self.credit = stream, welcome.credit
-        # A server that was restarted is asked to go on under what we have seen.
+        # After a restart, the server must continue with the newest quarantine snapshot seen.
         self._hello = replace(self._hello, quarantine=welcome.quarantine)
-        self.happens(Event.WELCOME, now)
+        self.handle_event(Event.WELCOME, now)
 
     def _sample(self, header: SampleHeader, frames: list[Buffer]) -> Arrival | None:
         if header.epoch != self._epoch:
@@ -409,30 +414,30 @@ class Conversation:
         again = header.index not in self._asked
         in_message = bool(frames) or header.slot == NO_SLOT
         arrays = decode_sample(header, frames, unpack) if in_message else None
-        answer = self._slots.answered(header.index, header.slot, in_message=in_message)
+        answer = self._slots.record_arrival(header.index, header.slot, in_message=in_message)
         if answer is Answer.NOWHERE:
             self.strays += 1
-            self._ask_on(again)
+            self._ask_for_more(again)
             return None
         self._hello = replace(self._hello, quarantine=max(self._hello.quarantine or 0, header.quarantine))
         self._asked.pop(header.index, None)
         self._credit_denials = 0
         self._last = header.index
-        self._ask_on(again)
+        self._ask_for_more(again)
         return Arrival(header, arrays, slot_is_free=answer is not Answer.ABANDONED)
 
-    def _ask_on(self, again: bool) -> None:
-        """After a sample; one that comes again held credit that we took for free."""
+    def _ask_for_more(self, again: bool) -> None:
+        """Send queued requests after a sample. A second copy (``again``) held credit that counted as free."""
         if again and self._owed:
             self._want_again()
         else:
             self.want(())
 
     def provenance(self, header: SampleHeader) -> Provenance:
-        """Where a sample came from. Opened once its batch is whole: many at once take less than one at a time.
+        """Decode a sample's provenance. Call this once its batch is complete: decoding many in a row is cheaper.
 
         Raises:
-            ProtocolError: it is that of another sample, or of none.
+            ProtocolError: the provenance is malformed or belongs to another sample.
         """
         identity = SampleId(
             spec_digest=self.stream.spec_digest,

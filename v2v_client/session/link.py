@@ -1,11 +1,12 @@
-"""The DEALER socket under a connection: frames in and out, and whether the network was cut in between.
+"""Send and receive frames over a connection's DEALER socket, and detect interruptions of the network.
 
-ZeroMQ connects again by itself after a cut, but it tells nobody, and what was under way is gone. Its monitor does tell:
-every handshake after the first means that messages may have been lost, so :meth:`Link.remade` says when to ask again.
+ZeroMQ reconnects by itself after a disconnect, but reports no error, and messages under way are lost. Its monitor shows
+it: every handshake after the first means that messages may have been lost. :meth:`Link.has_reconnected` tells the
+caller when to send its requests again.
 
-Two faults it does not repair by itself: a peer whose packets vanish without any error, and a stream of bytes that is
-no ZeroMQ stream any more (it then leaves the socket dead). For those a :class:`Link` can be connected again, under a
-new routing id: the server still holds the old one. It knows the consumer by the secret of its Hello.
+ZeroMQ does not recover from two faults: a peer whose packets vanish without an error, and a byte stream that is no
+longer ZeroMQ's (the socket is dead after that). For those a :class:`Link` can connect again, under a new routing id,
+because the server still holds the old one. The server recognises the consumer by the secret of its Hello.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
 
 
 class Transport(Protocol):
-    """What a connection needs of a link: a :class:`Link`, or the queues of a test. Closed, it raises ServerLost."""
+    """The interface of :class:`Link`, which tests implement with queues. After ``close`` methods raise ServerLost."""
 
     def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
         """See :meth:`Link.connect`."""
@@ -41,19 +42,19 @@ class Transport(Protocol):
     def receive(self, seconds: float) -> Frames | None:
         """See :meth:`Link.receive`."""
 
-    def remade(self) -> bool:
-        """See :meth:`Link.remade`."""
+    def has_reconnected(self) -> bool:
+        """See :meth:`Link.has_reconnected`."""
 
     def close(self) -> None:
         """See :meth:`Link.close`."""
 
 
 class Link:
-    """One socket to one address; a ZeroMQ context of its own, made here, so never before a fork.
+    """Hold one socket to one address, with its own ZeroMQ context. Create it after any fork, never before.
 
     Args:
         address: ``tcp://host:port``.
-        keys: file of this consumer's key; None takes what ``V2V_KEYS`` names, "" none.
+        keys: path of this consumer's key file; None uses the file that ``V2V_KEYS`` names, "" uses no key.
 
     Raises:
         KeyRefused: the key file cannot be used.
@@ -74,20 +75,20 @@ class Link:
         self._torn = False
 
     def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
-        """Opens a socket, in place of the one before, which is dropped with whatever it holds.
+        """Open a socket. The previous socket is dropped with all messages it holds.
 
         Args:
-            largest_frame_bytes: a peer that sends a larger frame is cut off before it is received.
-            again: the socket before gave no answer. If it never connected, another kind of address is tried.
+            largest_frame_bytes: a peer that sends a larger frame is disconnected before the frame is received.
+            again: True if the previous socket got no answer. If it never connected, the other IP version is tried.
 
         Raises:
-            UsageError: the address is not understood.
+            UsageError: the address is malformed.
         """
-        if again and self._monitor is not None and not self._shaken_hands():
-            # Of a name that stands for addresses of both kinds ("localhost", as a rule) ZeroMQ tries the first only.
+        if again and self._monitor is not None and not self._count_handshakes():
+            # If a name has IPv4 and IPv6 addresses ("localhost" usually does), ZeroMQ tries only the first.
             self._ipv6 = "[" in self._address or not self._ipv6
         self.disconnect(linger_ms=0)
-        with self._in_one_piece():
+        with self._mark_torn_on_error():
             socket = self._context.socket(zmq.DEALER)
             socket.setsockopt(zmq.ROUTING_ID, b"\x01" + os.urandom(15))  # a first byte of 0 is ZeroMQ's own
             socket.setsockopt(zmq.LINGER, 0)
@@ -116,52 +117,57 @@ class Link:
             raise UsageError(f"address {self._address!r}: {error}; give tcp://host:port") from error
 
     def disconnect(self, *, linger_ms: int) -> None:
-        """Drops the socket, if there is one; what was sent has ``linger_ms`` to leave, in the background."""
+        """Drop the socket, if there is one. Queued messages have ``linger_ms`` to leave, in the background."""
         socket, self._socket = self._socket, None
         monitor, self._monitor = self._monitor, None
-        with self._in_one_piece():
+        with self._mark_torn_on_error():
             if socket is not None:
                 socket.close(linger=linger_ms)
             if monitor is not None:
                 monitor.close()
 
     @contextmanager
-    def _in_one_piece(self) -> Iterator[None]:
-        """Marks the link as torn for good if an exception strikes in here. Only one that a signal's handler raises
-        does, and it may leave a socket open that is known to nobody but the frames of its traceback."""
+    def _mark_torn_on_error(self) -> Iterator[None]:
+        """Mark the link as torn permanently if the body raises.
+
+        Only a signal handler can raise here. Its exception may leave a socket open to which only the frames of the
+        traceback refer.
+        """
         before, self._torn = self._torn, True
         yield
         self._torn = before
 
     def close(self) -> None:
-        """Frees context and thread, after the time the socket was given to linger; where a signal has torn the link, in
-        the background, once nothing holds its sockets any more."""
+        """Free context and I/O thread once the socket has lingered.
+
+        If a signal has torn the link, this happens in the background, once nothing refers to its sockets.
+        """
         try:
             self.disconnect(linger_ms=0)
         finally:
             if self._torn:
-                # Terminating waits for every socket, and waiting here keeps the traceback alive that keeps one open.
+                # Terminating waits for every socket. Waiting here would keep the traceback alive that holds one open.
                 Thread(target=self._context.destroy, kwargs={"linger": 0}, daemon=True).start()
             else:
                 self._context.destroy(linger=0)
 
     def send(self, frames: Sequence[Any]) -> None:
-        """Queues a message; it is sent when the peer can be reached."""
+        """Queue a message. It is sent once the peer can be reached."""
         socket = self._open(self._socket)
         try:
             socket.send_multipart(frames, flags=zmq.NOBLOCK)
         except zmq.Again:
-            pass  # the handshake has failed already, and ended the connection for good: who receives hears why
+            pass  # the handshake failed, which ended the connection for good: receive() reports why
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot send: {error}") from error
 
     def receive(self, seconds: float) -> Frames | None:
-        """The next message; None when none came in that time, or the network was heard of instead."""
+        """Return the next message, or None if ``seconds`` passed or the monitor had an event instead."""
         socket = self._open(self._socket)
         try:
             if socket in dict(self._poller.poll(math.ceil(seconds * 1000))):
                 frames = [socket.recv(zmq.NOBLOCK, copy=False)]
-                while frames[-1].more:  # recv_multipart asks the socket instead, which takes longer
+                while frames[-1].more:  # recv_multipart asks the socket for this, which is slower
                     frames.append(socket.recv(zmq.NOBLOCK, copy=False))
                 return [frame.buffer for frame in frames]
             return None
@@ -170,18 +176,19 @@ class Link:
         except zmq.ZMQError as error:
             raise ServerLost(f"{self._address}: cannot receive: {error}") from error
 
-    def remade(self) -> bool:
-        """Whether ZeroMQ has connected again since the last call. To be asked when nothing is left to receive, or what
-        came before the cut would be taken for lost.
+    def has_reconnected(self) -> bool:
+        """Return whether ZeroMQ has reconnected since the last call.
+
+        Call this when nothing is left to receive; otherwise messages that came before the disconnect count as lost.
 
         Raises:
-            KeyRefused: the server takes no such key.
+            KeyRefused: the server does not accept this key.
         """
         before = self._handshakes.succeeded
-        return self._shaken_hands() > max(1, before)
+        return self._count_handshakes() > max(1, before)
 
-    def _shaken_hands(self) -> int:
-        """How often the socket has connected."""
+    def _count_handshakes(self) -> int:
+        """Return how often the socket has connected."""
         monitor = self._open(self._monitor)
         self._handshakes.take(lambda: monitor.poll(0), lambda: monitor.recv_multipart(flags=zmq.NOBLOCK))
         return self._handshakes.succeeded

@@ -1,6 +1,6 @@
-"""How long a consumer waits, and in which time: only time spent listening counts. Pure.
+"""Define how long a consumer waits for its server. Only time spent listening counts. Pure.
 
-A trainer that validates for ten minutes has not been kept waiting by the server, nor has one that was stopped.
+Time in which the trainer validates, or in which its process is stopped, does not count as silence of the server.
 """
 
 from __future__ import annotations
@@ -10,26 +10,27 @@ from dataclasses import dataclass
 from v2v_protocol.errors import UsageError
 
 _STOPPED_SECONDS = 1.0
-"""A wait that takes so much longer than was asked for: this process did not run."""
+"""If a wait exceeds its deadline by this much, the process was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """
+    """Hold a consumer's timeouts.
+
     Attributes:
-        ping_seconds: silence after which the server is asked whether it lives, and again as often; half of
-            ``timeout_seconds`` if that is less, because nobody is given up unasked.
-        rewant_seconds: time without an answer to any request after which all of them are sent again, although the
-            server lives: a cut of the network can swallow messages in either direction. If nothing at all was heard
-            in that time, another connection is made. The wait doubles each time, up to ``timeout_seconds``, so that a
-            network which is only slow is not flooded, nor left before it could answer.
-        timeout_seconds: silence after which the server is given up, and time without a sample after which one is that
-            has no worker to make it.
-        takeover_seconds: with several brokers, silence after which the next one is turned to. ServerLost is raised
-            after ``timeout_seconds``, once every one of them has had as long.
+        ping_seconds: silence after which the server is pinged, and the interval of further pings. It is at most half of
+            ``timeout_seconds``, so that the server is always pinged before it counts as lost.
+        rewant_seconds: time without an answer to any request after which all are sent again, although the server is
+            alive: a network interruption can lose messages in either direction. If nothing was received in that time,
+            a new connection is opened. The interval doubles each time, up to ``timeout_seconds``, so that a slow
+            network is neither flooded nor abandoned before it can answer.
+        timeout_seconds: silence after which the server counts as lost, and time without a sample after which a server
+            without workers does.
+        takeover_seconds: with several brokers, silence after which the next one is tried. ServerLost is raised after
+            ``timeout_seconds``, once each of them has had its turn.
 
     Raises:
-        UsageError: a time that is not positive.
+        UsageError: a time is not positive.
     """
 
     timeout_seconds: float = 60.0
@@ -44,26 +45,29 @@ class Patience:
 
 
 class ListeningClock:
-    """Seconds of listening, from those of the caller's clock (``now``), which never goes back."""
+    """Measure the seconds spent listening. ``now`` is the caller's monotonic clock, in seconds."""
 
     def __init__(self, now: float) -> None:
         self._away = 0.0
         self._paused = now
 
     def time(self, now: float) -> float:
-        """Seconds of listening so far, from an arbitrary beginning."""
+        """Return the seconds of listening so far, from an arbitrary origin."""
         return now - self._away
 
     def listen(self, now: float) -> None:
-        """The caller begins to listen; the time since :meth:`pause` does not count."""
+        """Start listening. The time since :meth:`pause` does not count."""
         self._away += max(0.0, now - self._paused)
 
     def pause(self, now: float) -> None:
-        """The caller stops listening."""
+        """Stop listening."""
         self._paused = now
 
-    def woke(self, now: float, due: float) -> None:
-        """The caller waited for post, until ``due`` at the latest. If that is long ago, this process was stopped (in a
-        terminal, by a batch system), and the server could not be heard."""
+    def wake(self, now: float, due: float) -> None:
+        """End a wait for messages that was to end at ``due`` at the latest.
+
+        If ``due`` is over 1 s ago, this process was stopped (in a terminal, by a batch system) and could not receive;
+        the excess does not count.
+        """
         if now - due > _STOPPED_SECONDS:
             self._away += now - due

@@ -1,4 +1,4 @@
-"""Arrays that were compressed for their way over a network."""
+"""Decompress arrays that were compressed for transport over a network."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from v2v_protocol.wire import Buffer
 
 
 def unpack(frame: Buffer, size: int) -> Buffer:
-    """The bytes of an array.
+    """Return the bytes of an array.
 
     Args:
-        frame: zstd, with its size stated.
-        size: of the array, bytes. No more is ever allocated.
+        frame: a zstd frame that states its content size.
+        size: of the array, in bytes. No more than this is ever allocated.
 
     Raises:
-        ProtocolError: the frame is none, or holds another number of bytes.
+        ProtocolError: it is not a zstd frame, or it holds another number of bytes.
     """
     try:
         stated = zstandard.frame_content_size(frame)

@@ -1,7 +1,7 @@
-"""``v2v-loadtest``: how fast a server feeds one trainer, and whether anything is lost or comes twice.
+"""Run ``v2v-loadtest``: measure how fast a server feeds one trainer, and whether samples are lost or repeated.
 
-It starts servers of its own with each number of workers (``--videos``), or measures a running one (``--connect``).
-The first ``--warmup-batches`` are received and checked, but not timed.
+It starts a server for each number of workers (``--videos``), or measures a running one (``--connect``). The first
+``--warmup-batches`` are received and checked, but not timed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rich.table import Table
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools.progress import Tell, measuring
+from v2v_client.tools.progress import ReportProgress, show_progress
 from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
@@ -32,7 +32,7 @@ from v2v_protocol.spec import SPEED_PRESETS
 
 _RSS_EVERY_SECONDS = 0.5
 _LEAST_WIDTH = 110
-"""Of a terminal, for a table of all columns."""
+"""Minimum width of a terminal, in characters, for a table with one line per record."""
 
 _COLUMNS = (
     ("workers", "workers", "{}"),
@@ -52,7 +52,7 @@ _COLUMNS = (
 
 @dataclass(slots=True)
 class Measurement:
-    """What one run consumed, after warm-up."""
+    """Sum up what one run consumed, after warm-up."""
 
     waits: list[float] = field(default_factory=list)
     samples: int = 0
@@ -71,7 +71,7 @@ class Measurement:
 
 
 class Usage:
-    """Processor time and memory of this process and, when it is ours, of the server's processes."""
+    """Measure processor time and memory of this process and, if it started the server, of the server's processes."""
 
     def __init__(self, server: LocalServer | None) -> None:
         self._server = server
@@ -85,7 +85,7 @@ class Usage:
         return mine.user + mine.system + theirs
 
     def sample(self, now: float) -> None:
-        """Notes the memory in use, not more often than it changes."""
+        """Record the memory in use, at most every 0.5 s."""
         if now - self._sampled < _RSS_EVERY_SECONDS:
             return
         self._sampled = now
@@ -94,7 +94,7 @@ class Usage:
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """The smallest value that at least ``share`` of the values do not exceed (nearest rank)."""
+    """Return the smallest value that at least ``share`` of the values do not exceed (nearest rank)."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
@@ -109,13 +109,14 @@ def measure(
     seconds: float,
     warmup_batches: int,
     trainer_seconds: float,
-    tell: Tell = lambda _measured, _batches: None,
+    report: ReportProgress = lambda _measured, _batches: None,
 ) -> tuple[dict[str, Any], ScheduleCheck]:
-    """Consumes the dataset for ``seconds`` after warm-up, over as many epochs as that takes. A Ctrl-C ends that sooner:
-    the record is of what was measured until then, and ``interrupted``.
+    """Consume the dataset for ``seconds`` after warm-up, over as many epochs as needed.
+
+    Ctrl-C ends it early. The record then covers the time until then, and its field ``interrupted`` is True.
 
     Returns:
-        one flat record, and what the schedule says of the samples that came.
+        one flat record, and the check of the received samples against the schedule.
     """
     first_epoch = dataset.epoch
     usage = Usage(server)
@@ -146,19 +147,19 @@ def measure(
         check.observe(batch.epoch, batch.indices)
         received += 1
         if trainer_seconds:
-            time.sleep(trainer_seconds)  # stands for an accelerator at work: the processor is free meanwhile
+            time.sleep(trainer_seconds)  # emulates a busy accelerator: the processor is free meanwhile
         ended = time.perf_counter()
         if received <= warmup_batches:
             began, cpu_began = ended, usage.cpu_seconds()
             continue
         usage.sample(ended)
         measured.add(batch, wait, trainer_seconds)
-        tell(ended - began, len(measured.waits))
+        report(ended - began, len(measured.waits))
     cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
     elapsed = ended - began
     count = len(measured.waits)
     if check is None:
-        raise UsageError(f"seconds = {seconds}: nothing was measured")
+        raise UsageError(f"seconds = {seconds}: no batch was measured; measure for longer")
     record = {
         "workers": workers,
         "batches_per_second": count / elapsed,
@@ -187,7 +188,7 @@ def measure(
 
 
 def table(records: Sequence[dict[str, Any]], width: int) -> Table:
-    """The records as a person reads them: a line for each, or, where ``width`` characters are too few, a column."""
+    """Format the records as a table: one line per record, or one column if ``width`` characters are too few."""
     rows = [[title for _, title, _ in _COLUMNS]]
     for record in records:
         values = {**record, "bytes_per_second": record["bytes_per_second"] / 1e6}
@@ -206,40 +207,48 @@ def table(records: Sequence[dict[str, Any]], width: int) -> Table:
 def _parser() -> Parser:
     parser = Parser(
         "v2v-loadtest", "(--videos DIR | --connect ADDRESS) [flags]",
-        "Measure how fast a server feeds one trainer, and whether anything is lost or comes twice.",
+        "Measure how fast a server feeds one trainer, and whether samples are lost or repeated.",
         ["v2v-loadtest --videos clips/ --workers 1,2,4", "v2v-loadtest --connect tcp://127.0.0.1:5555 --seconds 60"],
-        "Exit status: 0 each sample came once and in order, 1 not so, 2 wrong usage or no server.",
+        "Exit status: 0 each sample came once and in order, 1 some did not, 2 wrong usage or no server.",
     )  # fmt: skip
     server, stream, measuring = parser.group("Server"), parser.group("Stream"), parser.group("Measuring")
     source = server.add_mutually_exclusive_group(required=True)
-    source.add_argument("--videos", metavar="DIR", help="start servers of our own on these videos")
+    source.add_argument("--videos", metavar="DIR", help="start a local server on these videos")
     source.add_argument(
-        "--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port, or several with commas"
+        "--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port, or several, comma-separated"
     )
     server.add_argument(
         "--workers", type=_counts, metavar="N,N", help="with --videos: server workers, one run each (default 1,2)"
     )
     server.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
-    stream.add_argument("--batch-size", type=int, default=12, metavar="N", help="samples of a batch (default 12)")
+    stream.add_argument("--batch-size", type=int, default=12, metavar="N", help="samples in a batch (default 12)")
     measuring.add_argument(
-        "--seconds", type=float, default=20.0, metavar="S", help="to measure, after warm-up (default 20)"
+        "--seconds", type=float, default=20.0, metavar="S", help="time to measure, after warm-up (default 20)"
     )
-    measuring.add_argument("--warmup-batches", type=int, default=4, metavar="N", help="received first, not timed")
     measuring.add_argument(
-        "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulates a training step of this length"
+        "--warmup-batches", type=int, default=4, metavar="N", help="batches received first and not timed (default 4)"
+    )
+    measuring.add_argument(
+        "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulate a training step of this length (default 0)"
     )
     stream.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
     stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
-    stream.add_argument("--samples-per-decode", type=int, metavar="K", help="default: the preset's")
-    stream.add_argument("--recipe", metavar="PRESET", help="default: the server's")
     stream.add_argument(
-        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="changes a recipe field"
+        "--samples-per-decode", type=int, metavar="K", help="samples per decoded clip (default: the preset's)"
     )
-    stream.add_argument("--seed", type=int, default=0, metavar="N", help="of the stream (default 0)")
+    stream.add_argument("--recipe", metavar="PRESET", help="recipe preset (default: the server's)")
+    stream.add_argument(
+        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="change a field of the recipe"
+    )
+    stream.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the stream (default 0)")
     measuring.add_argument(
-        "--timeout-seconds", type=float, default=60.0, metavar="S", help="silence that means a lost server"
+        "--timeout-seconds",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="silence after which the server counts as lost (default 60)",
     )
-    measuring.add_argument("--json", metavar="FILE", help="write the records there")
+    measuring.add_argument("--json", metavar="FILE", help="write the records to this file")
     return parser
 
 
@@ -251,10 +260,10 @@ def _counts(text: str) -> list[int]:
 
 
 def recipe_of(preset: str | None, changes: Sequence[str]) -> str | dict[str, Any] | None:
-    """The recipe that ``--recipe`` and ``--set`` ask for.
+    """Return the recipe that ``--recipe`` and ``--set`` describe; None for the server's.
 
     Raises:
-        UsageError: a change that is not KEY=VALUE with a YAML value.
+        UsageError: a change is not KEY=VALUE with a YAML value.
     """
     if not changes:
         return preset
@@ -283,27 +292,27 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
         rank=0,
         world_size=1,
         timeout_seconds=arguments.timeout_seconds,
-        keys=None if arguments.connect else "",  # a server of our own asks for none
+        keys=None if arguments.connect else "",  # a local server needs no key
     )
 
 
 def _server_flags(arguments: argparse.Namespace) -> list[str]:
-    # A server looks at its own recipe to say which videos are long enough, so it is given ours.
+    # The server checks with its own recipe which videos are long enough, so it gets the stream's.
     settings = {"--rows": arguments.rows, "--recipe": arguments.recipe}
     flags = [part for flag, value in settings.items() if value for part in (flag, value)]
     return [*flags, *(part for change in arguments.changes for part in ("--set", change))]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measures, prints, writes; returns the exit status.
+    """Measure, print and write the records; return the exit status.
 
     Raises:
         V2VError: wrong usage, or no server.
     """
     if arguments.seconds <= 0 or arguments.warmup_batches < 0 or arguments.trainer_ms < 0:
-        raise UsageError("--seconds is more than 0, --warmup-batches and --trainer-ms are 0 or more")
+        raise UsageError("give --seconds above 0, and --warmup-batches and --trainer-ms of 0 or more")
     if arguments.connect and (arguments.workers or arguments.rows):
-        raise UsageError("--workers and --rows are for servers of our own: use them with --videos")
+        raise UsageError("--workers and --rows need a local server: use them with --videos")
     options = {
         "batch_size": arguments.batch_size,
         "seconds": arguments.seconds,
@@ -313,18 +322,20 @@ def run(arguments: argparse.Namespace) -> int:
     results = []
     if arguments.connect:
         dataset = _dataset(arguments, arguments.connect)
-        with measuring(arguments.connect, arguments.seconds) as tell:
-            results.append(measure(dataset, address=arguments.connect, workers=None, server=None, tell=tell, **options))
+        with show_progress(arguments.connect, arguments.seconds) as report:
+            results.append(
+                measure(dataset, address=arguments.connect, workers=None, server=None, report=report, **options)
+            )
     else:
-        _dataset(arguments, "tcp://127.0.0.1:0")  # a wrong option should not cost the start of a server
+        _dataset(arguments, "tcp://127.0.0.1:0")  # report wrong options before a server is started
         for workers in arguments.workers or (1, 2):
             with (
                 LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server,
-                measuring(f"{workers} workers", arguments.seconds) as tell,
+                show_progress(f"{workers} workers", arguments.seconds) as report,
             ):
                 dataset = _dataset(arguments, server.address)
                 results.append(
-                    measure(dataset, address=server.address, workers=workers, server=server, tell=tell, **options)
+                    measure(dataset, address=server.address, workers=workers, server=server, report=report, **options)
                 )
             if results[-1][0]["interrupted"]:
                 break
@@ -333,7 +344,7 @@ def run(arguments: argparse.Namespace) -> int:
     console.print(table(records, console.width))
     print(
         f"batch size {arguments.batch_size}; {arguments.warmup_batches} warm-up batches not timed; p50 and p99: time "
-        "between asking for and having a batch; CPU: " + _cpu_scope(arguments)
+        "between requesting and receiving a batch; CPU: " + _cpu_scope(arguments)
     )
     if arguments.json:
         write_json(arguments.json, records)
@@ -345,12 +356,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _cpu_scope(arguments: argparse.Namespace) -> str:
     if arguments.connect:
-        return "this process, and what the server's workers state for each sample (not its broker)"
+        return "this process, and the time that the server's workers report for each sample (not its broker)"
     return "this process, server and workers"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return run_command(_parser(), run, argv)
 
 

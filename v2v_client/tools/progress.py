@@ -1,4 +1,4 @@
-"""How far a measurement is, on a terminal."""
+"""Show a measurement's progress on a terminal."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from collections.abc import Callable, Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-Tell = Callable[[float, int], None]
-"""Takes the seconds that were measured, and the batches that came in them."""
+ReportProgress = Callable[[float, int], None]
+"""Progress callback: called with the seconds measured so far, and the batches received in them."""
 
 
 @contextlib.contextmanager
-def measuring(what: str, seconds: float) -> Iterator[Tell]:
-    """A bar on stderr, with batches a second and the time left; nothing where that is no terminal.
+def show_progress(what: str, seconds: float) -> Iterator[ReportProgress]:
+    """Show a progress bar on stderr, with batches per second and time left, if stderr is a terminal.
 
     Args:
-        what: is measured.
-        seconds: of the measurement, warm-up not counted.
+        what: name of the measurement.
+        seconds: its duration, without warm-up.
     """
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(f"{what}: warm-up", total=seconds)
 
-        def tell(measured: float, batches: int) -> None:
+        def report(measured: float, batches: int) -> None:
             rate = f"{batches / measured:.1f} batches/s" if measured > 0 and batches else "warm-up"
             bar.update(task, completed=min(measured, seconds), description=f"{what}: {rate}")
 
-        yield tell
+        yield report

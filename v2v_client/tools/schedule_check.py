@@ -1,11 +1,11 @@
-"""Counts what a consumer missed or got twice. Pure, and independent of the client's own bookkeeping.
+"""Count samples that a consumer missed or got twice. Pure, and independent of the client's own bookkeeping.
 
-The schedule of one rank of one: the batches of an epoch are samples [0, b), [b, 2b) ... as long as whole batches fit
-into its N sequences; then comes the next epoch. So the pair (epoch, index) has the ordinal
+With a single rank, the batches of an epoch are samples [0, b), [b, 2b) ... while whole batches fit into its N
+sequences; then the next epoch follows. So the pair (epoch, index) has the ordinal
 
     (epoch - first epoch) b floor(N / b) + index
 
-and a faultless consumer sees the ordinals 0, 1, 2 ... in this order.
+and a correct consumer receives the ordinals 0, 1, 2 ... in this order.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from collections.abc import Iterable
 
 
 class ScheduleCheck:
-    """
+    """Count lost, repeated, unexpected and misplaced samples.
+
     Args:
-        sequences: N.
-        batch_size: b.
-        first_epoch: the epoch that was consumed first, from its beginning.
+        sequences: N, the sequences of an epoch.
+        batch_size: b, the samples of a batch.
+        first_epoch: the epoch consumed first, from its beginning.
 
     Attributes:
-        duplicated: samples that came again.
-        foreign: samples that are not in the schedule at all.
-        out_of_order: samples that did not follow their predecessor.
+        duplicated: number of samples that came again.
+        foreign: number of samples that are not in the schedule.
+        out_of_order: number of samples that did not follow their predecessor.
     """
 
     def __init__(self, sequences: int, batch_size: int, first_epoch: int) -> None:
@@ -39,16 +40,16 @@ class ScheduleCheck:
 
     @property
     def lost(self) -> int:
-        """Samples that should have come before the furthest one that did."""
+        """Return the number of missing samples before the last one received."""
         return self._highest + 1 - self._complete - len(self._beyond)
 
     @property
     def faultless(self) -> bool:
-        """Each sample once, in order."""
+        """Return whether each sample came once and in order."""
         return not (self.lost or self.duplicated or self.foreign or self.out_of_order)
 
     def observe(self, epoch: int, indices: Iterable[int]) -> None:
-        """One batch as it came."""
+        """Record a received batch."""
         for index in indices:
             if epoch < self._first_epoch or not 0 <= index < self._per_epoch:
                 self.foreign += 1

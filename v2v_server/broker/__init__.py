@@ -1,16 +1,16 @@
-"""The broker: who gets which sample from which worker. It knows no pixels, and all but three files do no I/O.
+"""The broker decides which worker makes which sample for which consumer. It handles no pixels. Only three files do I/O.
 
-dispatcher        the mind: messages and deaths in, actions out
-actions           what it wants done; the loop in ``serve.py`` does it
-transport         the way in and out: its protocol, and the two ZeroMQ sockets (I/O)
-door             which consumers are cut off, and which have gone (I/O)
-admission         from a consumer's Hello to its session
-session           what each consumer has asked for, its credit, whose turn it is
-leases            requests, and which worker has which of them
-terms             what a lease says, and what its answer must be
-worker_registry   who is there, has room, is silent
-candidates        which sequence a request is made from; what moves it to the next
-blame             what the death of a worker says about the sample it was at
-quarantine        what workers died of, in numbered snapshots (a file)
-counters          what happened so far, in numbers
+dispatcher        takes messages and lost peers, returns actions
+actions           what the dispatcher wants done; the loop in ``serve.py`` does it
+transport         the protocol of the two sockets, and its ZeroMQ implementation (I/O)
+door              limits on consumer connections, and which connections have ended (I/O)
+admission         turns a consumer's Hello into a session
+session           what each consumer has asked for, its credit, and the order of service
+leases            requests, and which worker holds which of them
+terms             the content of a lease, and the checks on its result
+worker_registry   which workers are connected, have free credit, or are silent
+candidates        which sequence a request is made from, and when the next one is tried
+blame             what the loss of a worker says about the sample in work
+quarantine        sequences that brought workers down, in numbered snapshots (a file)
+counters          totals since the start
 """

@@ -1,5 +1,6 @@
-"""What the dispatcher wants done. The loop (:mod:`v2v_server.serve`) has the sockets, the processes and the disk, and
-carries it out."""
+"""Actions that the dispatcher wants done. The loop (:mod:`v2v_server.serve`) has the sockets, the processes and the
+disk, and carries them out.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +12,10 @@ from v2v_protocol.messages import Denied, ErrorCode
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Verdict
+from v2v_server.broker.quarantine import QuarantineEntry
 
 _LONGEST_TEXT = 2000
-"""Characters of a denial: it quotes what the peer sent, which may be long, and must itself fit a header."""
+"""Characters of a denial. It quotes what the peer sent, which may be long, and must fit a header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,41 +36,41 @@ class ToWorker:
 
 @dataclass(frozen=True, slots=True)
 class CutOff:
-    """This consumer sends nothing but nonsense: end its connection."""
+    """Disconnect a consumer that keeps sending malformed messages."""
 
     identity: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class GiveUp:
-    """This worker hangs: end its process where that is in our power, and report its loss."""
+    """End a hung worker's process, if it is one of ours, and report its loss."""
 
     identity: bytes
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
-class Condemn:
-    """Write this verdict down before anything that follows is sent, and report what came of it.
+class AddToQuarantine:
+    """Write this entry before any later action is carried out, and report the result.
 
     Attributes:
-        verdict: not numbered yet.
-        request: whose candidate it refuses.
+        entry: not numbered yet.
+        request: the request whose candidate it refuses.
     """
 
-    verdict: Verdict
+    entry: QuarantineEntry
     request: Request
 
 
 @dataclass(frozen=True, slots=True)
-class LookFor:
-    """A worker cannot have a video on its host: see whether it is on this one as it was catalogued, and report.
+class CheckVideo:
+    """Check whether this host has a video as it was catalogued, because a worker cannot read it on its own host.
 
     Attributes:
         video, fingerprint: of the file.
-        identity: the worker.
-        frame, reason: what the worker said.
-        request: what it was to make of it.
+        identity: routing id of the worker.
+        frame, reason: what the worker reported.
+        request: the request that it could not make.
     """
 
     video: str
@@ -81,12 +82,12 @@ class LookFor:
 
 
 @dataclass(frozen=True, slots=True)
-class PassOver:
+class ReportRefusal:
     """Tell the operator that a video was passed over.
 
     Attributes:
-        refusal: which, and why.
-        request: that it was passed over for.
+        refusal: which video, and why.
+        request: the request that it was passed over for.
     """
 
     refusal: Refusal
@@ -95,20 +96,20 @@ class PassOver:
 
 @dataclass(frozen=True, slots=True)
 class Show:
-    """This peer looks at the service: send it the next state that is made.
+    """Send the next state of the service to this peer.
 
     Attributes:
-        identity: of the peer.
-        is_worker_side: it is connected where workers are.
+        identity: routing id of the peer.
+        is_worker_side: whether it is connected to the workers' port.
     """
 
     identity: bytes
     is_worker_side: bool = False
 
 
-Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | Condemn | LookFor | PassOver | Show
+Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | Show
 
 
 def denial(code: ErrorCode, text: str) -> Frames:
-    """A Denied message that is short enough whatever the text quotes."""
+    """Build a Denied message, shortened to fit a header."""
     return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))

@@ -1,4 +1,4 @@
-"""Admission: from a consumer's Hello to its session. Pure."""
+"""Turn a consumer's Hello into its session. Pure."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
-from v2v_server.broker.worker_registry import shown
+from v2v_server.broker.worker_registry import clean_name
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import Columns, SequenceTable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
-"""Below the number of messages that the broker queues for a consumer before it takes it for deaf."""
+"""Less than ``transport.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
-"""Sequence tables kept for consumers to come; a session keeps its own."""
+"""Sequence tables cached for later consumers; a session keeps its own."""
 
 
 def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
-    """Samples a consumer should have asked for at any time: one batch ahead, and two a worker.
+    """Return how many samples a consumer should have outstanding: one batch ahead, and two for each worker.
 
-    With K samples of a decode these are counted in blocks of ``batch_size`` clips, K samples each, because a worker
-    gets the siblings of a clip at once only if all of them have been asked for: the blocks that the workers are at, two
-    clips each, and one more. And an eighth of the whole, for which our client waits until it asks.
+    With K samples per decode the count is in blocks of ``batch_size`` clips with K samples each. A worker gets the
+    siblings of a clip together only if all of them have been requested. So the credit covers the blocks in work (two
+    clips for each worker) and one more. It is then raised by a seventh, because our client asks only when an eighth of
+    its credit is free.
     """
     ahead = 2 * max(1, workers)
     if samples_per_decode == 1:
@@ -40,15 +41,14 @@ def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> 
 
 
 class Admission:
-    """Turns what consumers ask for into sessions.
+    """Turn what consumers ask for into sessions.
 
     Args:
-        catalogue: the corpus.
-        default_spec: what a consumer gets that asks for nothing in particular.
+        default_spec: the spec of a consumer that sends none.
         max_credit_bytes: bound on the bytes in flight to one consumer.
-        session_idle_seconds: a session silent for so long is forgotten, whatever it waits for. Its consumer opens it
-            again when it asks next, so the limit only bounds what abandoned consumers cost.
-        quarantine: the snapshots.
+        session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
+            consumer opens it again with its next request, so the limit only bounds the cost of abandoned consumers.
+        quarantine: the snapshots that a consumer may ask for.
     """
 
     def __init__(
@@ -68,16 +68,16 @@ class Admission:
         self._tables: dict[tuple[object, ...], SequenceTable] = {}
 
     def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
-        """The session a consumer asks for, and the answer to it.
+        """Open the session that a consumer asks for, and return it with the reply.
 
         Args:
-            identity: the consumer's routing identity.
-            hello: what it asks for.
-            workers: how many workers there are, or will be; the credit keeps all of them busy, within its bounds.
-            now: the time.
+            identity: the consumer's routing id.
+            hello: its message.
+            workers: number of workers, present or expected; the credit keeps all of them busy, within its bounds.
+            now: monotonic time, seconds.
 
         Raises:
-            UsageError, CorpusError: what is asked cannot be had.
+            UsageError, CorpusError: the request cannot be served.
         """
         if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
             raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
@@ -115,8 +115,8 @@ class Admission:
             quarantine=quarantine,
             since=now,
             packed=hello.packed,
-            name=shown(hello.name),
-            host=shown(hello.host),
+            name=clean_name(hello.name),
+            host=clean_name(hello.host),
         )
         return session, Welcome(
             spec=spec.to_dict(),
@@ -145,7 +145,7 @@ class Admission:
 
     def _table(self, spec: StreamSpec) -> SequenceTable:
         recipe = spec.recipe
-        # Only this of a spec decides which sequences there are; many specs share a table.
+        # The sequences depend only on these fields, so many specs share a table.
         geometry = (
             recipe.frames_needed,
             spec.samples_per_decode,

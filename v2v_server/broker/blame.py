@@ -1,12 +1,12 @@
-"""Blame: what the death of a worker says about the sample it was at. Pure.
+"""Decide what the loss of a worker says about the sample in work. Pure.
 
-    crashed, hung                the sample did it: its candidate is refused at once, and the verdict is written down
+    crashed, hung                the sample is the cause: its candidate is refused at once and quarantined
     unexplained                  an exception, no memory, a lost connection, storage that does not answer: the sample is
-                                 tried again; after two such deaths it runs alone on its worker, and a third death
+                                 tried again; after two such losses it runs alone on its worker, and a third one
                                  counts like a crash
-    killed                       from outside (pre-emption, an impatient operator): says nothing about any sample
+    killed                       from outside (pre-emption, an operator): says nothing about any sample
 
-Only the lease that the worker had begun is judged; those queued behind it go back as they were.
+Only the lease that the worker had begun is judged. The leases queued behind it go back unchanged.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from enum import StrEnum
 from v2v_server.broker.leases import Request
 
 ALONE_AFTER = 2
-"""Unexplained deaths after which a sample runs alone."""
+"""Number of unexplained losses after which a sample runs alone."""
 
 
 class Cause(StrEnum):
-    """Why a worker is gone."""
+    """Reason why a worker is gone."""
 
     CRASHED = "crashed"
     HUNG = "hung"
@@ -31,15 +31,15 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """A worker that is gone.
+    """Loss of a worker.
 
     Attributes:
         cause: what it says about the sample in work.
         text: what happened, in words: "was ended by SIGSEGV".
-        lease: the lease it was at by its own record, 0 for none; None where there is no record and what it announced
-            has to do.
-        for_all: whether it speaks against the video for everybody. That a sample took too long does only where the
-            video was being decoded; else it was what its spec asks for.
+        lease: the lease in work by the worker's own record, 0 for no lease; None without a record. Then the last lease
+            that the worker announced counts.
+        for_all: whether the video is refused under every spec. A sample that took too long refuses its video for all
+            only if the video was being decoded; otherwise the cause is what its spec asks for.
     """
 
     cause: Cause
@@ -49,12 +49,12 @@ class Loss:
 
 
 def runs_alone(request: Request) -> bool:
-    """Whether the request must have its worker to itself."""
+    """Return whether the request needs a worker without other leases."""
     return request.deaths >= ALONE_AFTER
 
 
-def judged(request: Request, loss: Loss) -> Request | str:
-    """The verdict on a request that was begun when its worker was lost.
+def judge(request: Request, loss: Loss) -> Request | str:
+    """Judge a request that was begun when its worker was lost.
 
     Returns:
         the request to try again, or the reason why its candidate is refused.

@@ -1,4 +1,4 @@
-"""What the server counts about itself. Every number has one owner: the dispatcher counts, everything else reads."""
+"""Count what the server does. The dispatcher counts; all other parts only read."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _MOST_SECONDS = 86_400.0
 
 @dataclass(slots=True)
 class WorkDone:
-    """What samples took, as their workers say.
+    """Totals of the time that samples took, as reported by the workers.
 
     Attributes:
-        samples: how many.
+        samples: number of samples.
         cpu_seconds: processor time.
-        decode_seconds, simulate_seconds, handover_seconds: by the clock: what went into clips, into arrays made of
-            them, and into getting those to their consumers.
+        decode_seconds, simulate_seconds, handover_seconds: wall-clock time for decoding clips, for building the arrays,
+            and for delivering them to their consumers.
     """
 
     samples: int = 0
@@ -28,7 +28,7 @@ class WorkDone:
     handover_seconds: float = 0.0
 
     def add(self, result: Result, cpu_seconds: float) -> None:
-        """One sample more."""
+        """Add one sample."""
         self.samples += 1
         self.cpu_seconds += bounded_seconds(cpu_seconds)
         self.decode_seconds += bounded_seconds(result.decode_seconds)
@@ -37,12 +37,12 @@ class WorkDone:
 
     @property
     def busy_seconds(self) -> float:
-        """By the clock, all of it."""
+        """Wall-clock time of all three parts."""
         return self.decode_seconds + self.simulate_seconds + self.handover_seconds
 
 
 def bounded_seconds(said: float) -> float:
-    """What a worker says that something took, within reason."""
+    """Clip a duration that a worker reported to a plausible range: 0 to one day, seconds."""
     return min(max(said, 0.0), _MOST_SECONDS)
 
 
@@ -51,23 +51,23 @@ class Counters:
     """Totals since the start.
 
     Attributes:
-        samples: samples handed to consumers.
+        samples: samples sent to consumers.
         batches: the same in batches of each consumer's own size (a fraction while one is filling).
-        decodes: clips decoded for those samples; fewer than samples where siblings share one.
-        cache_hits, cache_misses: of those clips, where workers have a cache.
-        cache_trouble: why a worker's cache keeps no more, when last heard of; empty where it does.
-        bytes: of the arrays of those samples.
-        in_slots: samples put into memory shared with their consumer; the others travelled in messages.
-        work: what the workers took for them.
-        waited_seconds: for how long consumers have waited for samples in all, as they say.
-        refused_candidates: videos passed over because they could not give what they promised.
-        unavailable: samples that no candidate could give.
+        decodes: clips decoded for those samples; fewer than samples if siblings share one.
+        cache_hits, cache_misses: of those clips, if workers have a cache.
+        cache_trouble: why a worker's cache stores nothing more, as last reported; empty if it does.
+        bytes: size of the arrays of those samples.
+        in_slots: samples written to memory shared with their consumer; the others travelled in messages.
+        work: time that the workers took for them.
+        waited_seconds: total time that consumers have waited for samples, as they report.
+        refused_candidates: videos passed over because they could not be used.
+        unavailable: samples without a usable candidate.
         returned_leases: leases taken back from workers that died, hung or left.
         second_leases: samples given to a second worker because the first was slow.
-        late_results: answers to leases that had been taken back.
+        late_results: results of leases that had been taken back.
         workers_lost: workers that died or were given up.
-        missing_videos: leases whose worker could not have a video that the server's host has.
-        malformed: messages that were none.
+        missing_videos: leases whose worker could not read a video that the server's host has.
+        malformed: malformed messages received.
     """
 
     samples: int = 0
@@ -90,7 +90,7 @@ class Counters:
     malformed: int = 0
 
     def count_cache(self, said: str) -> None:
-        """Counts what a sample's header says of the cache."""
+        """Count the cache field of a sample's header."""
         kind, _, trouble = said.partition(": ")
         self.cache_hits += kind == "hit"
         self.cache_misses += kind == "miss"
@@ -99,5 +99,5 @@ class Counters:
 
     @property
     def faults(self) -> int:
-        """Everything that went wrong and was survived."""
+        """Number of faults that the service survived."""
         return self.refused_candidates + self.unavailable + self.workers_lost + self.missing_videos + self.malformed

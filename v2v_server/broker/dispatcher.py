@@ -1,7 +1,7 @@
-"""The server's mind: messages and deaths in, actions out. No sockets, no processes, no clock.
+"""Decide what the server does: messages and lost peers in, actions out. No sockets, no processes, no clock.
 
-Consumers ask (Want), sessions queue, free workers are given leases, results pass through as they are. Whatever a peer
-sends, the answer is an action or a counted fault, never an exception: one bad peer must not stop the others.
+Consumers send Want, sessions queue requests, free workers get leases, and results are passed on unchanged. Every
+message from a peer leads to an action or a counted fault, never to an exception: one bad peer must not stop the others.
 """
 
 from __future__ import annotations
@@ -44,46 +44,55 @@ from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
-from v2v_server.broker.actions import Action, Condemn, CutOff, GiveUp, LookFor, Show, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    CutOff,
+    GiveUp,
+    Show,
+    ToConsumer,
+    ToWorker,
+    denial,
+)
 from v2v_server.broker.admission import Admission
-from v2v_server.broker.blame import Cause, Loss, judged, runs_alone
+from v2v_server.broker.blame import Cause, Loss, judge, runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
-from v2v_server.broker.leases import LeaseBook, Request, Withheld
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.leases import LeaseBook, Request, Stall
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
-from v2v_server.broker.terms import inspected, lease_for, work_seconds
+from v2v_server.broker.terms import check_result, lease_for, work_seconds
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
 from v2v_server.catalogue.catalogue import Catalogue
 
 MOST_SESSIONS = 4096
 _LONGEST_SECRET_BYTES = 64
 MOST_FAULTS = 16
-"""Malformed messages after which a consumer is cut off: to answer each costs as much as a sample."""
+"""Malformed messages after which a consumer is disconnected: answering one costs as much as a sample."""
 
 
 class Dispatcher:
-    """Decides who gets what.
+    """Assign requests of consumers to workers.
 
     Args:
-        catalogue: the corpus.
-        default_spec: what a consumer gets that asks for nothing in particular.
-        lease_deadline_seconds: a worker silent for longer over one sample, besides what that sample may take, is taken
-            for hung.
-        session_idle_seconds: a consumer silent for longer is forgotten (it can come back).
+        default_spec: the spec of a consumer that sends none.
+        lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
+            that the sample may take, is treated as hung.
+        session_idle_seconds: a consumer that is silent for longer is forgotten; it can come back.
         max_credit_bytes: bound on the bytes in flight to one consumer.
-        quarantine: the snapshots; verdicts that were written down are added to it.
-        wall_clock: gives the time for a verdict, ISO 8601.
-        expected_workers: workers that will serve in all, this host's and others', counted before they have said
-            hello: a consumer's credit is settled when it connects, which may be before the first of them is there.
+        quarantine: the snapshots; new entries are added to it once they are on disk.
+        wall_clock: returns the time for a quarantine entry, ISO 8601.
+        expected_workers: total number of workers expected, including other hosts. It sets a consumer's credit when the
+            consumer connects, which may be before the first worker says hello.
 
     Attributes:
-        counters: what happened so far.
+        counters: totals since the start.
         sessions: the consumers.
-        held_up: why no lease can be made just now, whoever asks; empty where they can.
+        blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         registry: the workers.
-        leases: who makes what.
-        candidates: what was refused.
+        leases: which worker makes what.
+        candidates: which sequences were refused.
     """
 
     def __init__(
@@ -108,32 +117,32 @@ class Dispatcher:
         self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self.registry = Workers(self.leases)
         self._lone: deque[Request] = deque()
-        self.held_up = ""
-        self._faults: dict[bytes, int] = {}  # of consumers that are connected
+        self.blocked_reason = ""
+        self._faults: dict[bytes, int] = {}  # malformed messages of connected consumers
 
     @property
     def workers(self) -> int:
-        """Workers that said hello and are alive as far as is known."""
+        """Number of workers that said hello and are alive as far as is known."""
         return len(self.registry)
 
     @property
     def waiting(self) -> int:
-        """Asked samples that nobody works on yet."""
+        """Number of requested samples that are not leased to a worker yet."""
         return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
 
     @property
     def waiting_share(self) -> float:
-        """Consumers that asked for something nobody works on yet, of all that are connected: 0 to 1."""
+        """Share of the connected consumers that have requests without a worker: 0 to 1."""
         connected = [session for session in self.sessions if session.left_at is None]
         return sum(bool(session.waiting) for session in connected) / max(len(connected), 1)
 
     @property
     def consumers(self) -> int:
-        """Consumers that are connected, as far as is known."""
+        """Number of consumers that are connected, as far as is known."""
         return sum(session.left_at is None for session in self.sessions)
 
     def identity_of(self, request: Request) -> SampleId | None:
-        """Whose identity a request is for; None when its consumer is gone."""
+        """Return the identity of the sample that a request asks for; None if its consumer is gone."""
         session = self.sessions.get(request.session)
         if session is None:
             return None
@@ -141,7 +150,7 @@ class Dispatcher:
         return SampleId(session.spec.digest, catalogue, NUMERICS_VERSION, session.seed, request.epoch, request.index)
 
     def clip_of(self, request: Request) -> tuple[str, int] | None:
-        """Video and first frame that a request is made from now; None when its consumer is gone."""
+        """Return the video and first frame of the request's current candidate; None if its consumer is gone."""
         session = self.sessions.get(request.session)
         if session is None:
             return None
@@ -150,7 +159,7 @@ class Dispatcher:
 
     @property
     def idle_share(self) -> float:
-        """Workers that hold no lease, of all that there are: 0 to 1."""
+        """Share of the workers that hold no lease: 0 to 1."""
         return max(0.0, 1.0 - self.leases.holders / max(len(self.registry), 1)) if self.registry else 0.0
 
     # --- consumers ---------------------------------------------------------------------------------------------------
@@ -161,8 +170,8 @@ class Dispatcher:
         Args:
             identity: routing id of the connection.
             frames: the message.
-            now: the time.
-            user: name of the key that the connection has; empty without keys.
+            now: monotonic time, seconds.
+            user: name of the connection's key; empty without keys.
         """
         try:
             message = _only(frames)
@@ -170,44 +179,46 @@ class Dispatcher:
             return [self._fault(identity, error)]
         session = self.sessions.get(identity)
         if session is not None and session.user != user:
-            session = None  # another key cannot act for it
+            session = None  # a session belongs to one key
         if session is not None:
-            session.heard(now)
+            session.mark_heard(now)
         match message:
             case Hello():
                 return [self._hello(identity, message, now, user)]
             case Ping():
                 return [
-                    ToConsumer(identity, encode(Pong(self.held_up or self.registry.trouble(self._expected_workers))))
+                    ToConsumer(
+                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self._expected_workers)))
+                    )
                 ]
             case See():
                 return [Show(identity)]
             case Goodbye():
                 if session is not None:
-                    self.counters.waited_seconds += session.waits(message.waited_seconds, now)
+                    self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                     self.consumer_lost(identity)
                 return []
             case Want():
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
-                self.counters.waited_seconds += session.waits(message.waited_seconds, now)
+                self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                 return self._want(session, message) or self._assign(now)
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, stray)]
             case _:
-                stray = ProtocolError(f"{type(message).__name__} is not for a consumer to send")
+                stray = ProtocolError(f"consumers cannot send {type(message).__name__}")
                 return [self._fault(identity, stray)]
 
     def consumer_gone(self, identity: bytes, now: float) -> None:
-        """The connection of a consumer has ended. It may come back at once over another one, and find its session."""
+        """Note that a consumer's connection has ended. The consumer may reconnect at once and find its session."""
         self._faults.pop(identity, None)
         session = self.sessions.get(identity)
         if session is not None:
             session.left_at = now
 
     def consumer_lost(self, identity: bytes) -> None:
-        """The consumer left, or cannot be reached any more."""
+        """Forget a consumer that left or cannot be reached any more."""
         self.sessions.forget(identity)
         self.leases.forget_session(identity)
         self._lone = deque(request for request in self._lone if request.session != identity)
@@ -254,7 +265,7 @@ class Dispatcher:
         return []
 
     def _fault(self, identity: bytes, error: ProtocolError) -> Action:
-        """The answer to a consumer's message that is none."""
+        """Answer a malformed message from a consumer."""
         faults = self._faults[identity] = self._faults.pop(identity, 0) + 1
         if len(self._faults) > MOST_SESSIONS:
             del self._faults[next(iter(self._faults))]
@@ -269,7 +280,7 @@ class Dispatcher:
     # --- workers -----------------------------------------------------------------------------------------------------
 
     def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Action]:
-        """A message from the workers' side. The frames behind a Result are passed on as they are."""
+        """Handle a message from the workers' side. The frames behind a Result are passed on unchanged."""
         try:
             message = decode(frames[0]) if frames else _only(frames)
         except ProtocolError as error:
@@ -281,11 +292,11 @@ class Dispatcher:
         if isinstance(message, Hello):
             text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
-        if not self.registry.heard(identity, now):
+        if not self.registry.mark_heard(identity, now):
             return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
         match message:
             case Begun(lease):
-                self.leases.begun(lease, identity, now)
+                self.leases.mark_begun(lease, identity, now)
                 return []
             case Result():
                 return self._result(identity, message, frames[1:], now)
@@ -300,44 +311,47 @@ class Dispatcher:
                 return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
-        """A worker died, was given up, or cannot be reached any more."""
+        """Take back the leases of a worker that died, was given up, or cannot be reached any more."""
         self.counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
-    def worker_withheld(self, identity: bytes, withheld: Withheld) -> None:
-        """A worker was kept from working for so long; no deadline runs meanwhile."""
-        self.leases.put_off(identity, withheld)
+    def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
+        """Extend the deadlines of a worker by the time in which it could not run."""
+        self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
-        """Something sent to a worker did not go out, and nobody will say what became of its process."""
+        """Take back the leases of a worker that a message did not reach and that no supervisor watches."""
         if identity not in self.registry:
             return []
         return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
-    def recorded(self, record: Condemn, written: Sequence[Verdict], now: float) -> list[Action]:
-        """What came of a :class:`Condemn`.
+    def quarantine_recorded(
+        self, record: AddToQuarantine, written: Sequence[QuarantineEntry], now: float
+    ) -> list[Action]:
+        """Continue after an :class:`AddToQuarantine`.
 
         Args:
             record: the action.
-            written: the lines that the quarantine has more now, others' among them; none when it cannot be written.
-            now: the time.
+            written: the lines that the quarantine has gained, including those of other processes; empty if it cannot be
+                written.
+            now: monotonic time, seconds.
         """
         before = self._quarantine.latest
         self._quarantine.extend(written)
-        # Consumers that went on under the newest snapshot go on under the newest. One that resumed an older one keeps
-        # it: what was cleared since must not come back, nor what it had refused be admitted.
+        # Consumers under the newest snapshot move on to the new one. A consumer that resumed an older snapshot keeps
+        # it: entries cleared since must not return, and sequences that it refused must stay refused.
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self.candidates.refuse_condemned(record.request, record.verdict.reason), *self._assign(now)]
+        return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._assign(now)]
 
-    def looked_for(self, missing: LookFor, found: bool, now: float) -> list[Action]:
-        """What came of a :class:`LookFor`: the video's fault, or that of the worker's host.
+    def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
+        """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.
 
         Args:
             missing: the action.
             found: whether this host has the video as it was catalogued.
-            now: the time.
+            now: monotonic time, seconds.
         """
         if not found:
             return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
@@ -347,11 +361,13 @@ class Dispatcher:
         return self._assign(now)
 
     def tick(self, now: float) -> list[Action]:
-        """To be called a few times a second: deadlines, second workers for slow samples, forgotten peers."""
+        """Apply deadlines, lease slow samples to a second worker, and forget silent peers. Call a few times a
+        second.
+        """
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
-        self.held_up = ""  # to try again
+        self.blocked_reason = ""  # cleared so that the next lease is tried
         self.registry.wake(now)
         for identity in self.registry.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
@@ -362,11 +378,11 @@ class Dispatcher:
             if second is not None and not runs_alone(request):
                 self.counters.second_leases += 1
                 actions += self._grant(replace(request, slot=None), second, now)
-        # A consumer that left may have freed a worker that was kept for it, or for its requests.
+        # A consumer that left may have freed a worker that was reserved for its requests.
         return actions + self._assign(now)
 
     def stop_workers(self) -> list[ToWorker]:
-        """Tells every worker to finish and leave."""
+        """Tell every worker to finish and leave."""
         return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
@@ -391,10 +407,10 @@ class Dispatcher:
             self._charge(result.lease, identity, now)
         else:
             try:
-                header = inspected(payload, request, session.form)
+                header = check_result(payload, request, session.form)
             except ProtocolError as error:
-                # No worker of ours does this, and one that did it once would do it again.
-                refused = ToWorker(identity, self._malformed(ProtocolError(f"a result that is none: {error}")))
+                # Our workers never send such a result; a worker that sends one would send more.
+                refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
@@ -403,7 +419,7 @@ class Dispatcher:
                 actions.append(ToConsumer(request.session, payload))
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
-        self.leases.begun(result.begins, identity, now)
+        self.leases.mark_begun(result.begins, identity, now)
         return actions + self._assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
@@ -415,19 +431,19 @@ class Dispatcher:
         if not failed.here:
             self.registry.can_work(identity)
             return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
-        # The catalogue is of this host's files: if the video is here, other workers can have it too.
+        # The catalogue lists this host's files: if the video is here, other workers can probably read it.
         video = self.candidates.sequence(session, request).video
-        return [LookFor(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
+        return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
-        """Who asked for it and waits no more pays for it all the same."""
+        """Charge a consumer for a sample that it asked for and then abandoned."""
         debt = self.leases.debt(lease, worker, now)
         if debt is not None:
             self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Accounts for a sample; False when nobody waits for it."""
-        if not self.sessions.answered(request, bounded_seconds(header.cpu_seconds)):
+        """Count a sample; return False if no session waits for it."""
+        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
         self.counters.samples += 1
@@ -444,19 +460,19 @@ class Dispatcher:
         returned = self.leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
-            verdict = judged(request, loss) if begun else request
+            verdict = judge(request, loss) if begun else request
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                actions += self.candidates.condemn(request, verdict, for_all=loss.for_all)
+                actions += self.candidates.quarantine_candidate(request, verdict, for_all=loss.for_all)
         return actions + self._assign(now)
 
     # --- requests ----------------------------------------------------------------------------------------------------
 
     def _assign(self, now: float) -> list[Action]:
-        """Gives waiting requests to workers, until there is no request or no room."""
+        """Give waiting requests to workers until there are no requests or no free workers."""
         actions: list[Action] = []
-        while not self.held_up:
+        while not self.blocked_reason:
             if self._lone:
                 empty = self.registry.for_lone_request()
                 if empty is not None:
@@ -473,7 +489,7 @@ class Dispatcher:
         return actions
 
     def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
-        """Gives a worker the requests of one clip, except those whose candidate is in quarantine."""
+        """Give a worker the requests of one clip, except those whose candidate is in quarantine."""
         session = self.sessions.get(requests[0].session)
         if session is None:
             return []
@@ -511,28 +527,28 @@ class Dispatcher:
             )
             return [ToWorker(worker, encode(lease))]
         except IndexUnreadable as error:
-            self.held_up = f"{error}; it is tried again ten times a second"
+            self.blocked_reason = f"{error}; retried ten times a second"
             returned = self.leases.finished(number, worker, now)
             if returned is not None:
                 self.sessions.put_back(returned)
             return []
         except V2VError as error:
-            # The index of one video cannot be read, or is too large to send: that video's fault, nobody else's.
+            # The index of this video cannot be read, or is too large to send; other videos are not affected.
             returned = self.leases.finished(number, worker, now)
             return [] if returned is None else self.candidates.refuse(returned, None, str(error))
 
 
 def _only(frames: Sequence[Buffer]) -> Message:
     if len(frames) != 1:
-        raise ProtocolError(f"a message of {len(frames)} frames; this kind has one")
+        raise ProtocolError(f"message with {len(frames)} frames; this kind has one")
     return decode(frames[0], LARGEST_REQUEST_BYTES)
 
 
 def _slots(want: Want) -> list[Slot | None]:
-    """Where the samples may be put.
+    """Return where the samples may be put.
 
     Raises:
-        ProtocolError: that is nowhere.
+        ProtocolError: a slot does not exist, or the numbers of slots and indices differ.
     """
     if not len(want.arenas) == len(want.slots) in (0, len(want.indices)):
         raise ProtocolError(f"want: {len(want.arenas)} arenas, {len(want.slots)} slots for {len(want.indices)} indices")
@@ -546,7 +562,7 @@ def _slots(want: Want) -> list[Slot | None]:
 
 
 def _owner(user: str, secret: bytes) -> bytes:
-    """Name who may take a session over: a key, if there are keys, and a secret."""
+    """Return a digest of who may take a session over: a key, if there are keys, and a secret."""
     return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""
 
 

@@ -1,4 +1,4 @@
-"""Leases: which worker is making which sample. A state machine without I/O; time is passed in.
+"""Track which worker makes which sample. A state machine without I/O; time is passed in.
 
     pending (in its session's queue) --grant--> leased --begun--> working --finished--> gone
                  ^                                 |                 |
@@ -6,7 +6,7 @@
 
 A request is one sample that a consumer asked for. Every grant gives it a lease with a new number, so an answer to a
 lease that was taken away is recognised by its number and dropped. A request that takes much longer than its consumer's
-others is given to a second worker as well; the first answer retires its twin.
+others is given to a second worker as well; the first answer ends both leases.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Request:
     """One sample that a consumer asked for, until it is answered.
 
     Attributes:
-        session: routing identity of the consumer.
+        session: routing id of the consumer.
         epoch, index: which sample.
-        candidate: which candidate sequence is being tried.
+        candidate: number of the candidate sequence that is being tried, from 0.
         refusals: the candidates that failed before it.
-        deaths: unexplained deaths of workers that were at this candidate.
+        deaths: unexplained losses of workers over this candidate.
         snapshot: number of the quarantine snapshot under which those candidates were passed over.
-        place: of the index in the epoch's order (:mod:`v2v_server.schedule.epoch`); None: the index itself.
-        slot: where its consumer lets it be put; given to one worker only.
+        place: position of the index in the epoch's order (:mod:`v2v_server.schedule.epoch`); None: the index itself.
+        slot: where its consumer lets the sample be put; given to one worker only.
     """
 
     session: bytes
@@ -53,34 +53,34 @@ class Request:
 
     @property
     def clip(self) -> tuple[bytes, int, int, int]:
-        """What it is made from: requests of equal clip are made from the same decoded frames."""
+        """Key of the decoded clip: requests with equal keys are made from the same frames."""
         return self.session, self.epoch, self.index if self.place is None else self.place, self.candidate
 
     @property
     def sample(self) -> tuple[bytes, int, int]:
-        """What is asked, whichever candidate it will be made from."""
+        """Key of the requested sample, independent of the candidate it is made from."""
         return self.session, self.epoch, self.index
 
 
 @dataclass(slots=True)
 class _Grant:
-    request: Request | None  # None: answered, or its consumer is gone; but the worker still has to get through it
+    request: Request | None  # None: answered, or its consumer is gone; the worker still works on it
     worker: bytes
     since: float  # when it was granted, or its worker last began something
-    limit_seconds: float  # from then to the answer
+    limit_seconds: float  # from ``since`` to the answer
     begun_at: float | None = None
-    stopped_seconds: float = 0.0  # of them, in which its worker was stopped from outside
-    queued_seconds: float = 0.0  # and in which it waited for a core
-    debtor: bytes | None = None  # who asked for it and waits no more, which does not make it less work
+    stopped_seconds: float = 0.0  # time in which its worker was stopped from outside
+    queued_seconds: float = 0.0  # time in which its worker waited for a core
+    debtor: bytes | None = None  # the consumer that abandoned it; the work is charged to it
 
 
 @dataclass(frozen=True, slots=True)
-class Withheld:
-    """Time in which a worker could not work, and not for anything that it is at.
+class Stall:
+    """Time in which a worker could not run, for reasons other than its work.
 
     Attributes:
         stopped_seconds: stopped from outside, by a signal or a debugger.
-        queued_seconds: waiting for a core that other processes had.
+        queued_seconds: waiting for a core that ran other processes.
     """
 
     stopped_seconds: float = 0.0
@@ -91,8 +91,8 @@ class LeaseBook:
     """All leases that are out.
 
     Args:
-        deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer, besides what
-            the work itself may take.
+        deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer, in addition to
+            the time that the work itself may take.
     """
 
     def __init__(self, deadline_seconds: float) -> None:
@@ -109,37 +109,41 @@ class LeaseBook:
         return len(self._leases)
 
     def held_by(self, worker: bytes) -> int:
-        """Clips that this worker has to decode for the leases that are out to it.
+        """Return the number of clips that this worker has to decode for its leases.
 
-        Of those that nobody waits for any more each counts, lest a clip that is asked for anew hides behind an old one.
+        Abandoned leases count individually; otherwise a repeated request could hide behind an old lease for the same
+        clip.
         """
         requests = [self._leases[number].request for number in self._held.get(worker, ())]
         return len({request.clip for request in requests if request is not None}) + requests.count(None)
 
     def holds(self, worker: bytes) -> bool:
-        """Whether this worker holds any lease."""
+        """Return whether this worker holds any lease."""
         return worker in self._held
 
     @property
     def holders(self) -> int:
-        """Workers that hold any lease."""
+        """Number of workers that hold any lease."""
         return len(self._held)
 
     def take_changed(self) -> set[bytes]:
-        """Workers that hold more or less than at the last call, or something that nobody waits for any more."""
+        """Return and clear the workers whose leases have changed since the last call, including leases that were
+        abandoned.
+        """
         changed, self._changed = self._changed, set()
         return changed
 
     def requests_of(self, worker: bytes) -> Iterator[Request]:
-        """The requests that this worker holds and somebody still waits for."""
+        """Yield the requests that this worker holds and that are still wanted."""
         for number in self._held.get(worker, ()):
             request = self._leases[number].request
             if request is not None:
                 yield request
 
     def in_work(self, worker: bytes) -> tuple[Request | None, float] | None:
-        """What this worker is at, as far as it said, and since when. The request is None where nobody waits for it any
-        more; None where the worker has begun nothing."""
+        """Return what this worker works on, as far as it said, and since when. The request is None if it was abandoned.
+        The result is None if the worker has begun nothing.
+        """
         for number in self._held.get(worker, ()):
             lease = self._leases[number]
             if lease.begun_at is not None:
@@ -147,17 +151,18 @@ class LeaseBook:
         return None
 
     def request(self, number: int, worker: bytes) -> Request | None:
-        """What this worker's lease asks for; None when nobody waits for its answer."""
+        """Return the request behind this worker's lease; None if its answer is no longer wanted."""
         lease = self._leases.get(number)
         return None if lease is None or lease.worker != worker else lease.request
 
     def grant(self, request: Request, worker: bytes, now: float, work_seconds: float = 0.0) -> int:
-        """Gives the request to a worker.
+        """Give a request to a worker.
 
         Args:
-            request, worker: who makes what.
-            now: the time.
-            work_seconds: what the work may take; the deadline is so much later.
+            request: the sample to make.
+            worker: routing id.
+            now: monotonic time, seconds.
+            work_seconds: longest time that the work may take; added to the deadline.
 
         Returns:
             the number of the lease.
@@ -174,10 +179,10 @@ class LeaseBook:
         self._changed.add(worker)
         return number
 
-    def begun(self, number: int, worker: bytes, now: float) -> None:
-        """The worker started on it. The clock of those queued behind it starts again: they wait through no fault.
+    def mark_begun(self, number: int, worker: bytes, now: float) -> None:
+        """Note that the worker has begun this lease, and restart the clock of the leases queued behind it.
 
-        A lease begins once: said again it would put off the deadline for ever.
+        A lease begins once: otherwise a worker could extend its deadline without end by repeating the message.
         """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker or lease.begun_at is not None:
@@ -187,47 +192,49 @@ class LeaseBook:
             other.since, other.stopped_seconds, other.queued_seconds = now, 0.0, 0.0
             other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
 
-    def put_off(self, worker: bytes, withheld: Withheld) -> None:
-        """The worker was kept from working for so long, which counts as no time.
+    def extend_deadlines(self, worker: bytes, stalled: Stall) -> None:
+        """Exclude the time in which a worker could not run from its deadlines.
 
-        One that stays stopped is overdue all the same, after twice its time: somebody waits for its samples. One that
-        waits for a core gets one in the end; to end it would only cost more of them. Meanwhile its samples may be given
-        to a second worker (:meth:`slow`).
+        A worker that stays stopped is overdue after twice its time, because a consumer waits for its samples. A worker
+        that waits for a core is not: it gets one eventually, and replacing it would use more cores. Meanwhile its
+        samples may be given to a second worker (:meth:`slow`).
         """
         for number in self._held.get(worker, ()):
             lease = self._leases[number]
-            lease.stopped_seconds = min(lease.stopped_seconds + withheld.stopped_seconds, lease.limit_seconds)
-            lease.queued_seconds += withheld.queued_seconds
+            lease.stopped_seconds = min(lease.stopped_seconds + stalled.stopped_seconds, lease.limit_seconds)
+            lease.queued_seconds += stalled.queued_seconds
             if lease.begun_at is not None:
-                lease.begun_at += withheld.stopped_seconds
+                lease.begun_at += stalled.stopped_seconds
 
     def limit_seconds(self, worker: bytes) -> float:
-        """How long the worker may be silent over what it holds."""
+        """Return how long the worker may be silent over its current leases, seconds."""
         return max((self._leases[n].limit_seconds for n in self._held.get(worker, ())), default=self.deadline_seconds)
 
     def abandoned(self, session: bytes) -> int:
-        """Leases out for samples that this consumer asked for and gave up before they were made."""
+        """Return the number of leases out for samples that this consumer asked for and then abandoned."""
         return self._abandoned.get(session, 0)
 
     def debt(self, number: int, worker: bytes, now: float) -> tuple[bytes, float] | None:
-        """Who gave up the sample of this lease before it was made, and the seconds that it took all the same."""
+        """Return which consumer abandoned the sample of this lease, and how long it took, seconds; None if it is
+        still wanted.
+        """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker or lease.debtor is None or lease.begun_at is None:
             return None
         return lease.debtor, now - lease.begun_at
 
     def finished(self, number: int, worker: bytes, now: float, *, decoded: bool = True) -> Request | None:
-        """The worker answered, well or badly.
+        """Close a lease that the worker answered with a sample or a failure.
 
         Args:
-            number, worker: of the lease.
-            now: the time.
-            decoded: whether a clip was decoded for it. What a sibling of a decoded one takes says nothing of how long
-                a clip may take.
+            number, worker: the lease and its holder.
+            now: monotonic time, seconds.
+            decoded: whether a clip was decoded for it. Samples that reuse a decoded clip are too fast to estimate
+                decode time from.
 
         Returns:
-            the request, or None when nobody waits for this answer: the lease had been taken away from the worker, the
-            consumer is gone, or the twin was faster.
+            the request; None if the answer is not wanted: the lease was taken away from the worker, the consumer is
+            gone, or a second worker was faster.
         """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker:
@@ -242,15 +249,15 @@ class LeaseBook:
         return request
 
     def lost(self, worker: bytes, at: int | None = None) -> list[tuple[Request, bool]]:
-        """The worker is gone.
+        """Take back all leases of a worker that is gone.
 
         Args:
-            worker: which one.
-            at: number of the lease it was at by its own record; None goes by what it announced.
+            worker: routing id.
+            at: number of the lease in work by the worker's own record; None: the lease that it last announced.
 
         Returns:
-            those of its requests that nobody else is at, oldest first, each with whether it had been begun;
-            without their slots, where this worker may still write.
+            its requests that no other worker holds, oldest first, each with whether it had been begun. They lose their
+            slots, because this worker may still write to them.
         """
         returned = []
         for number in list(self._held.get(worker, ())):
@@ -262,7 +269,9 @@ class LeaseBook:
         return returned
 
     def overdue(self, now: float) -> set[bytes]:
-        """Workers with a lease past its deadline. Their leases stay out until they are given up (:meth:`lost`)."""
+        """Return the workers with a lease past its deadline. Their leases stay out until the workers are given up
+        (:meth:`lost`).
+        """
         return {
             lease.worker
             for lease in self._leases.values()
@@ -270,9 +279,9 @@ class LeaseBook:
         }
 
     def slow(self, now: float) -> list[tuple[Request, bytes]]:
-        """For each session its oldest request, with its worker, if it is slow and nobody else is at it.
+        """Return each session's oldest request, with its worker, if it is slow and no second worker has it.
 
-        Counted from when its worker last began something, so that a request queued behind one that hangs is slow too.
+        The time counts from when its worker last began something, so a request queued behind a hanging one is slow too.
         """
         oldest: dict[bytes, _Grant] = {}
         for lease in self._leases.values():
@@ -289,10 +298,10 @@ class LeaseBook:
         return found
 
     def forget_session(self, session: bytes) -> None:
-        """The consumer is gone: answers to its leases will find nothing.
+        """Abandon the requests of a consumer that is gone.
 
-        The leases stay with their workers, which do not know and work through them: that is room they do not have for
-        others, and time for which those queued behind must not be called overdue.
+        Their leases stay with the workers, which do not know and finish them. Until then they occupy the workers, and
+        the leases queued behind them must not become overdue.
         """
         self._durations.pop(session, None)
         for sample in [sample for sample in self._out if sample[0] == session]:

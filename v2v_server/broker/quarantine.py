@@ -1,18 +1,19 @@
-"""The quarantine: sequences and videos that crash or hang workers, in numbered snapshots.
+"""Keep the quarantine: sequences and videos that crash or hang workers, in numbered snapshots.
 
-A decode error is a function of the file's bytes: whoever decodes it meets it again, so nothing need be remembered. A
-crash or a hang is not. Its verdict is written down, because without it nobody could make the same stream again:
+A decode error depends only on the file's bytes: every worker meets it again, so it need not be remembered. A crash or a
+hang may not happen again. It is written down, because otherwise the same stream could not be made a second time:
 
     snapshot 0      empty
-    snapshot n + 1  snapshot n and one verdict more, or nothing (after a clearing)
+    snapshot n + 1  snapshot n and one more entry, or empty (after a clearing)
 
-A verdict says that decoding a video brought a worker down, or that what one spec asks of it took too long; the latter
-counts under that spec only. It refuses one sequence of a video; a second verdict on the same file refuses the whole
-video. A file that has changed since (another fingerprint) is another file. The number of the snapshot that a sample was
-made under is part of its provenance, and every snapshot can be asked for again.
+An entry says that decoding a video brought a worker down, or that the work that one spec asks for took too long; the
+latter counts under that spec only. An entry refuses one sequence of a video; a second entry for the same file refuses
+the whole video. A file that has changed since (another fingerprint) is another file. The number of the snapshot that a
+sample was made under is part of its provenance, and every snapshot stays available.
 
-Several servers and a person may write to the quarantine of one corpus at once, so only the file gives numbers, under an
-advisory lock, and only lines that are on disk count. What a process has in memory is always a beginning of the file.
+Several servers and a person may write to the quarantine of one corpus at once. So only the file assigns numbers, under
+an advisory lock, and only lines that are on disk count. The lines that a process has in memory are always the first
+lines of the file.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ _LONGEST_LOCK_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class QuarantineEntry:
     """One line of the quarantine.
 
     Attributes:
-        snapshot: the first snapshot it is in; 0 until it is written down.
-        path: catalogue id of the video; empty in a line that clears everything.
+        snapshot: the first snapshot that holds it; 0 until it is written.
+        path: catalogue id of the video; empty in a line that clears the quarantine.
         fingerprint: of the file.
         frame: first frame of the sequence.
         reason: what happened.
         time: when, ISO 8601, UTC.
-        spec: digest of the only spec under which it refuses; empty: under any.
+        spec: digest of the only spec under which it refuses the sequence; empty: under every spec.
     """
 
     snapshot: int
@@ -63,53 +64,53 @@ class Verdict:
         return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}{only}"
 
 
-def clearing(time: str) -> Verdict:
-    """The line that makes the next snapshot an empty one; the old ones can still be asked for."""
-    return Verdict(0, "", "", 0, "cleared", time)
+def clearing(time: str) -> QuarantineEntry:
+    """Return the line that makes the next snapshot empty; older snapshots stay available."""
+    return QuarantineEntry(0, "", "", 0, "cleared", time)
 
 
 class Quarantine:
-    """All snapshots, as the list of verdicts they grew by.
+    """All snapshots, stored as the list of entries that led to them.
 
     Args:
-        verdicts: the lines so far, oldest first.
+        entries: the lines so far, oldest first.
 
     Raises:
         CorpusError: their numbers are not 1, 2, 3 ...
     """
 
-    def __init__(self, verdicts: Iterable[Verdict] = ()) -> None:
-        self._verdicts: list[Verdict] = []
-        self._of_file: dict[tuple[str, str], list[Verdict]] = {}
+    def __init__(self, entries: Iterable[QuarantineEntry] = ()) -> None:
+        self._entries: list[QuarantineEntry] = []
+        self._of_file: dict[tuple[str, str], list[QuarantineEntry]] = {}
         self._clearings: list[int] = []
-        self.extend(verdicts)
+        self.extend(entries)
 
     @property
     def latest(self) -> int:
         """Number of the newest snapshot."""
-        return len(self._verdicts)
+        return len(self._entries)
 
     @property
-    def lines(self) -> tuple[Verdict, ...]:
-        """Every verdict and clearing there ever was, oldest first."""
-        return tuple(self._verdicts)
+    def lines(self) -> tuple[QuarantineEntry, ...]:
+        """All entries and clearings, oldest first."""
+        return tuple(self._entries)
 
-    def verdicts(self, snapshot: int) -> list[Verdict]:
-        """What snapshot number ``snapshot`` holds, oldest first.
+    def entries(self, snapshot: int) -> list[QuarantineEntry]:
+        """Return the entries of a snapshot, oldest first.
 
         Raises:
             CorpusError: there is no such snapshot.
         """
-        return self._verdicts[self._cleared(snapshot) : snapshot]
+        return self._entries[self._cleared(snapshot) : snapshot]
 
     def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int, spec: str = "") -> str | None:
-        """Why a sequence is refused under a snapshot; None when it is not.
+        """Return why a sequence is refused under a snapshot; None if it is not.
 
         Args:
-            snapshot: its number.
-            path, fingerprint: of the video.
+            snapshot: number of the snapshot.
+            path, fingerprint: catalogue id and fingerprint of the video.
             frame: first frame of the sequence.
-            spec: digest of the spec it is asked under.
+            spec: digest of the spec that the sequence is requested under.
 
         Raises:
             CorpusError: there is no such snapshot.
@@ -119,43 +120,43 @@ class Quarantine:
         against = [v for v in of_file if cleared < v.snapshot <= snapshot]
         if len(against) >= VERDICTS_PER_VIDEO:
             return f"video in quarantine snapshot {snapshot} ({len(against)} verdicts): {against[-1].reason}"
-        for verdict in against:
-            if verdict.frame == frame:
-                return f"sequence in quarantine snapshot {snapshot}: {verdict.reason}"
+        for entry in against:
+            if entry.frame == frame:
+                return f"sequence in quarantine snapshot {snapshot}: {entry.reason}"
         return None
 
-    def extend(self, verdicts: Iterable[Verdict]) -> None:
-        """Takes up what was written down since.
+    def extend(self, entries: Iterable[QuarantineEntry]) -> None:
+        """Append lines that have been written since.
 
         Raises:
-            CorpusError: their numbers do not go on where ours end.
+            CorpusError: their numbers do not continue the existing ones.
         """
-        for verdict in verdicts:
-            if verdict.snapshot != self.latest + 1:
-                raise CorpusError(f"quarantine: line {self.latest + 1} has snapshot number {verdict.snapshot}")
-            self._verdicts.append(verdict)
-            if verdict.path:
-                self._of_file.setdefault((verdict.path, verdict.fingerprint), []).append(verdict)
+        for entry in entries:
+            if entry.snapshot != self.latest + 1:
+                raise CorpusError(f"quarantine: line {self.latest + 1} has snapshot number {entry.snapshot}")
+            self._entries.append(entry)
+            if entry.path:
+                self._of_file.setdefault((entry.path, entry.fingerprint), []).append(entry)
             else:
-                self._clearings.append(verdict.snapshot)
+                self._clearings.append(entry.snapshot)
 
     def _cleared(self, snapshot: int) -> int:
-        """Number of the last empty snapshot up to this one."""
+        """Return the number of the last empty snapshot up to this one."""
         if not 0 <= snapshot <= self.latest:
             raise CorpusError(f"quarantine snapshot {snapshot}: there are 0 .. {self.latest}")
         return max((number for number in self._clearings if number <= snapshot), default=0)
 
 
 def quarantine_path(root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None) -> Path:
-    """The file of a corpus's quarantine: beside the catalogue's index."""
+    """Return the path of a corpus's quarantine file, beside the catalogue's index."""
     index = index_path(root, cache_dir)
     return index.with_name(index.name.replace("catalogue-", "quarantine-")).with_suffix(".jsonl")
 
 
 def read_quarantine(file: Path) -> Quarantine:
-    """The quarantine in a file of JSON lines; empty when there is no such file.
+    """Read a quarantine from a file of JSON lines; it is empty if there is no such file.
 
-    A last line that was cut off (it is being written, or the host lost power meanwhile) is left out.
+    A truncated last line (it is being written, or the host lost power while writing) is ignored.
 
     Raises:
         CorpusError: the file cannot be read, or any other line is damaged.
@@ -168,20 +169,20 @@ def read_quarantine(file: Path) -> Quarantine:
         raise CorpusError(f"quarantine file {file} cannot be read: {error.strerror}; give read access") from error
 
 
-def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdict]:
-    """Gives a verdict the next number and has it on disk before anybody is served under the new snapshot.
+def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[QuarantineEntry]:
+    """Write an entry under the next number. It is on disk before any sample is made under the new snapshot.
 
     Args:
-        file: of the quarantine; made when it is missing.
-        verdict: to be written; its number is not looked at.
-        known: what the caller has read or written so far.
+        file: the quarantine file; created if it is missing.
+        entry: the entry; its number is ignored.
+        known: the lines that the caller has read or written so far.
 
     Returns:
-        every line that ``known`` lacks, to extend it by: others' first, then this one.
+        every line that ``known`` lacks: those of other processes first, then this one.
 
     Raises:
-        OSError: it cannot be written.
-        CorpusError: the file is damaged, or another one than ``known`` came from.
+        OSError: the file cannot be written.
+        CorpusError: the file is damaged, or is not the file that ``known`` came from.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     with open(file, "a+b", buffering=0) as out:
@@ -191,10 +192,10 @@ def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdi
         lines = _parse(file, whole).lines
         if lines[: known.latest] != known.lines:
             raise CorpusError(
-                f"quarantine file {file} is not the one that was read: it has {len(lines)} lines, and not the "
-                f"{known.latest} known here at its beginning; start again whatever uses it"
+                f"quarantine file {file} was replaced: it has {len(lines)} lines, which do not start with the "
+                f"{known.latest} lines read before; restart the programs that use it"
             )
-        numbered = replace(verdict, snapshot=len(lines) + 1)
+        numbered = replace(entry, snapshot=len(lines) + 1)
         line = json.dumps(asdict(numbered)).encode() + b"\n"
         kept = whole.rfind(b"\n") + 1
         out.truncate(kept)
@@ -211,7 +212,7 @@ def write_verdict(file: Path, verdict: Verdict, known: Quarantine) -> list[Verdi
 
 
 def _lock(descriptor: int, file: Path) -> None:
-    """Writers hold the lock for a moment; who holds it longer, which any reader may, must not stop a server."""
+    """Lock the file. Writers hold the lock briefly; a reader that holds it for longer must not stop a server."""
     until = time.monotonic() + _LONGEST_LOCK_SECONDS
     while True:
         try:
@@ -219,13 +220,15 @@ def _lock(descriptor: int, file: Path) -> None:
         except BlockingIOError:
             if time.monotonic() >= until:
                 raise BlockingIOError(
-                    errno.EAGAIN, f"another process has locked it for {_LONGEST_LOCK_SECONDS:g} s; end that one", file
+                    errno.EAGAIN,
+                    f"another process has locked it for {_LONGEST_LOCK_SECONDS:g} s; end that process",
+                    file,
                 ) from None
             time.sleep(0.01)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Has the name of a new file on disk too."""
+    """Flush the folder, so that the name of a new file is on disk too."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -237,18 +240,18 @@ def _parse(file: Path, whole: bytes) -> Quarantine:
     quarantine = Quarantine()
     for number, line in enumerate(whole.split(b"\n")[:-1], 1):
         try:
-            quarantine.extend([_verdict(parse_json(line))])
+            quarantine.extend([_entry(parse_json(line))])
         except (ValueError, TypeError, CorpusError) as error:
             raise CorpusError(
-                f"quarantine file {file}, line {number} is damaged ({error}); mend or delete it"
+                f"quarantine file {file}, line {number} is damaged ({error}); correct or delete the line"
             ) from error
     return quarantine
 
 
-def _verdict(fields: dict[str, object]) -> Verdict:
-    verdict = Verdict(**fields)  # type: ignore[arg-type]
-    for name, value in asdict(verdict).items():
+def _entry(fields: dict[str, object]) -> QuarantineEntry:
+    entry = QuarantineEntry(**fields)  # type: ignore[arg-type]
+    for name, value in asdict(entry).items():
         expected = int if name in ("snapshot", "frame") else str
         if type(value) is not expected:
             raise TypeError(f"{name} = {value!r}: expected {expected.__name__}")
-    return verdict
+    return entry

@@ -1,17 +1,17 @@
-"""Consumer sessions: what each consumer asked for, how much credit it has, whose turn it is. No I/O; time is passed in.
+"""Track what each consumer asked for, its credit, and the order of service. No I/O; time is passed in.
 
 The server keeps no position: a consumer asks for indices, each of which is one unit of its credit until it is answered,
 and an index that was answered is forgotten. So a session can be dropped and opened again at any time.
 
 Worker time is shared by deficit round robin (Shreedhar and Varghese, "Efficient fair queuing using deficit round
-robin", SIGCOMM 1995). What a sample costs is known only once it is made, so a session pays afterwards: it may be served
-while its balance is positive, and when none is, all waiting sessions earn one quantum. A consumer whose samples take
-ten times the work so gets a tenth of the samples, not ten times the time.
+robin", SIGCOMM 1995). The cost of a sample is known only once it is made, so a session pays afterwards: it is served
+while its balance is not negative. If all waiting sessions have negative balances, each earns one quantum at a time. A
+consumer whose samples take ten times the work therefore gets a tenth of the samples, not ten times the time.
 
-Hello again changes none of this: a session that is opened anew pays the debt of the one before it, and what that one
-had asked for and nobody waits for any more counts as asked until the workers are through with it.
+A repeated Hello changes none of this. The new session takes over the debt of the old one, and its abandoned requests
+count against its credit until the workers have finished them.
 
-Memory: the server holds at most credit x sample bytes for a session in its queues, whatever the consumer does.
+Memory: the server queues at most credit x sample bytes for a session, whatever the consumer does.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from v2v_server.schedule.epoch import Schedule
 
 _QUANTUM_SECONDS = 0.05
 GONE_SECONDS = 10.0
-"""After its connection ended a consumer has so long to come back to its session."""
+"""Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0
 _MOST_DEBTS = 4096
-"""Debts remembered of consumers that are not there; the oldest goes first."""
+"""Number of debts remembered for absent consumers; the oldest is dropped first."""
 
 
 @dataclass(slots=True)
@@ -42,26 +42,26 @@ class Session:
     """One consumer.
 
     Attributes:
-        identity: its routing identity.
+        identity: its routing id.
         spec, seed, arrays, batch_size: what it asked for.
         schedule: the order of its samples.
-        credit: most indices it may have asked for and not yet been answered.
+        credit: largest number of indices that it may have requested and not yet received.
         liveness: when it was last heard.
-        waiting: requests nobody works on yet, in the order asked.
-        unanswered: every (epoch, index) asked for and not yet answered.
-        balance_seconds: worker time it has earned and not used.
+        waiting: requests without a worker, in the order of the request.
+        unanswered: every requested (epoch, index) that is not yet answered.
+        balance_seconds: worker time that it has earned and not used.
         served: samples sent.
-        quarantine: number of the quarantine snapshot its samples are made under.
-        left_at: when its connection ended; None while it has one, as far as is known.
+        quarantine: number of the quarantine snapshot that its samples are made under.
+        left_at: when its connection ended; None while it is connected, as far as is known.
         since: when it was opened.
         packed: whether it asks for compressed arrays.
-        name, host: what it calls itself.
-        epoch: that it last asked for samples of.
-        position: index after the highest of that epoch that was answered.
-        waited_seconds: for how long it has waited for samples since its Hello, as it says.
-        user: name of the key that its connection has; empty without keys.
-        owner: digest of that and of the secret of its Hello; empty without a secret.
-        form: of one of its samples.
+        name, host: names that the consumer gives for itself.
+        epoch: the epoch that it last requested samples of.
+        position: index after the highest answered index of that epoch.
+        waited_seconds: time that it has waited for samples since its Hello, as it reports.
+        user: name of its connection's key; empty without keys.
+        owner: digest of that key and of the secret of its Hello; empty without a secret.
+        form: the form of one of its samples.
     """
 
     identity: bytes
@@ -93,23 +93,31 @@ class Session:
     def __post_init__(self) -> None:
         self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
 
-    def heard(self, now: float) -> None:
-        """Its consumer said something."""
-        self.liveness.heard(now)
+    def mark_heard(self, now: float) -> None:
+        """Note a message from the consumer."""
+        self.liveness.mark_heard(now)
         self.left_at = None
 
-    def waits(self, seconds: float, now: float) -> float:
-        """Its consumer says how long it has waited in all; returns how much more than before that is, within reason."""
+    def add_wait(self, seconds: float, now: float) -> float:
+        """Update the consumer's total waiting time.
+
+        Args:
+            seconds: the new total as the consumer reports it.
+            now: monotonic time, seconds.
+
+        Returns:
+            the increase, bounded by the age of the session.
+        """
         more = min(seconds, now - self.since) - self.waited_seconds
         self.waited_seconds += max(0.0, more)
         return max(0.0, more)
 
 
 class Sessions:
-    """All consumers, and whose turn it is.
+    """All consumers, and the order in which they are served.
 
     Args:
-        abandoned: how many samples workers still make that a consumer asked for in an earlier session.
+        abandoned: returns how many samples workers still make that this consumer abandoned in an earlier session.
     """
 
     def __init__(self, abandoned: Callable[[bytes], int] = lambda identity: 0) -> None:
@@ -125,12 +133,13 @@ class Sessions:
         return iter(self._sessions.values())
 
     def get(self, identity: bytes) -> Session | None:
-        """The session of that consumer, if it has one."""
+        """Return the session of a consumer; None if it has none."""
         return self._sessions.get(identity)
 
     def open(self, session: Session) -> None:
-        """Add a session. One of the same routing id or owner is replaced: what it asked for is forgotten, its debt is
-        not."""
+        """Add a session. It replaces a session with the same routing id or owner: old requests are dropped, the debt
+        stays.
+        """
         for before in {session.identity, *self.owned_by(session.owner)}:
             self.forget(before)
             session.balance_seconds -= self._debts.pop(before, 0.0)
@@ -138,11 +147,11 @@ class Sessions:
         self._turns.append(session.identity)
 
     def owned_by(self, owner: bytes) -> list[bytes]:
-        """Return the routing ids of the sessions of an owner; none for an empty one."""
+        """Return the routing ids of an owner's sessions; an empty list for an empty owner."""
         return [each.identity for each in self if owner and each.owner == owner]
 
     def forget(self, identity: bytes) -> None:
-        """Drops a session, if there is one; what it owes is remembered."""
+        """Drop a session, if there is one; its debt is remembered."""
         session = self._sessions.pop(identity, None)
         if session is not None:
             self._turns.remove(identity)
@@ -150,7 +159,7 @@ class Sessions:
                 self.charge(identity, -session.balance_seconds)
 
     def charge(self, identity: bytes, seconds: float) -> None:
-        """The consumer, there or not, owes worker time."""
+        """Charge worker time to a consumer, whether it is connected or not."""
         session = self._sessions.get(identity)
         if session is not None:
             session.balance_seconds -= seconds
@@ -160,16 +169,16 @@ class Sessions:
             del self._debts[next(iter(self._debts))]
 
     def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
-        """The consumer asks for samples. Those it is already waiting for are not made twice, and keep their slots.
+        """Queue requests of a consumer. Samples that it already waits for are not made twice, and keep their slots.
 
         Args:
             session: of the consumer.
             epoch, indices: which samples.
-            slots: where each may be put; empty: none of them anywhere.
+            slots: where each may be put, in the order of ``indices``; empty: no slots.
 
         Raises:
-            LimitExceeded: more than its credit would then be unanswered; none of them is taken.
-            IndexError: an index outside the epoch; none of them is taken.
+            LimitExceeded: more than its credit would be unanswered; no request is taken.
+            IndexError: an index is outside the epoch; no request is taken.
         """
         places: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
         new = [index for index in places if (epoch, index) not in session.unanswered]
@@ -189,7 +198,7 @@ class Sessions:
             session.waiting.append(Request(session.identity, epoch, index, place=place, slot=places[index]))
 
     def next_request(self) -> Request | None:
-        """The next request to give to a worker, by deficit round robin; None when nobody waits."""
+        """Take the next request to give to a worker, by deficit round robin; None if no session waits."""
         waiting = [identity for identity in self._turns if self._may_go_on(self._sessions[identity])]
         if not waiting:
             return None
@@ -200,19 +209,19 @@ class Sessions:
                     self._turns.remove(identity)
                     self._turns.append(identity)
                     return session.waiting.popleft()
-            # Everybody who waits is in debt: let time pass in steps of one quantum until the smallest debt is paid.
+            # All waiting sessions are in debt: add quanta until the smallest debt is paid.
             debt = -max(self._sessions[identity].balance_seconds for identity in waiting)
             quanta = int(debt / _QUANTUM_SECONDS) + 1
             for identity in waiting:
                 self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
 
     def _may_go_on(self, session: Session) -> bool:
-        """Whether it waits for something, and its credit is not spent on what it gave up."""
+        """Return whether a session has waiting requests and credit that its abandoned requests do not use up."""
         at_work = len(session.unanswered) - len(session.waiting)
         return bool(session.waiting) and self._abandoned(session.identity) + at_work < session.credit
 
     def take_siblings(self, request: Request) -> list[Request]:
-        """The waiting requests that are made from the same clip as ``request``; they wait no more."""
+        """Take the waiting requests that are made from the same clip as ``request``."""
         session = self._sessions.get(request.session)
         if session is None or session.spec.samples_per_decode == 1:
             return []
@@ -222,13 +231,17 @@ class Sessions:
         return siblings
 
     def put_back(self, request: Request) -> None:
-        """A request that comes back unanswered: it is next, because its consumer has waited longest for it."""
+        """Put a request back that was not answered. It is served next, because its consumer has waited longest for
+        it.
+        """
         session = self._sessions.get(request.session)
         if session is not None and (request.epoch, request.index) in session.unanswered:
             session.waiting.appendleft(request)
 
-    def answered(self, request: Request, worker_seconds: float) -> bool:
-        """The request is answered; returns False when nobody waits for it (the session is gone, or had it already)."""
+    def mark_answered(self, request: Request, worker_seconds: float) -> bool:
+        """Close a request; return False if it is not wanted: the session is gone, or the request was answered
+        before.
+        """
         session = self._sessions.get(request.session)
         if session is None or (request.epoch, request.index) not in session.unanswered:
             return False
@@ -237,14 +250,14 @@ class Sessions:
             session.position = max(session.position, request.index + 1)
         session.balance_seconds -= worker_seconds
         if not session.unanswered:
-            # Nothing is saved up while idle. A debt stays, or asking for one sample at a time would be free of charge;
-            # it is never more than the cost of what was in work at once.
+            # An idle session saves no credit balance. A debt stays; otherwise asking for one sample at a time would be
+            # free. The debt is at most the cost of the samples that were in work at the same time.
             session.balance_seconds = min(session.balance_seconds, 0.0)
         session.served += 1
         return True
 
     def idle(self, now: float) -> list[bytes]:
-        """Sessions to forget: silent for too long, or without a connection."""
+        """Return the sessions to forget: silent for too long, or without a connection."""
         return [
             session.identity
             for session in self._sessions.values()
@@ -252,8 +265,9 @@ class Sessions:
         ]
 
     def dispensable(self, now: float) -> list[bytes]:
-        """Sessions to forget where others need their place: a consumer that is there says something every few
-        seconds."""
+        """Return the sessions to forget if others need their place. A live consumer sends a message every few
+        seconds.
+        """
         return [
             session.identity
             for session in self._sessions.values()

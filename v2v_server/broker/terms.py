@@ -1,15 +1,14 @@
-"""The terms of a lease: what it asks of a worker, and what the answer must be. Pure.
+"""Build leases and check their results. Pure.
 
-A lease says everything that a worker on any host needs, and nothing else. Its answer is inspected before it is passed
-on: a consumer trusts its server, but the server does not trust a worker, which may be another version, broken or
-hostile. The small header is read; the arrays are only measured, and not even that where they lie in a slot of the
-consumer's.
+A lease holds everything that a worker on any host needs, and nothing else. Its result is checked before it is passed
+on: a consumer trusts its server, but the server does not trust a worker, which may run another version, be broken or be
+hostile. Only the small header is read. The arrays are measured, unless they lie in a slot of the consumer.
 """
 
 from __future__ import annotations
 
 import math
-from collections import abc
+from collections.abc import Sequence
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
@@ -21,13 +20,13 @@ from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.leases import Request
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.videos import VideoEntry
-from v2v_server.schedule.sequences import Sequence
+from v2v_server.schedule.sequences import VideoSequence
 
 
 def lease_for(
     request: Request,
     *,
-    sequence: Sequence,
+    sequence: VideoSequence,
     catalogue: Catalogue,
     spec: StreamSpec,
     seed: int,
@@ -36,20 +35,20 @@ def lease_for(
     siblings: tuple[int, ...] = (),
     packed: bool = False,
 ) -> Lease:
-    """The lease for one request.
+    """Build the lease for one request.
 
     Args:
-        request: which sample, and what was tried before.
-        sequence: what the request's candidate is made from.
-        catalogue, spec, seed: of the sample's identity.
-        arrays: to be sent.
-        number: of the lease.
+        request: which sample, and which candidates failed before.
+        sequence: the sequence that the request's candidate is made from.
+        catalogue, spec, seed: parts of the sample's identity.
+        arrays: names of the arrays to send.
+        number: the lease's number.
         siblings: indices that are made from the same clip and follow in leases of their own.
-        packed: whether its consumer asks for compressed arrays.
+        packed: whether the consumer asks for compressed arrays.
 
     Raises:
-        IndexUnreadable: of the catalogue, just now.
-        V2VError: what the index says of this video is damaged, another file's, or too large to send.
+        IndexUnreadable: the catalogue's index cannot be read at the moment.
+        V2VError: the index of this video is damaged, belongs to another file, or is too large to send.
     """
     video = sequence.video
     thresholds: tuple[float, ...] = ()
@@ -87,19 +86,19 @@ def lease_for(
 
 
 _DECODE_SECONDS = 5e-8
-"""For each pixel of a frame: ten times what a slow codec takes on a slow core, and so are the others."""
+"""For each pixel of a frame: ten times the time of a slow codec on a slow core. The other limits are as generous."""
 _FLOW_SECONDS = 1e-6
 _SIMULATION_SECONDS = 1e-7
 
 
 def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -> float:
-    """How long a worker may need for one sample, at the worst: whole seconds.
+    """Return an upper bound of the time for one sample, whole seconds.
 
     A frame of 1920 x 1080 is given 0.1 s, its flow 2 s.
 
     Args:
         spec, arrays: what is asked of the video.
-        video: its pictures are decoded whole.
+        video: its catalogue entry; pictures are decoded whole.
     """
     recipe, picture_px = spec.recipe, video.width_px * video.height_px
     seconds = _DECODE_SECONDS * picture_px * recipe.frames_needed
@@ -109,22 +108,22 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     return float(math.floor(seconds * spec.samples_per_decode))
 
 
-def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> SampleHeader:
-    """The header of a sample that its consumer will be able to read.
+def check_result(payload: Sequence[Any], request: Request, form: Form) -> SampleHeader:
+    """Return the header of a result, after checking that its consumer will be able to read the sample.
 
     Args:
         payload: the frames behind the worker's Result: a whole SampleHeader message.
         request: what was asked.
-        form: of the sample.
+        form: the expected form of the sample.
 
     Raises:
-        ProtocolError: it must not be passed on.
+        ProtocolError: the result must not be passed on.
     """
     if not payload:
         raise ProtocolError("nothing follows it")
     header = decode(bytes(payload[0]))
     if not isinstance(header, SampleHeader) or (header.epoch, header.index) != (request.epoch, request.index):
-        raise ProtocolError("its header is that of another sample, or of none")
+        raise ProtocolError("its header names another sample than the lease")
     if (header.names, header.dtypes) != (form.names, form.dtypes):
         raise ProtocolError(f"it has {list(header.names)!r:.100} of {list(header.dtypes)!r:.100}")
     if header.quarantine != request.snapshot:
@@ -134,12 +133,12 @@ def inspected(payload: abc.Sequence[Any], request: Request, form: Form) -> Sampl
         raise ProtocolError(f"it names slot {header.slot}, slot {slot} was lent")
     in_slot = slot != NO_SLOT and len(payload) == 1
     if header.shapes != form.shapes or not (in_slot or _fits(payload[1:], form.sizes, header.packed)):
-        raise ProtocolError("its arrays have other shapes or sizes than were asked")
+        raise ProtocolError("its arrays have other shapes or sizes than the lease asks for")
     return header
 
 
-def _fits(frames: abc.Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
-    """Whether the frames may hold arrays of these bytes."""
+def _fits(frames: Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
+    """Return whether the frames may hold arrays of these sizes, bytes."""
     lengths = tuple(map(len, frames))
     if not packed:
         return lengths == sizes

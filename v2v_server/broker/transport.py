@@ -1,13 +1,14 @@
-"""The way in and out: who sent what, and what goes to whom.
+"""Send and receive messages of consumers and workers.
 
-The loop (:mod:`v2v_server.serve`) knows only the :class:`ServerTransport`. The server's is :class:`Sockets`, two ZeroMQ
-sockets; tests have one of plain queues.
+The loop (:mod:`v2v_server.serve`) uses only the :class:`ServerTransport` protocol. The server implements it with
+:class:`Sockets`, two ZeroMQ sockets; tests implement it with plain queues.
 
-Samples pass through as the very frames that arrived; only the small header before them is read.
+Samples pass through in the frames that arrived; only the small header before them is read.
 
-Memory: a consumer asks for more only as it takes what it was sent, so broker bytes <= sum over sessions of credit x
-sample bytes (in ZeroMQ's out-queue of a consumer that is slow) + workers x 2 x sample bytes. A peer that asks and never
-reads is cut off at MOST_QUEUED messages, or at the bytes of its credit (:mod:`v2v_server.broker.door`).
+Memory: a consumer asks for more only after it has taken what it was sent. So the broker holds at most the sum over all
+sessions of credit x sample bytes (in ZeroMQ's send queue of a slow consumer) + workers x 2 x sample bytes. A peer that
+asks and never reads is disconnected at MOST_QUEUED messages, or at the bytes of its credit
+(:mod:`v2v_server.broker.door`).
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from v2v_server.keys.folder import KeyFolder
 from v2v_server.keys.zap import HANDSHAKE_MS, Gate
 
 MOST_QUEUED = 512
-"""Messages that wait for one peer before it is taken for deaf; above any credit (``admission.MOST_CREDIT``)."""
+"""Messages queued for one peer at which it is disconnected; above any credit (``admission.MOST_CREDIT``)."""
 MOST_UNREAD = 4
-"""Messages of one peer that wait for this server. After that its connection is not read: it waits, and nobody else."""
+"""Messages queued from one peer. Beyond that its connection is not read, so only this peer waits."""
 _KEEPALIVE_SECONDS = 300
 _REVIEW_SECONDS = 0.5
-# Plain numbers: to combine two flags of an enumeration takes longer than to send a small frame.
+# Plain numbers: combining two flags of an enumeration takes longer than sending a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
 
@@ -64,19 +65,24 @@ class FromWorker:
 
 @dataclass(frozen=True, slots=True)
 class ConsumerGone:
-    """The connection of a consumer has ended; it may come back over another one. Empty: of some that never spoke."""
+    """The connection of a consumer has ended; the consumer may come back over another one.
+
+    Attributes:
+        identity: routing id; empty for connections that never sent a message.
+    """
 
     identity: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class TurnedAway:
-    """From an address came more connections without a message than any host needs; its next ones are not let in.
+    """New connections from an address are rejected, because it opened more connections without a message than a host
+    needs.
 
     Attributes:
-        address: of a host, or of a network of IPv6; empty where connections were gone before they could be asked, and
-            hosts that have not spoken within the hour are turned away.
-        side: whose port it was.
+        address: of a host, or of an IPv6 network; empty if connections ended before their addresses could be read. Then
+            all hosts that have sent no message within the hour are rejected.
+        side: which port: that of consumers or of workers.
     """
 
     address: str
@@ -87,7 +93,7 @@ Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone | TurnedAway
 
 
 class ServerTransport(Protocol):
-    """Carries messages between the server and its peers."""
+    """Transport of messages between the server and its peers."""
 
     @property
     def address(self) -> str:
@@ -99,24 +105,24 @@ class ServerTransport(Protocol):
 
     @property
     def waited_seconds(self) -> float:
-        """For how long :meth:`receive` has waited in all: nobody had said anything."""
+        """Total time that :meth:`receive` has waited without a message, seconds."""
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """At most one message of each side, so that neither can shut the other out; the workers' first. Last of all who
-        has gone, and who is turned away.
+        """Return at most one message of each side, the workers' first, so that neither side can starve the other. Ended
+        connections and rejected addresses follow last.
 
         Args:
             seconds: longest wait for any of them.
         """
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
-        """False when the peer is not connected any more, or does not read what it is sent."""
+        """Send a message; return False if the peer is not connected any more or does not read."""
 
     def cut(self, identity: bytes) -> None:
-        """Ends the connection of a consumer."""
+        """End the connection of a consumer."""
 
     def close(self) -> None:
-        """Ends all connections; what was not sent is dropped."""
+        """End all connections; unsent messages are dropped."""
 
 
 class Sockets:
@@ -125,13 +131,13 @@ class Sockets:
     Args:
         bind: address for consumers.
         worker_bind: address for workers.
-        most_connections: of consumers, at a time.
-        most_queued_bytes: that may wait for one consumer.
-        keys: whose ``tcp://`` peers may come in; None lets in everyone.
-        local_bind: address for workers of this host that have no key; used where ``worker_bind`` asks for one.
+        most_connections: largest number of consumer connections at a time.
+        most_queued_bytes: largest number of bytes queued for one consumer.
+        keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
+        local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
 
     Raises:
-        UsageError: an address that cannot be bound; the message names the flag.
+        UsageError: an address cannot be bound; the message names the flag.
         KeyRefused: the server's own keys cannot be read.
     """
 
@@ -156,8 +162,8 @@ class Sockets:
             self._context.destroy(linger=0)
             raise
         self._door = Door(self._consumers, most_connections, most_queued_bytes)
-        # A worker's samples are large: only the number of its kind and those that never say who they are matter here.
-        # An ipc:// address is our own user's.
+        # Workers send large samples, so only their number and silent connections are limited here.
+        # Only our own user can reach an ipc:// address.
         is_private = worker_bind.startswith("ipc:")
         self._worker_door = None if is_private else Door(self._workers, most_connections, 1 << 40, 1 << 62)
         self._users: dict[tuple[str, bytes], str] = {}
@@ -167,7 +173,9 @@ class Sockets:
             _bind(self._consumers, bind, "--bind")
             self.local_address = ""
             if self._gate is not None and not worker_bind.startswith("ipc:") and local_bind:
-                _bind(self._workers, local_bind, "--worker-bind")  # before the guard, which is for what follows it
+                _bind(
+                    self._workers, local_bind, "--worker-bind"
+                )  # before the guard, which applies to the addresses bound after it
                 self.local_address = self._workers.getsockopt_string(zmq.LAST_ENDPOINT)
             self._guard(self._workers, worker_bind, "worker")
             _bind(self._workers, worker_bind, "--worker-bind")
@@ -182,7 +190,7 @@ class Sockets:
         self.local_address = self.local_address or self.worker_address
 
     def _guard(self, router: zmq.Socket[bytes], address: str, side: str) -> None:
-        # An ipc:// address lets in our own user only.
+        # Only our own user may connect to an ipc:// address.
         if self._gate is not None and not address.startswith("ipc:"):
             self._gate.guard(router, side)
 
@@ -199,14 +207,14 @@ class Sockets:
         if sys.platform.startswith("linux"):
             # An ipc:// address is open to every user of this host; the system says whose process connects.
             router.setsockopt(zmq.IPC_FILTER_UID, os.getuid())
-        # A host that vanishes (pre-empted, unplugged) says no farewell, and nothing is said to it that would show it:
-        # the system asks, or its connection would stay open as long as this process lives.
+        # A host that vanishes (pre-empted, unplugged) does not close its connection, and no data is sent that would
+        # reveal it. Without TCP keep-alive the connection would stay open for the life of this process.
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)
         router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
         return router
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """See :class:`ServerTransport`."""
+        """Implement :meth:`ServerTransport.receive`."""
         began = time.monotonic()
         ready = dict(self._poller.poll(int(seconds * 1000)))
         self.waited_seconds += time.monotonic() - began
@@ -226,21 +234,21 @@ class Sockets:
         return arrivals
 
     def _receive(self, router: zmq.Socket[bytes], side: str) -> tuple[bytes, list[Any]] | None:
-        """A message that is there, and who sent it: somebody whose key was not revoked since it came in.
+        """Return an available message and its sender, if the sender's key has not been revoked since it connected.
 
         The header is copied out as bytes; what follows stays in ZeroMQ's own frames.
         """
         frames: list[Any] = []
         try:
             identity = frame = router.recv(_NOBLOCK, copy=False)
-            while frame.more:  # recv_multipart asks the socket instead, which takes longer
+            while frame.more:  # recv_multipart queries the socket instead, which takes longer
                 frame = router.recv(_NOBLOCK, copy=False)
                 frames.append(frame if frames else frame.bytes)
         except zmq.Again:
-            return None  # a connection that just ended took it along
+            return None  # the connection has just ended, and its message is gone
         door = self._door if side == "consumer" else self._worker_door
         if door is not None:
-            with suppress(zmq.ZMQError):  # of some messages, whose connection just ended, ZeroMQ does not know
+            with suppress(zmq.ZMQError):  # ZeroMQ does not know this for messages of connections that have just ended
                 door.heard(identity.bytes, int(identity.get(zmq.SRCFD)))
         if self._gate is not None:
             with suppress(zmq.ZMQError):  # it came over ipc://, and has no key
@@ -251,7 +259,7 @@ class Sockets:
         return identity.bytes, frames
 
     def _review(self, gate: Gate, consumers: list[bytes], workers: list[bytes]) -> None:
-        """Forgets those that are gone, and cuts off whose key was revoked."""
+        """Forget peers that are gone, and disconnect peers whose key was revoked."""
         for side, identities in (("consumer", consumers), ("worker", workers)):
             for identity in identities:
                 self._users.pop((side, identity), None)
@@ -264,7 +272,7 @@ class Sockets:
                 door.cut(identity)
 
     def send(self, action: ToConsumer | ToWorker) -> bool:
-        """See :class:`ServerTransport`."""
+        """Implement :meth:`ServerTransport.send`."""
         router = self._consumers if isinstance(action, ToConsumer) else self._workers
         try:
             router.send(action.identity, _NOBLOCK_MORE)
@@ -282,11 +290,11 @@ class Sockets:
         return True
 
     def cut(self, identity: bytes) -> None:
-        """See :class:`ServerTransport`."""
+        """Implement :meth:`ServerTransport.cut`."""
         self._door.cut(identity)
 
     def close(self) -> None:
-        """Closes both sockets; what was not sent is dropped."""
+        """Close both sockets; unsent messages are dropped."""
         self._door.close()
         if self._worker_door is not None:
             self._worker_door.close()
@@ -296,7 +304,7 @@ class Sockets:
 
 
 def _bind(router: zmq.Socket[bytes], address: str, flag: str) -> None:
-    # Otherwise IPv4 addresses come back in their IPv6 form, which nobody would recognise.
+    # Otherwise IPv4 addresses come back in their IPv6 form, which few readers recognise.
     router.setsockopt(zmq.IPV6, int("[" in address))
     try:
         router.bind(address)

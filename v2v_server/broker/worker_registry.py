@@ -1,4 +1,4 @@
-"""The workers as far as is known: who is there, who has room, who is silent. No I/O; time is passed in."""
+"""Track the workers: which are connected, have free credit, or are silent. No I/O; time is passed in."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from v2v_server.broker.leases import LeaseBook
 MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
 SILENCE_SECONDS = 30.0
-"""A worker without work says so every five seconds; after this long without a word it is taken for gone."""
+"""An idle worker pings every five seconds; after this time without a message it is treated as gone."""
 REST_SECONDS = 10.0
-"""A worker whose host cannot read what the server's can gets no work for so long: storage may come back."""
+"""Time without work for a worker whose host cannot read a video that the server's host can; storage may return."""
 LONGEST_NAME = 100
-"""Characters that are kept of what a peer calls itself or its host."""
+"""Characters kept of the name that a peer gives itself or its host."""
 _MOST_STALE = 64
-"""Entries out of date that the heap may hold, besides one for each worker with room, before it is made anew."""
+"""Stale entries that the heap may hold, besides one for each worker with free credit, before it is rebuilt."""
 
 
 @dataclass(slots=True)
@@ -29,13 +29,13 @@ class Member:
     """A worker that said hello.
 
     Attributes:
-        credit: leases it takes at a time.
+        credit: number of leases that it accepts at a time.
         liveness: when it was last heard.
-        host: where it says it is.
-        given_up: it hangs or is silent, and gets no more work.
-        unreadable: what its host could not read last; empty since it has done anything.
-        work: what its samples took that were waited for.
-        memory_bytes: of its process when it last said so; 0: not known.
+        host: the host that it names.
+        given_up: whether it hangs or is silent; then it gets no more work.
+        unreadable: why its host could not read the last video; empty once it has made a sample since.
+        work: totals of its samples that were wanted.
+        memory_bytes: memory of its process as last reported; 0: not known.
     """
 
     credit: int
@@ -47,8 +47,8 @@ class Member:
     memory_bytes: int = 0
 
 
-def shown(text: str) -> str:
-    """What a peer calls itself, fit for a person's eyes: short, and without control characters."""
+def clean_name(text: str) -> str:
+    """Make a name that a peer sent safe to display: short, and without control characters."""
     return "".join(filter(str.isprintable, text[:LONGEST_NAME]))
 
 
@@ -56,17 +56,17 @@ class Workers:
     """Workers that said hello and are alive as far as is known.
 
     Args:
-        leases: what they hold.
+        leases: the leases that they hold.
     """
 
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, Member] = {}
-        self._resting: dict[bytes, float] = {}  # until when
-        # Of a thousand workers only those are looked at whose load has changed, and who holds least is found at once.
+        self._resting: dict[bytes, float] = {}  # time at which their rest ends
+        # With a thousand workers, only those whose load has changed are examined; the heap gives the least loaded one.
         self._changed: set[bytes] = set()
-        self._room: dict[bytes, int] = {}  # what they hold who have room for more
-        self._heap: list[tuple[int, bytes]] = []  # all of that, and what was so once
+        self._room: dict[bytes, int] = {}  # leases held by each worker with free credit
+        self._heap: list[tuple[int, bytes]] = []  # the same as a heap, with stale entries
         self._in_heap: set[tuple[int, bytes]] = set()
 
     def __len__(self) -> int:
@@ -76,54 +76,54 @@ class Workers:
         return identity in self._workers
 
     def identities(self) -> list[bytes]:
-        """All of them."""
+        """Return the routing ids of all workers."""
         return list(self._workers)
 
     def members(self) -> Mapping[bytes, Member]:
-        """All of them, and what is known of each."""
+        """Return all workers by routing id."""
         return self._workers
 
     def is_resting(self, identity: bytes) -> bool:
-        """Whether it gets no work for a while."""
+        """Return whether a worker gets no work for a while."""
         return identity in self._resting
 
     def add(self, identity: bytes, credit: int, now: float, host: str = "") -> None:
-        """A worker said hello."""
+        """Add a worker that said hello."""
         room = max(1, min(credit, MOST_WORKER_CREDIT))
-        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), shown(host))
+        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), clean_name(host))
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
-        """It is gone."""
+        """Remove a worker that is gone."""
         self._workers.pop(identity, None)
         self._resting.pop(identity, None)
         self._changed.add(identity)
 
-    def heard(self, identity: bytes, now: float) -> bool:
-        """A message came from it; False when nobody of that name said hello."""
+    def mark_heard(self, identity: bytes, now: float) -> bool:
+        """Note a message from a worker; return False if it has not said hello."""
         worker = self._workers.get(identity)
         if worker is None:
             return False
-        worker.liveness.heard(now)
+        worker.liveness.mark_heard(now)
         return True
 
     def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:
-        """It made a sample that was waited for."""
+        """Add a wanted sample to the worker's totals."""
         worker = self._workers.get(identity)
         if worker is not None:
             worker.work.add(result, cpu_seconds)
             worker.memory_bytes = result.memory_bytes
 
     def can_work(self, identity: bytes) -> None:
-        """It has done something: its host can read videos."""
+        """Note that a worker has made a sample, so its host can read videos."""
         if identity in self._workers:
             self._workers[identity].unreadable = ""
 
     def trouble(self, expected: int) -> str:
-        """Why none of them can make a sample, and what to do about it; empty where one can, as far as is known.
+        """Return why no worker can make a sample, and what to do about it; empty if one can, as far as is known.
 
         Args:
-            expected: how many there should be.
+            expected: number of workers expected.
         """
         if not self._workers:
             start = f"{expected} should come; see what v2v-serve says of them" if expected else "start v2v-worker"
@@ -137,25 +137,27 @@ class Workers:
         )
 
     def rest(self, identity: bytes, now: float, unreadable: str) -> None:
-        """It gets no work for a while: its host could not read that."""
+        """Give a worker no work for a while, because its host could not read a video."""
         if identity in self._workers:
             self._workers[identity].unreadable = unreadable
             self._resting[identity] = now + REST_SECONDS
             self._changed.add(identity)
 
     def wake(self, now: float) -> None:
-        """Those that have rested get work again."""
+        """Give work again to workers whose rest is over."""
         rested = [identity for identity, until in self._resting.items() if now >= until]
         for identity in rested:
             del self._resting[identity]
         self._changed.update(rested)
 
     def hanging(self, now: float) -> list[bytes]:
-        """Workers with an overdue lease. Each is reported once, and gets no more work."""
+        """Return workers with an overdue lease. Each is returned once, and gets no more work."""
         return self._give_up(identity for identity in self._leases.overdue(now) if identity in self._workers)
 
     def vanished(self, now: float) -> list[bytes]:
-        """Workers that hold nothing and have been silent for too long. Each is reported once, and gets no more work."""
+        """Return workers without leases that have been silent for too long. Each is returned once, and gets no more
+        work.
+        """
         return self._give_up(
             identity
             for identity, worker in self._workers.items()
@@ -163,17 +165,17 @@ class Workers:
         )
 
     def for_request(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:
-        """The worker that holds least and has room for more.
+        """Return the worker that holds the fewest leases and has free credit; None if there is none.
 
         Args:
-            keep_one_empty: a request that runs alone waits: the worker that holds least is left to work itself empty.
-            other_than: not this one, which is slow at the request.
+            keep_one_empty: a request that runs alone waits, so the worker with the fewest leases gets no new ones.
+            other_than: a worker to skip, because it is slow at this request.
         """
         lightest = self._lightest(2 + keep_one_empty)[keep_one_empty:]
         return next((identity for _, identity in lightest if identity != other_than), None)
 
     def for_lone_request(self) -> bytes | None:
-        """A worker that holds nothing."""
+        """Return a worker that holds no lease; None if there is none."""
         return next((identity for held, identity in self._lightest(1) if not held), None)
 
     def _give_up(self, found: Iterable[bytes]) -> list[bytes]:
@@ -184,7 +186,7 @@ class Workers:
         return given_up
 
     def _lightest(self, most: int) -> list[tuple[int, bytes]]:
-        """(leases held, identity) of those with room who hold least, in that order; equals by name."""
+        """Return (leases held, routing id) of the workers with free credit, fewest leases first; ties by routing id."""
         self._look_at_changed()
         found: list[tuple[int, bytes]] = []
         while self._heap and len(found) < most:
@@ -208,7 +210,7 @@ class Workers:
                 self._room.pop(identity, None)
                 continue
             self._room[identity] = held
-            # An entry that is out of date stays until it comes up, or until there are more of them than of others.
+            # A stale entry stays until it reaches the top, or until stale entries outnumber the others.
             if (held, identity) not in self._in_heap:
                 self._in_heap.add((held, identity))
                 heapq.heappush(self._heap, (held, identity))
@@ -218,5 +220,5 @@ class Workers:
             heapq.heapify(self._heap)
 
     def _is_alone(self, identity: bytes) -> bool:
-        """A request that runs alone leaves no room."""
+        """Return whether the worker holds a request that runs alone, which leaves no credit."""
         return any(runs_alone(request) for request in self._leases.requests_of(identity))

@@ -206,21 +206,21 @@ class Catalogue:
             )
         return self.scene_digest
 
-    def wait_no_more(self) -> None:
+    def fail_fast(self) -> None:
         """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
-        self._store.wait_no_more()
+        self._store.fail_fast()
 
-    def doubt(self, id: str) -> None:
+    def mark_stale(self, id: str) -> None:
         """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
         say. Does nothing where the index cannot be written now."""
         with suppress(sqlite3.Error):
-            self._store.doubt(id)
+            self._store.mark_stale(id)
 
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""
         self._store.close()
         if isinstance(self.root, Copies):
-            self.root.let_go()
+            self.root.release()
 
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)

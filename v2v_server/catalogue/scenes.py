@@ -24,7 +24,7 @@ from v2v_server.catalogue.index.runs import CutVideos, Runs
 from v2v_server.catalogue.manifest import Manifest
 from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
 from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
-from v2v_server.cloud.copies import Copies, lent
+from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -185,7 +185,7 @@ def _look_at(root: Path | Copies, job: _ToLookAt) -> bytes:
     seen = Look()
     if job.index and job.window is not None:
         try:
-            with lent(root, job.id, job.fingerprint) as path:
+            with open_local(root, job.id, job.fingerprint) as path:
                 pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
                 for picture in islice(pictures, MOST_FRAMES):
                     seen.add(picture)

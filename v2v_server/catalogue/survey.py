@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.catalogue.index.file import IndexRow
-from v2v_server.cloud.copies import Copies, lent
+from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
@@ -33,7 +33,7 @@ def examine(root: Path | Copies, id: str) -> IndexRow:
     """
     try:
         before = _state(root, id)
-        with lent(root, id, "") as path:
+        with open_local(root, id, "") as path:
             mark = fingerprint(path)
             facts = _facts(path)
         if _state(root, id) != before:

@@ -121,11 +121,11 @@ class Copies:
             VideoUnreadable: it cannot be had.
             VideoChanged: the object is another one by now.
         """
-        self.let_go()
+        self.release()
         self._keep(id, fingerprint, self._get(id, fingerprint))
 
     @contextlib.contextmanager
-    def lent(self, id: str, fingerprint: str) -> Iterator[Path]:
+    def open_local(self, id: str, fingerprint: str) -> Iterator[Path]:
         """The copy of a video, which stays until the end of the context.
 
         Args:
@@ -137,15 +137,15 @@ class Copies:
         if fingerprint and self.has(id, fingerprint):
             yield self._path(id, fingerprint)
             return
-        self.let_go()
+        self.release()
         with self._get(id, fingerprint) as held:
             yield Path(held.name)
 
     def _keep(self, id: str, fingerprint: str, held: IO[bytes]) -> None:
-        self.let_go()
+        self.release()
         self._at_hand = (id, fingerprint), held
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Nothing is kept from eviction any more."""
         if self._at_hand is not None:
             self._at_hand[1].close()
@@ -252,13 +252,13 @@ def copies_of(
     return copies
 
 
-def lent(root: Path | Copies, id: str, fingerprint: str) -> AbstractContextManager[Path]:
+def open_local(root: Path | Copies, id: str, fingerprint: str) -> AbstractContextManager[Path]:
     """The file of a video for as long as the context lasts, be it in a folder or in object storage.
 
     Raises:
-        VideoUnreadable, VideoChanged: as of :meth:`Copies.lent`; of a folder, whoever opens the file finds out.
+        VideoUnreadable, VideoChanged: as of :meth:`Copies.open_local`; of a folder, whoever opens the file finds out.
     """
-    return root.lent(id, fingerprint) if isinstance(root, Copies) else nullcontext(root / id)
+    return root.open_local(id, fingerprint) if isinstance(root, Copies) else nullcontext(root / id)
 
 
 def _oldest_first(folder: Path) -> list[Path]:

@@ -15,8 +15,8 @@ from v2v_protocol.spec import SCENES
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.catalogue.index.parts import Shard
 from v2v_server.cloud.copies import COPIES_GIB
-from v2v_server.console.farewell import span
 from v2v_server.console.progress import CatalogueProgress, catalogue_progress
+from v2v_server.console.shutdown_summary import format_duration
 from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -86,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> None:
             parts = None if arguments.merge is None else Path(arguments.merge)
             catalogue = catalogue_ahead(asked, parts, probed, shown.notice)
     lines = _of_part(part, shard) if shard is not None else _of_all(catalogue)
-    for line in [*lines, f"looked into {probed.files} files in {span(time.monotonic() - begun)}"]:
+    for line in [*lines, f"looked into {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
         print(line)
 
 

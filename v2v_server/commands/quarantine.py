@@ -16,7 +16,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
-from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
 from v2v_server.catalogue.files import corpus_root
 from v2v_server.cloud.bucket import is_url
 
@@ -40,9 +40,9 @@ def _run(arguments: argparse.Namespace) -> None:
     source: str = arguments.videos
     file = quarantine_path(corpus_root(Path(source)) if not is_url(source) else source.rstrip("/"), arguments.cache_dir)
     quarantine = read_quarantine(file)
-    if arguments.clear and quarantine.verdicts(quarantine.latest):
+    if arguments.clear and quarantine.entries(quarantine.latest):
         _clear(file, quarantine)
-    in_force = quarantine.verdicts(quarantine.latest)
+    in_force = quarantine.entries(quarantine.latest)
     for line in quarantine.lines:
         print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
     print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
@@ -54,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _clear(file: Path, quarantine: Quarantine) -> None:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        quarantine.extend(write_verdict(file, clearing(now), quarantine))
+        quarantine.extend(write_entry(file, clearing(now), quarantine))
     except OSError as error:
         raise V2VError(f"quarantine file {file} cannot be written: {error.strerror}; nothing was cleared") from error
 

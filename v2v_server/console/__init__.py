@@ -3,7 +3,7 @@
 status     the summary at the start, and a line every ten seconds
 terminal   the same on a terminal, a few lines kept up to date
 status_log the same as a line that programs read
-farewell   what is said at the end
+shutdown_summary  the last lines of the log
 progress   how far the catalogue is
 state      the one model of the service, which terminal, page and metrics read
 survey     makes it from the server's parts

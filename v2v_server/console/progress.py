@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.status import Status
 from rich.text import Text
 
-from v2v_server.console.farewell import span
+from v2v_server.console.shutdown_summary import format_duration
 from v2v_server.system.log import Log
 
 _LOG_SECONDS = 10.0
@@ -72,7 +72,7 @@ class _Lines:
             self._begun = done, now
         first, begun = self._begun
         rate = (done - first) / (now - begun) if now > begun else 0.0
-        left = f", {rate:.3g} a second, {span((total - done) / rate)} left" if rate and done < total else ""
+        left = f", {rate:.3g} a second, {format_duration((total - done) / rate)} left" if rate and done < total else ""
         self.notice(f"probing videos: {done} of {total}{left}")
 
     def notice(self, text: str) -> None:

@@ -119,7 +119,7 @@ class RefusalState:
 
 
 @dataclass(frozen=True, slots=True)
-class VerdictState:
+class QuarantineState:
     """One of the last verdicts of the quarantine that is in force."""
 
     snapshot: int
@@ -240,7 +240,7 @@ class ServiceState:
     refusals: tuple[RefusalState, ...]
     quarantine_snapshot: int
     quarantined: int
-    verdicts: tuple[VerdictState, ...]
+    verdicts: tuple[QuarantineState, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""

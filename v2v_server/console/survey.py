@@ -25,10 +25,10 @@ from v2v_server.console.state import (
     STATE_VERSION,
     CacheState,
     ConsumerState,
+    QuarantineState,
     RefusalState,
     ServiceState,
     Totals,
-    VerdictState,
     WorkerState,
 )
 from v2v_server.console.waiting import Shares, Waiting, who_waits
@@ -115,10 +115,12 @@ def service_state(service: Service, now: float, time: str, *, is_ready: bool) ->
             for when, each in reversed(dispatcher.candidates.latest)
         ),
         quarantine_snapshot=service.quarantine.latest,
-        quarantined=len(service.quarantine.verdicts(service.quarantine.latest)),
+        quarantined=len(service.quarantine.entries(service.quarantine.latest)),
         verdicts=tuple(
-            VerdictState(each.snapshot, each.time, each.path[:_LONGEST_TEXT], each.frame, each.reason[:_LONGEST_TEXT])
-            for each in reversed(service.quarantine.verdicts(service.quarantine.latest)[-_MOST_VERDICTS:])
+            QuarantineState(
+                each.snapshot, each.time, each.path[:_LONGEST_TEXT], each.frame, each.reason[:_LONGEST_TEXT]
+            )
+            for each in reversed(service.quarantine.entries(service.quarantine.latest)[-_MOST_VERDICTS:])
         ),
     )
 
@@ -138,7 +140,7 @@ def _waiting(service: Service, now: float, before: Moment, last: Moment) -> Wait
         is_attended=service.history.is_attended(now) or dispatcher.consumers > 0,
         workers=dispatcher.workers,
         starting=max(0, service.supervisor.running - dispatcher.workers),
-        trouble=dispatcher.held_up or dispatcher.registry.trouble(service.config.workers_in_all),
+        trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(service.config.workers_in_all),
         has_cache=bool(service.config.cache),
     )
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from v2v_server.catalogue.files import printable
-from v2v_server.console.farewell import span
+from v2v_server.console.shutdown_summary import format_duration
 
 _MOST_ROWS = 30
 _COLOURS = {
@@ -98,7 +98,7 @@ def consumers_table(count: int, consumers: Sequence[Mapping[str, Any]]) -> Table
             str(each["epoch"]),
             ProgressBar(total=1.0, completed=share, width=20),
             f"{each['position']}/{each['sequences']}",
-            "" if each["eta_seconds"] is None else span(each["eta_seconds"]),
+            "" if each["eta_seconds"] is None else format_duration(each["eta_seconds"]),
             f"{each['batches_per_second']:.2f}",
             f"{each['waiting_share']:.0%}",
             f"{each['in_flight']}+{each['waiting']}",

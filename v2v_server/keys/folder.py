@@ -38,7 +38,7 @@ class KeyFolder:
         self._lent: dict[str, dict[str, str]] = {side: {} for side in SIDES}
 
     def init(self) -> None:
-        """Makes the folder and the server's keys.
+        """Make the folder and the server's keys.
 
         Raises:
             UsageError: there are keys already, or the folder cannot be made.
@@ -78,7 +78,7 @@ class KeyFolder:
         return public.encode(), secret.encode()
 
     def new(self, name: str, side: str, out: Path) -> None:
-        """Makes a key for a peer, and lets it in.
+        """Make a key for a peer, and lets it in.
 
         Args:
             side: "consumer" or "worker".
@@ -113,7 +113,7 @@ class KeyFolder:
         return PeerKey(side, name, server.decode(), public, secret)
 
     def revoke(self, name: str) -> list[str]:
-        """Removes the keys of that name; returns their sides.
+        """Remove the keys of that name; returns their sides.
 
         Raises:
             UsageError: there is none.

@@ -59,7 +59,7 @@ class Gate:
         return user in self._allowed[side]
 
     def close(self) -> None:
-        """Ends the thread. To be called before the context is closed."""
+        """End the thread. To be called before the context is closed."""
         self._closing.set()
         self._thread.join()
         self._questions.close(linger=0)

@@ -21,7 +21,7 @@ _NICE = 10
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serves until it is told to stop, or the server ends."""
+    """Serve until it is told to stop, or the server ends."""
     parser = argparse.ArgumentParser(prog="python -m v2v_server.page", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server's own workers connect")
     parser.add_argument("--fd", required=True, type=int, help="descriptor of the socket that listens")

@@ -68,7 +68,7 @@ class PageProcess:
         self._address = address
 
     def watch(self, now: float) -> list[str]:
-        """Starts the process where there is none, and says how one ended. To be called a few times a second."""
+        """Start the process where there is none, and says how one ended. To be called a few times a second."""
         if self._process is not None and (status := self._process.poll()) is not None:
             if now - self._started_at >= _LONG_LIFE_SECONDS:
                 self._pause = _FIRST_PAUSE_SECONDS
@@ -100,7 +100,7 @@ class PageProcess:
         )
 
     def stop(self) -> None:
-        """Ends the process, and listens no more."""
+        """End the process, and listens no more."""
         self._address = ""
         process, self._process = self._process, None
         if process is not None:

@@ -175,7 +175,7 @@ class _Room:
         return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels) if self._lossless else 0
 
     def check(self) -> None:
-        """Raises CorpusError where the disk is nearly full."""
+        """Raise CorpusError where the disk is nearly full."""
         free = shutil.disk_usage(self._target).free
         if free < LEAST_FREE_BYTES:
             raise CorpusError(

@@ -54,7 +54,7 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
 
 @contextlib.contextmanager
 def locked(target: Path) -> Iterator[None]:
-    """Keeps other processes out of the folder; the system lets go of the lock however this one ends.
+    """Keep other processes out of the folder; the system lets go of the lock however this one ends.
 
     Raises:
         CorpusError: another process is at work there.

@@ -148,7 +148,7 @@ def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint
 
 
 def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
-    """Makes a file of the store, and reads it back."""
+    """Make a file of the store, and reads it back."""
     packing = SIZES[job.encoding.size]
     top, _, rows, width = job.window
     rate = job.frames_per_second
@@ -173,7 +173,7 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
 
 
 def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
-    """Encodes a video, and compares it with its source."""
+    """Encode a video, and compares it with its source."""
     pts, time_base = _times(job, index)
     height, width = job.window[2:]
     encode_luma(made, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)

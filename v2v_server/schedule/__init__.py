@@ -1,4 +1,4 @@
-"""The schedule: pure, from (catalogue, spec, seed, epoch, index) to a sequence of frames.
+"""The schedule: a pure function from (catalogue, spec, seed, epoch, index) to a sequence of frames.
 
 sequences     which sequences of which videos a spec may draw from
 permutation   a keyed permutation that is computed, never stored

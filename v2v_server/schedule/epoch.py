@@ -1,21 +1,21 @@
-"""The schedule: which sequence each index of an epoch is made from. Pure; nothing is stored per index.
+"""Map each index of an epoch to a sequence. Pure; nothing is stored per index.
 
     candidate 0 of (seed, epoch, place)     the sequence that the epoch's permutation puts at ``place``
-    candidate k                             a hash of (seed, epoch, place, k), of a video that no candidate before it is
-                                            of (as far as a few attempts find one)
+    candidate k                             a hash of (seed, epoch, place, k), from a video that no earlier candidate
+                                            uses (if a few attempts find one)
 
-A candidate whose video fails is passed over for the next one. That moves only this place: catalogue, permutation and
-every other place stay as they are, and the sample's provenance lists the refusals.
+If the video of a candidate fails, the next candidate is tried. That changes only this place: catalogue, permutation and
+every other place stay the same, and the sample's provenance lists the refusals.
 
-Places and indices are the same where each decoded clip gives one sample. With K samples of a clip, S apart, an epoch is
-made of blocks of S places and S K indices:
+Places and indices are the same if each decoded clip gives one sample. With K samples of a clip, S apart, an epoch
+consists of blocks of S places and S K indices:
 
     index      block S K + view S + offset          view 0 .. K-1, offset 0 .. S-1
     place      block S + offset
 
 so the K samples of a place, its siblings, are S, 2 S ... (K-1) S apart. S is the number of samples from one batch of a
-consumer to its next: no batch holds two siblings, all of them go to the same consumer, and they come within K batches.
-What does not fill a block at the end of the epoch is dropped, others in each epoch.
+consumer to its next. So no batch holds two siblings, all siblings go to the same consumer, and they come within K
+batches. Places that do not fill a block at the end of the epoch are dropped; they differ in each epoch.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from functools import lru_cache
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.schedule.permutation import Permutation, hashed_below
-from v2v_server.schedule.sequences import Sequence, SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 
 _MOST_ATTEMPTS = 16
 MOST_CANDIDATES = 8
-"""Candidates of one place. A corpus where this many random videos in a row are broken needs a person, not a ninth."""
+"""Candidates of one place. If this many random videos in a row are broken, a person must repair the corpus."""
 
 
 class Schedule:
@@ -39,7 +39,7 @@ class Schedule:
         table: the sequences; must not be empty.
         shuffle: False keeps catalogue order in every epoch.
         samples_per_decode: K.
-        sibling_spacing: S; not 0 where K > 1.
+        sibling_spacing: S; not 0 if K > 1.
 
     Raises:
         UsageError: K > 1 and S = 0.
@@ -50,8 +50,8 @@ class Schedule:
     ) -> None:
         if samples_per_decode > 1 and not sibling_spacing:
             raise UsageError(
-                f"samples_per_decode = {samples_per_decode} and sibling_spacing = 0: say how many samples lie between "
-                "a batch and the next (batch size x ranks x loader workers)"
+                f"samples_per_decode = {samples_per_decode} and sibling_spacing = 0: set sibling_spacing to the number "
+                "of samples from one batch to the next (batch size x ranks x loader workers)"
             )
         self._table = table
         self._shuffle = shuffle
@@ -60,10 +60,10 @@ class Schedule:
 
     @classmethod
     def of(cls, table: SequenceTable, spec: StreamSpec) -> Schedule:
-        """The schedule that a spec asks for.
+        """Return the schedule that a spec asks for.
 
         Raises:
-            UsageError: its ``sibling_spacing`` is open.
+            UsageError: its ``sibling_spacing`` is not set.
         """
         return cls(
             table,
@@ -74,11 +74,11 @@ class Schedule:
 
     @property
     def count(self) -> int:
-        """Indices of an epoch."""
+        """Number of indices of an epoch."""
         return self._table.count // self._spacing * self._spacing * self._views
 
     def place(self, index: int) -> int:
-        """The place of an index: equal for siblings.
+        """Return the place of an index; siblings have the same place.
 
         Raises:
             IndexError: index is outside 0 .. count-1.
@@ -88,8 +88,8 @@ class Schedule:
         block, within = divmod(index, self._spacing * self._views)
         return block * self._spacing + within % self._spacing
 
-    def candidate(self, seed: int, epoch: int, index: int, candidate: int) -> Sequence:
-        """The sequence that candidate number ``candidate`` (0 .. MOST_CANDIDATES - 1) of an index is made from.
+    def candidate(self, seed: int, epoch: int, index: int, candidate: int) -> VideoSequence:
+        """Return the sequence of candidate number ``candidate`` (0 .. MOST_CANDIDATES - 1) of an index.
 
         Raises:
             IndexError: index is outside 0 .. count-1.
@@ -101,7 +101,7 @@ class Schedule:
             tried.append(self._substitute(seed, epoch, place, number, {sequence.video.id for sequence in tried}))
         return tried[candidate]
 
-    def _substitute(self, seed: int, epoch: int, place: int, candidate: int, refused: set[str]) -> Sequence:
+    def _substitute(self, seed: int, epoch: int, place: int, candidate: int, refused: set[str]) -> VideoSequence:
         for attempt in range(_MOST_ATTEMPTS):
             sequence = self._table[hashed_below(self._table.count, seed, epoch, place, candidate, attempt)]
             if sequence.video.id not in refused:

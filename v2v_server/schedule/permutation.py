@@ -1,9 +1,9 @@
-"""A keyed permutation of 0 .. n-1 that is computed, never stored.
+"""Compute a keyed permutation of 0 .. n-1 without storing it.
 
-A balanced Feistel network permutes the smallest suitable power of four that is at least n; an output that falls outside
-0 .. n-1 is permuted again until it falls inside (cycle walking: Black and Rogaway, "Ciphers with arbitrary finite
-domains", CT-RSA 2002). Any index is looked up in constant expected time and memory, so an epoch over ten million
-sequences costs as little to start, or to resume in the middle, as one over ten.
+A balanced Feistel network permutes the smallest suitable power of four that is at least n. An output outside 0 .. n-1
+is permuted again until it falls inside (cycle walking: Black and Rogaway, "Ciphers with arbitrary finite domains",
+CT-RSA 2002). Looking up an index takes constant expected time and memory. So starting an epoch over ten million
+sequences, or resuming in the middle of it, costs no more than one over ten.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class Permutation:
         if n < 1:
             raise ValueError(f"a permutation of {n} elements")
         self.n = n
-        # A few spare bits keep small domains well mixed: with 2-bit halves too few permutations can be reached.
+        # Spare bits keep small domains well mixed: 2-bit halves reach too few permutations.
         self._half_bits = max(_LEAST_HALF_BITS, ((n - 1).bit_length() + 1) // 2)
         self._half_mask = (1 << self._half_bits) - 1
         key = hashlib.blake2b(b"v2v permutation 1" + seed.to_bytes(8, "little") + epoch.to_bytes(8, "little")).digest()
         self._round_keys = tuple(int.from_bytes(key[8 * i : 8 * i + 8], "little") for i in range(_ROUNDS))
 
     def __call__(self, index: int) -> int:
-        """Where the permutation sends ``index``.
+        """Return the image of ``index`` under the permutation.
 
         Raises:
             IndexError: index is outside 0 .. n-1.
@@ -55,13 +55,17 @@ class Permutation:
 
 
 def _mix64(x: int) -> int:
-    """The finaliser of splitmix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014)."""
+    """Apply the finaliser of splitmix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators",
+    2014).
+    """
     x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 & _MASK64
     x = (x ^ x >> 27) * 0x94D049BB133111EB & _MASK64
     return x ^ x >> 31
 
 
 def hashed_below(n: int, *words: int) -> int:
-    """A number in 0 .. n-1 that is a pure hash of some words (each 0 .. 2**64 - 1). Its bias is at most n / 2**64."""
+    """Return a number in 0 .. n-1 that is a pure hash of the words (each 0 .. 2**64 - 1). Its bias is at most n /
+    2**64.
+    """
     data = b"".join(word.to_bytes(8, "little") for word in words)
     return int.from_bytes(hashlib.blake2b(b"v2v candidate 1" + data, digest_size=8).digest(), "little") % n

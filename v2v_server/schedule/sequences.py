@@ -1,14 +1,14 @@
-"""Which sequences of which videos a spec may draw samples from.
+"""List the sequences of videos that a spec may draw samples from.
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
-start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With
-scene "auto" the same holds of each stretch of the video between its cuts and where there is something to see.
+start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
+"auto" the same holds for each stretch of the video between shot boundaries in which there is something to see.
 """
 
 from __future__ import annotations
 
 import math
-from collections import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -26,14 +26,14 @@ from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
 MOST_CLIP_BYTES = 2 << 30
-"""What a worker may have to hold of decoded frames for one lease."""
+"""Largest size of the decoded frames of one lease, bytes."""
 
 
-Videos = abc.Sequence[VideoEntry]
+Videos = Sequence[VideoEntry]
 
 
 @dataclass(frozen=True, slots=True)
-class Sequence:
+class VideoSequence:
     """One run of frames: the video and its first frame."""
 
     video: VideoEntry
@@ -41,16 +41,17 @@ class Sequence:
 
 
 class Columns:
-    """What decides how many sequences each video gives, side by side: a table for another spec costs no look at each.
+    """Columns of the catalogue that determine how many sequences each video gives. A table for another spec then reads
+    no entry.
 
     Args:
         videos: the catalogue's entries, in its order.
 
     Attributes:
-        frames: int64 [N], of each video.
-        size: int32 [N], which of ``first_of_size``.
-        first_of_size: for each size of picture, the first video that has it.
-        cut: the videos whose one run is not the whole of them; None where a video's runs are not known.
+        frames: int64 [N], frames of each video.
+        size: int32 [N], index into ``first_of_size``.
+        first_of_size: for each picture size, the first video that has it.
+        cut: the videos whose usable runs are not just the whole video; None if runs are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
@@ -64,12 +65,12 @@ class Columns:
 
 
 def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """A number for each size of picture."""
+    """Return a number for each picture size."""
     return height_px.astype(np.int64) << 32 | width_px
 
 
 def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], CutVideos | None]:
-    """Frames, sizes, and which have cuts."""
+    """Return frames, sizes, and the videos with shot boundaries."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
@@ -84,18 +85,18 @@ class SequenceTable:
 
     Args:
         videos: the catalogue's entries, in its order.
-        rows: the rows of each picture that may be used.
-        spec: says how many frames a sequence needs, how large the crop is, and whether cuts count.
-        columns: of the videos; None makes them.
+        rows: the usable rows of each picture.
+        spec: determines the frames in a sequence, the size of the crop, and whether shot boundaries count.
+        columns: columns of the videos; None computes them.
 
     Attributes:
-        count: N, sequences in all.
-        videos: how many give at least one.
-        refusals: the videos that give none; each is made when it is looked at.
-        spoilt: sequences of the places 0, L, 2L ... that are left out or moved because of what they show.
+        count: N, total number of sequences.
+        videos: number of videos that give at least one.
+        refusals: the videos that give no sequence; each refusal is built when it is read.
+        spoilt: sequences at 0, L, 2L ... that are left out or moved because of what they show.
 
     Raises:
-        UsageError: the spec asks for scenes and the catalogue has none.
+        UsageError: the spec asks for scenes and the catalogue has no scene statistics.
     """
 
     def __init__(self, videos: Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
@@ -124,38 +125,38 @@ class SequenceTable:
 
     @property
     def longest_clips(self) -> tuple[int, ...]:
-        """Of the videos that are too short, the ``voxels_per_clip`` that each is long enough for."""
+        """The ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
         short = self._frames[self._frames < self._recipe.frames_needed]
         runs = [] if self._cut is None else self._cut.too_short.tolist()
         clips = (_longest_clip(frames, self._recipe) for frames in [*short.tolist(), *runs])
         return tuple(voxels for voxels in clips if voxels)
 
-    def __getitem__(self, rank: int) -> Sequence:
-        """The sequence of that rank, 0 .. count-1.
+    def __getitem__(self, rank: int) -> VideoSequence:
+        """Return the sequence with this rank, 0 .. count-1.
 
         Raises:
-            IndexError: rank is outside.
+            IndexError: the rank is outside.
         """
         if not 0 <= rank < self.count:
             raise IndexError(f"sequence {rank} of {self.count}")
         video = int(self._ends.searchsorted(rank, side="right"))
         place = rank - (int(self._ends[video - 1]) if video else 0)
         start = None if self._cut is None else self._cut.start(video, place)
-        return Sequence(self._all[video], place * self._stride if start is None else start)
+        return VideoSequence(self._all[video], place * self._stride if start is None else start)
 
 
 class _CutSequences:
-    """The sequences of the videos that have cuts: at 0, L, 2L ... of each run.
+    """Sequences of the videos with shot boundaries: at 0, L, 2L ... of each run.
 
     Args:
         cut: these videos.
-        whole: int64 [C], how many sequences each would have without its cuts.
-        spec: says how many frames a sequence needs, and how many a video may give.
+        whole: int64 [C], number of sequences that each would have without its shot boundaries.
+        spec: determines the frames in a sequence, and the largest number for one video.
 
     Attributes:
-        counts: int32 [C], how many each has.
-        spoilt: how many in all are not where they would be without cuts.
-        too_short: frames of the longest run of each that has none because of its cuts.
+        counts: int32 [C], number of sequences of each video.
+        spoilt: total number that are not where they would be without shot boundaries.
+        too_short: frames of the longest run of each video that has no sequence because of its shot boundaries.
     """
 
     def __init__(self, cut: CutVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
@@ -163,7 +164,7 @@ class _CutSequences:
         self._cut, owners = cut, cut.owners()
         each = np.clip((cut.end - cut.first - needed) // self._stride + 1, 0, None)
         upto = np.concatenate(([0], np.cumsum(each)))
-        # How many sequences of its video lie before each run, and how many it may still give.
+        # Number of sequences of its video before each run, and number that the run may add.
         self._before = (upto[:-1] - upto[cut.bounds[:-1]][owners]).astype(np.int32)
         most = np.where(whole > 0, spec.max_sequences_per_video, 0)[owners]
         each = np.clip(most - self._before, 0, each)
@@ -173,7 +174,7 @@ class _CutSequences:
         self.too_short = cut.longest()[(whole > 0) & (self.counts == 0)]
 
     def start(self, video: int, place: int) -> int | None:
-        """The first frame of that sequence of a video; None if the video is none of these."""
+        """Return the first frame of a sequence of a video; None if the video has no shot boundaries."""
         if (at := self._cut.find(video)) is None:
             return None
         low, high = self._cut.bounds[at : at + 2].tolist()
@@ -181,13 +182,13 @@ class _CutSequences:
         return int(self._cut.first[run]) + self._stride * (place - int(self._before[run]))
 
 
-class Refusals(abc.Sequence[Refusal]):
-    """Why videos give no sequence.
+class Refusals(Sequence[Refusal]):
+    """Reasons why videos give no sequence.
 
     Args:
-        places: of these videos.
-        videos: all of the catalogue.
-        rows, spec: that they do not suit.
+        places: positions of these videos in the catalogue.
+        videos: all entries of the catalogue.
+        rows, spec: rows and spec that the videos do not suit.
     """
 
     def __init__(self, places: npt.NDArray[np.intp], videos: Videos, rows: Rows, spec: StreamSpec) -> None:
@@ -219,7 +220,9 @@ def _longest_run(video: VideoEntry) -> int:
 
 
 def _longest_clip(frames: int, recipe: Recipe) -> int:
-    """The ``voxels_per_clip`` that so many frames are enough for; 0: not even one."""
+    """Return the largest ``voxels_per_clip`` that this number of frames is enough for; 0 if it is not enough for
+    any.
+    """
     return max(0, (frames - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels)
 
 
@@ -248,7 +251,9 @@ def _unsuited_size(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal |
 
 
 def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    """The frames of a lease are held whole until they are resized, however small the sample becomes."""
+    """Return a refusal if the decoded frames of a lease exceed the limit. They are held whole until they are resized,
+    however small the sample is.
+    """
     recipe = spec.recipe
     top, bottom = rows.bounds(video.height_px)
     cropped = recipe.resize_scale == (1.0, 1.0)
@@ -268,7 +273,7 @@ def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:
     height, width = bottom - top, video.width_px
     if admits(recipe, height, width):
         return None
-    # Rounded up, or the picture would still be a fraction of a pixel too small.
+    # Round up; otherwise the picture would be a fraction of a pixel too small.
     scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
     reason = f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"

@@ -183,7 +183,7 @@ def _stream_of(effect: str) -> int:
 
 
 def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
-    """Runs of repeated frames of a Markov chain that starts in the running state."""
+    """Run of repeated frames of a Markov chain that starts in the running state."""
     if recipe.pause_probability == 0.0:
         return ()
     runs: list[tuple[int, int]] = []

@@ -72,7 +72,7 @@ def choose(asked: str, events: float) -> Real:
 
 
 def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
-    """Refuses thresholds that a float32 cannot work with.
+    """Refuse thresholds that a float32 cannot work with.
 
     Raises:
         UsageError: one is outside THRESHOLD_ENDS.

@@ -51,7 +51,7 @@ def variants(
 
 
 def load(variant: Variant) -> None:
-    """Loads one from numba's cache, or compiles it."""
+    """Load one from numba's cache, or compiles it."""
     simulate(
         np.zeros((2, 1, 1), np.uint8),
         threshold_pos=0.2,
@@ -64,6 +64,6 @@ def load(variant: Variant) -> None:
 
 
 def warm_up() -> None:
-    """Loads, or compiles, what a server worker usually needs."""
+    """Load, or compiles, what a server worker usually needs."""
     for variant in sorted(USUAL):
         load(variant)

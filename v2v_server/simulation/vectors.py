@@ -34,7 +34,7 @@ def bits_of_float(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def use_widest_vectors(typing_context: Any) -> Any:
-    """Lets LLVM use 512-bit vectors in the calling function where the processor has them; ignored elsewhere.
+    """Let LLVM use 512-bit vectors in the calling function where the processor has them; ignored elsewhere.
 
     For some processors LLVM halves them by default, lest a few wide instructions lower the clock of all the others.
     Here the wide ones are the work. llvmlite knows no attributes with a value, hence ``set.add``.

@@ -1,15 +1,15 @@
-"""A folder of pieces of decoded videos, filled by whoever decodes them first.
+"""Cache pieces of decoded videos in a folder, filled by the processes that decode them first.
 
-A piece is a file of the store (:mod:`v2v_server.store.format`) with some hundred consecutive frames of a video, which
-begin at a multiple of that number. So only what samples read is decoded and kept, and samples of other recipes find it.
-Its name is a hash of the video's id, its fingerprint and the rows: a changed source has other names.
+A piece is a store file (:mod:`v2v_server.store.format`) with some hundred consecutive frames of a video, which begin at
+a multiple of that number. So only frames that samples read are decoded and stored, and samples of other recipes reuse
+them. Its name is a hash of the video's id, its fingerprint and the rows: a changed source has other names.
 
-Several workers and servers may share a folder. A piece is written under another name, and gets its own when it is whole
-and there is room for it; ``used``, behind a lock, says how many bytes there are. A worker that is killed leaves a file
-that nobody reads, and that the next one to start removes, because its lock is gone. At the limit what is there stays:
-every epoch reads all of it, so putting something else in its place would help nobody.
+Several workers and servers may share a folder. A piece is written under a temporary name, and renamed once it is
+complete and fits the limit. The file ``used``, behind a lock, holds the number of bytes in the folder. A killed worker
+leaves a temporary file that is never read; the next worker to start removes it, because its lock is free. At the limit
+existing pieces stay: every epoch reads all of them, so replacing one by another would gain nothing.
 
-Whatever goes wrong here costs time and no sample: then its video is decoded as if there were no cache.
+A fault here costs time but no sample: its video is then decoded without the cache.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.used import PARTIAL, counted, locked_use, used_bytes
+from v2v_server.store.used import PARTIAL, count_bytes, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
@@ -42,17 +42,19 @@ from v2v_server.video.orientation import Window
 
 GIB = 1 << 30
 LEAST_FREE_BYTES = GIB
-"""So much of the disk is left to others."""
+"""Always keep this much disk space free."""
 
 _LARGE_PICTURE_PX = 1 << 20
 _EXPECTED_BITS = 4
-"""Of a pixel, at most: what is not known before it is written."""
+"""Largest size of a packed pixel; the real size is known only after writing."""
 _REST_SECONDS = 60.0
-"""A cache that could not be written to is left alone for so long."""
+"""Time without writing to a cache after a write failed."""
 
 
 def piece_frames(rows: int, width_px: int) -> int:
-    """Frames of a piece: fewer of large pictures, since a worker decodes whole pieces in the time of one sample."""
+    """Return the number of frames in a piece. Larger pictures get fewer, because a worker decodes whole pieces in the
+    time of one sample.
+    """
     frames = PIECE_FRAMES
     while frames > PIECE_FRAMES // 4 and rows * width_px * frames > _LARGE_PICTURE_PX * PIECE_FRAMES:
         frames //= 2
@@ -63,12 +65,13 @@ class Cache:
     """The cache of a worker.
 
     Args:
-        folder: made by :func:`make_cache`, and by nobody later: a disk that is gone must not fill the one below it.
-        most_bytes: how much may lie there.
-        least_free_bytes: how much of the disk stays free.
+        folder: created by :func:`make_cache` and never later: if a disk is unmounted, the disk below must not be
+            filled.
+        most_bytes: largest size of the folder, bytes.
+        least_free_bytes: disk space to keep free, bytes.
 
     Attributes:
-        trouble: what was wrong when it was last asked, for people: what keeps it from keeping more, or a damaged piece.
+        trouble: the last problem, for people: why nothing more is stored, or a damaged piece; empty if there is none.
     """
 
     def __init__(self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
@@ -91,20 +94,20 @@ class Cache:
         cuts: Sequence[Cut],
         stride: int,
     ) -> tuple[DecodedClip, ...] | None:
-        """Several cuts of a video, read here, or decoded and kept.
+        """Return several cuts of a video, read from the cache, or decoded and stored in it.
 
         Args:
             path: the video.
-            video, fingerprint: its name and state.
-            rows: (first, one after the last) that may be used: those that are kept. The cuts lie within.
-            index: its frames, or a part that holds the pieces that are needed.
+            video, fingerprint: its catalogue id and fingerprint.
+            rows: (first, one after the last) usable row; these are stored. The cuts lie within.
+            index: its frames, or a part that holds the needed pieces.
             start, cuts, stride: see :func:`v2v_server.video.decode.decode_cuts`.
 
         Returns:
-            None where neither can be done: then it has to be decoded as if there were no cache.
+            None if the cache can neither read nor store them; the caller then decodes without the cache.
 
         Raises:
-            VideoError: another video lies there now.
+            VideoError: the file is another video now.
             UsageError: a range outside the index.
         """
         self.trouble = ""
@@ -129,13 +132,13 @@ class Cache:
             self._rest(f"cannot be written to: {error.strerror or error}")
             return None
         except VideoError:
-            return None  # what is damaged may lie beyond the frames that this sample needs
+            return None  # the damage may lie beyond the frames that this sample needs
         made = self._read(pieces, fingerprint, index, start, cuts, stride)
         return None if made is None else tuple(replace(clip, origin="") for clip in made)
 
     @property
     def used_bytes(self) -> int:
-        """How much lies there, of all that share the folder; 0 where that cannot be told."""
+        """Bytes stored in the folder by all processes that share it; 0 if unknown."""
         return used_bytes(self.folder)
 
     def _read(
@@ -147,7 +150,7 @@ class Cache:
         cuts: Sequence[Cut],
         stride: int,
     ) -> tuple[DecodedClip, ...] | None:
-        """The cuts, if all pieces are there and sound. A damaged one is removed."""
+        """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
         clips = [np.empty((cut.count, *_window(cut, index)[2:]), np.uint8) for cut in cuts]
         codec, bit_exact, sound = "", False, True
         for piece in pieces:
@@ -155,7 +158,7 @@ class Cache:
                 with StoreFile(piece.path, fingerprint) as stored:
                     codec, bit_exact = stored.head.codec, stored.head.bit_exact
                     for cut, frames in zip(cuts, clips, strict=True):
-                        # Of the frames start, start + stride ... those in this piece.
+                        # The frames of start, start + stride ... that lie in this piece.
                         low = max(0, -(-(piece.first - start) // stride))
                         high = min(cut.count, -(-(piece.end - start) // stride))
                         if low < high:
@@ -166,7 +169,7 @@ class Cache:
                 return None
             except (VideoError, UsageError) as error:
                 self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
-                sound = False  # and on, so that all that are damaged are made anew together
+                sound = False  # continue, so that all damaged pieces are decoded again together
         if not sound:
             return None
         times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
@@ -203,17 +206,17 @@ class Cache:
         index: FrameIndex,
         missing: Sequence[_Piece],
     ) -> None:
-        """Decodes the missing pieces in one pass, and keeps each.
+        """Decode the missing pieces in one pass, and store each.
 
         Raises:
-            VideoError: they do not decode.
+            VideoError: they cannot be decoded.
             OSError: they cannot be written.
         """
         top, width = rows[0], index.width_px
         height, begin, end = rows[1] - rows[0], missing[0].first, missing[-1].end
         with contextlib.closing(stream_decoded(path, index, begin, end - begin, (top, 0, height, width))) as frames:
             for piece in missing:
-                for _ in range(begin, piece.first):  # of a piece that is there
+                for _ in range(begin, piece.first):  # frames of a piece that exists
                     next(frames)
                 begin = piece.end
                 codec, picture = next(frames)
@@ -227,12 +230,14 @@ class Cache:
                 self._keep(piece.path, head, chain((picture,), more))
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
-        """Writes a piece, and gives it its name if there is room."""
+        """Write a piece, and rename it into place if it fits the limit."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             with StoreWriter(partial, head, QUICK) as writer:
-                fcntl.flock(writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as we live: see _remove_abandoned
+                fcntl.flock(
+                    writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
+                )  # held for the life of this process: see _remove_abandoned
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
@@ -240,14 +245,16 @@ class Cache:
                 if path.exists() or used.bytes + writer.bytes > self._most_bytes:
                     return
                 path.parent.mkdir(exist_ok=True)
-                used.add(writer.bytes)  # before: who is killed in between has counted too much, not too little
+                used.add(
+                    writer.bytes
+                )  # count before renaming: a process killed in between has counted too much, not too little
                 partial.replace(path)
         finally:
             with contextlib.suppress(OSError):
                 partial.unlink()
 
     def _remove(self, path: Path, why: str) -> None:
-        """Removes a piece that cannot be read, so that it is made anew."""
+        """Remove an unreadable piece, so that it is decoded again."""
         self.trouble = f"a damaged piece was removed: {why}"
         with contextlib.suppress(OSError), locked_use(self.folder) as used:
             size = path.stat().st_size
@@ -261,7 +268,7 @@ class Cache:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """Frames ``first`` .. ``end`` - 1 of a video, and where they lie."""
+    """Frames ``first`` .. ``end`` - 1 of a video, and the path of their file."""
 
     path: Path
     first: int
@@ -269,22 +276,22 @@ class _Piece:
 
 
 def make_cache(folder: Path) -> None:
-    """Makes the folder of a cache if need be, and counts what it holds: a worker that was killed may have counted what
-    it did not keep.
+    """Create the folder of a cache if it is missing, and recount its bytes: a killed worker may have counted a piece
+    that it did not store.
 
     Raises:
-        CorpusError: the folder cannot be made, read or written to.
+        CorpusError: the folder cannot be created, read or written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(BlockingIOError), locked_use(folder) as used:
-            used.bytes = counted(folder)
+            used.bytes = count_bytes(folder)
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what workers that are gone have left half-written: those that live hold locks."""
+    """Remove temporary files of workers that are gone; live workers hold locks on theirs."""
     for path in (folder / PARTIAL).iterdir():
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

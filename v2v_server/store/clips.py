@@ -1,4 +1,4 @@
-"""The pixels of a video, wherever they are: decoded, or read from a file of the store that was made of it."""
+"""Read the pixels of a video: decode them, or read the store file that was made from it."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts, probe
 
 STORE_FORMAT = "v2v store"
-"""Stands for the format of a store file by itself, which only a lossless corpus can serve."""
+"""Name of the store file format, which only a lossless corpus can serve."""
 
 
 def clips_of(
     path: str | os.PathLike[str], fingerprint: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int
 ) -> tuple[DecodedClip, ...]:
-    """Several cuts of the frames from ``start`` on: see :func:`v2v_server.video.decode.decode_cuts`.
+    """Return several cuts of the frames from ``start`` on, see :func:`v2v_server.video.decode.decode_cuts`.
 
     Args:
-        path: a video, or a file of the store.
-        fingerprint: of the video; of the one that the file of the store was made of.
+        path: a video, or a store file.
+        fingerprint: of the video, or of the source of the store file.
 
     Raises:
-        UsageError, VideoError: see there; also where another video lies here, or was the source.
+        UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
+            another video.
     """
     if not is_store_file(path):
         check_fingerprint(path, fingerprint)
@@ -43,7 +44,7 @@ def clips_of(
 
 
 def stored_clip(stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int) -> DecodedClip:
-    """One cut, from an open file of the store that keeps all of it."""
+    """Read one cut from an open store file that holds all of it."""
     head = stored.head
     window = cut.window or (head.top, 0, head.rows, head.width_px)
     frames = np.empty((cut.count, *window[2:]), np.uint8)
@@ -53,7 +54,7 @@ def stored_clip(stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stri
 
 
 def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:
-    """Make sure that a file is the video that was catalogued, or was made of it.
+    """Check that a file is the catalogued video, or was made from it.
 
     Raises:
         VideoError: it is another one, or cannot be read.
@@ -65,7 +66,7 @@ def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:
 
 
 def pictures_of(path: str | os.PathLike[str], index: FrameIndex, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
-    """All frames of a video, one by one: see :func:`v2v_server.video.decode.stream_luma`."""
+    """Yield all frames of a video, see :func:`v2v_server.video.decode.stream_luma`."""
     if not is_store_file(path):
         yield from stream_luma(path, index, 0, len(index), window)
         return
@@ -74,7 +75,7 @@ def pictures_of(path: str | os.PathLike[str], index: FrameIndex, window: Window)
 
 
 def stored_pictures(stored: StoreFile, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
-    """All frames that an open file of the store keeps, one by one."""
+    """Yield all frames that an open store file holds."""
     head = stored.head
     for number in range(head.groups):
         frames = np.empty((head.group_frames(number), *window[2:]), np.uint8)
@@ -83,10 +84,10 @@ def stored_pictures(stored: StoreFile, window: Window) -> Iterator[npt.NDArray[n
 
 
 def facts_of(path: str | os.PathLike[str]) -> VideoFacts:
-    """What a file holds: see :func:`v2v_server.video.probe.probe`. Of a file of the store: what its source holds.
+    """Probe a file, see :func:`v2v_server.video.probe.probe`. A store file reports the facts of its source.
 
     Raises:
-        VideoError: see there.
+        VideoError: see :func:`v2v_server.video.probe.probe`.
     """
     if not is_store_file(path):
         return probe(path)

@@ -1,4 +1,4 @@
-"""How a prepared corpus holds its pictures: without loss in the store, or as a small H.264 file."""
+"""Settings of a prepared corpus: lossless store files, or small H.264 files."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ _LONGEST_GOP = 600
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """How a prepared corpus holds its pictures.
+    """How a prepared corpus stores its pictures.
 
     Attributes:
-        codec: "lossless", files of the store, or "h264".
-        size: lossless: a key of :data:`v2v_server.store.packing.SIZES`; else empty.
-        quality: h264: x264's rate factor, lower is better and larger; else 0.
-        gop: h264: distance of keyframes in frames; decoding a random range begins up to so many frames early. Else 0.
+        codec: "lossless" (store files) or "h264".
+        size: lossless: a key of :data:`v2v_server.store.packing.SIZES`; otherwise empty.
+        quality: h264: x264's rate factor, lower is better and larger; otherwise 0.
+        gop: h264: distance of keyframes, frames. Decoding a random range starts up to this many frames early. Otherwise
+            0.
 
     Raises:
-        UsageError: an unknown codec, or a setting that it does not have or that is outside its limits.
+        UsageError: the codec is unknown, or a setting does not belong to it or is outside its limits.
     """
 
     codec: str = LOSSLESS
@@ -46,7 +47,7 @@ class Encoding:
 
     @classmethod
     def of(cls, codec: str, size: str | None = None, quality: int | None = None, gop: int | None = None) -> Encoding:
-        """The settings that were asked for, and the defaults of the others that the codec has.
+        """Return an encoding from the given settings and the codec's defaults for the others.
 
         Raises:
             UsageError: see the class.
@@ -59,7 +60,7 @@ class Encoding:
 
     @property
     def is_lossless(self) -> bool:
-        """Whether the files give the very pixels of their sources."""
+        """Whether the files reproduce the exact pixels of their sources."""
         return self.codec == LOSSLESS
 
     def __str__(self) -> str:

@@ -1,17 +1,17 @@
-"""What a store file looks like: the luma of a video, or of a piece of it, in blocks that are read one by one.
+"""Layout of a store file: the luma of a video, or of a piece of it, in blocks that can be read one by one.
 
     magic, length of the head, check of the head      8 + 4 + 8 bytes
     head                                              msgpack, see :class:`Head`
     table                                             a record of equal size for each group of frames
     blocks                                            in any order
 
-A group is up to :attr:`Head.group` consecutive frames, a block is a group of frames of a rectangle of up to
-:data:`BLOCK_ROWS` x :data:`BLOCK_COLUMNS` pixels. A record of the table says where the first block of its group begins,
-how long each block is (they follow each other row by row), what its bytes hash to, and what the record itself hashes
-to. Every hash starts from the place of what it covers, so that nothing passes for something else.
+A group is up to :attr:`Head.group` consecutive frames. A block is a group of frames of a rectangle of up to
+:data:`BLOCK_ROWS` x :data:`BLOCK_COLUMNS` pixels. A record of the table states where the first block of its group
+begins, the length of each block (they follow each other row by row), the hash of each block, and the hash of the record
+itself. Every hash is seeded with the position of what it covers, so a valid block at another position is rejected.
 
-A file is written under another name, its head last, and renamed when it is whole. It is read with ``pread`` and never
-mapped: a mapped file that is cut short kills who reads it.
+A file is written under another name, its head last, and renamed when it is complete. It is read with ``pread`` and
+never mapped: truncating a mapped file kills the process that reads it.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ MAGIC = b"V2VSTOR1"
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
 GROUP_FRAMES = 32
 PIECE_FRAMES = 256
-"""Frames of a piece of the cache, at most: pieces begin at its multiples, or at those of a half or quarter."""
+"""Largest number of frames in a cache piece. Pieces begin at multiples of this, or of a half or quarter of it."""
 LARGEST_BLOCK_BYTES = 2 * GROUP_FRAMES * BLOCK_ROWS * BLOCK_COLUMNS
-"""Of a packed block: no packing doubles what it is given."""
+"""Largest packed block, bytes: no packing doubles its input."""
 _LARGEST_GROUP_BYTES = 64 << 20
 _PREFIX = struct.Struct("<8sIQ")
 _LARGEST_HEAD_BYTES = 64 << 20
@@ -44,19 +44,19 @@ _BLOCK = np.dtype([("bytes", "<u4"), ("check", "<u8")])
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """What a store file says of itself.
+    """Head of a store file.
 
     Attributes:
         video: the source's id, for people.
         fingerprint: of the source file.
-        height_px, width_px: of the source's upright picture.
-        top, rows: the rows of it that are kept.
-        first, count: the frames that are kept, by their ordinals in the source.
-        frames: how many the source has.
-        frames_per_second: of the source; 0 where unknown.
+        height_px, width_px: size of the source's upright picture.
+        top, rows: the stored rows of it: the first, and their number.
+        first, count: the stored frames: ordinal of the first in the source, and their number.
+        frames: number of frames of the source.
+        frames_per_second: of the source; 0 if unknown.
         codec: FFmpeg's name of the source's format.
         bit_exact: whether every host decodes the source to these bytes.
-        group: frames of a group.
+        group: frames in a group.
         packing: method of :mod:`v2v_server.store.packing`.
         index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
     """
@@ -99,49 +99,49 @@ class Head:
 
     @property
     def groups(self) -> int:
-        """How many groups of frames there are."""
+        """Number of groups of frames."""
         return -(-self.count // self.group)
 
     @property
     def down(self) -> int:
-        """How many rows of blocks a picture has."""
+        """Number of rows of blocks in a picture."""
         return -(-self.rows // BLOCK_ROWS)
 
     @property
     def across(self) -> int:
-        """How many blocks a row of them has."""
+        """Number of blocks in a row of blocks."""
         return -(-self.width_px // BLOCK_COLUMNS)
 
     @property
     def record_bytes(self) -> int:
-        """Size of a record of the table."""
+        """Size of a record of the table, bytes."""
         return 8 + self.down * self.across * _BLOCK.itemsize + 8
 
     def group_frames(self, group: int) -> int:
-        """How many frames a group has."""
+        """Return the number of frames in a group."""
         return min(self.group, self.count - group * self.group)
 
     def to_bytes(self) -> bytes:
-        """Everything in front of the table."""
+        """Return the bytes in front of the table."""
         head = msgpack.packb(asdict(self))
         return _PREFIX.pack(MAGIC, len(head), _check(head, 0)) + head
 
 
 def group_frames_for(rows: int, width_px: int) -> int:
-    """How many frames a group has: fewer where pictures are so large that who writes them would need much memory."""
+    """Return the number of frames in a group. Larger pictures get fewer, which bounds the memory of the writer."""
     return max(1, min(GROUP_FRAMES, _LARGEST_GROUP_BYTES // (rows * width_px)))
 
 
 def read_head(path: str, file: int) -> tuple[Head, int]:
-    """The head of an open file, and where the table begins.
+    """Read the head of an open file, and return it with the position of the table.
 
     Raises:
-        VideoError: it is no store file, or its head is damaged.
+        VideoError: it is not a store file, or its head is damaged.
         OSError: it cannot be read.
     """
     prefix = os.pread(file, _PREFIX.size, 0)
     if len(prefix) < _PREFIX.size or not prefix.startswith(MAGIC):
-        raise VideoError(path, None, f"begins with {prefix[:8]!r}: no file of the store, or one that was cut short")
+        raise VideoError(path, None, f"begins with {prefix[:8]!r}: not a store file, or a truncated one")
     _, length, check = _PREFIX.unpack(prefix)
     head = os.pread(file, length, _PREFIX.size) if length <= _LARGEST_HEAD_BYTES else b""
     if len(head) != length or _check(head, 0) != check:
@@ -155,9 +155,9 @@ def read_head(path: str, file: int) -> tuple[Head, int]:
 
 
 def is_store_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins like one of the store. A file that cannot be read does not."""
+    """Return whether a file begins like a store file; False if it cannot be read."""
     try:
-        # An ordinary open of a named pipe would wait for somebody at its other end.
+        # Opening a FIFO without O_NONBLOCK would block until there is a writer.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             return file.read(len(MAGIC)) == MAGIC
     except OSError:
@@ -165,13 +165,13 @@ def is_store_file(path: str | os.PathLike[str]) -> bool:
 
 
 def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: list[int]) -> bytes:
-    """A record of the table.
+    """Encode a record of the table.
 
     Args:
-        head: of the file.
-        group: its number.
-        offset: where its first block begins.
-        sizes, checks: of its blocks, row by row.
+        head: head of the file.
+        group: number of the group.
+        offset: position of its first block, bytes.
+        sizes, checks: length and hash of its blocks, row by row.
     """
     blocks = np.empty(head.down * head.across, _BLOCK)
     blocks["bytes"], blocks["check"] = sizes, checks
@@ -181,11 +181,11 @@ def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: l
 
 @dataclass(frozen=True, slots=True)
 class BlockRecord:
-    """Where the blocks of a group lie.
+    """Positions of the blocks of a group.
 
     Attributes:
-        starts: [blocks + 1] where each begins, and where the last ends.
-        checks: [blocks] what each hashes to.
+        starts: [blocks + 1] start of each block, and the end of the last, bytes.
+        checks: [blocks] hash of each block.
     """
 
     starts: list[int]
@@ -193,10 +193,10 @@ class BlockRecord:
 
 
 def unpack_record(group: int, data: bytes) -> BlockRecord | None:
-    """The record of a group; None if it is damaged."""
+    """Decode the record of a group; None if it is damaged."""
     if len(data) < 16 or _check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
         return None
-    if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # no file is that long, and offsets are signed
+    if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # longer than any file; offsets are signed
         return None
     blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
     starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))
@@ -204,7 +204,7 @@ def unpack_record(group: int, data: bytes) -> BlockRecord | None:
 
 
 def block_check(block: bytes | memoryview, group: int, number: int) -> int:
-    """What a block hashes to, at its place."""
+    """Return the hash of a block at its position."""
     return _check(block, group << 32 | number)
 
 

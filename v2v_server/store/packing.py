@@ -1,6 +1,6 @@
-"""Compressing a block of differences: densely (zstd), or so that it is read in half the time (LZ4HC).
+"""Compress blocks of differences: densely (zstd), or for reading in half the time (LZ4HC).
 
-What is unpacked was checked before, and is unpacked into a known number of bytes and no more.
+Blocks are checked before they are unpacked, and unpacked into a known number of bytes.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ Bytes = bytes | memoryview
 
 @dataclass(frozen=True, slots=True)
 class Packing:
-    """How blocks are compressed; who reads them need only know the method.
+    """How blocks are compressed; reading them needs only the method.
 
     Attributes:
         method: "zstd" or "lz4".
-        search: zstd: how hard it looks for repetitions, as ``ZstdCompressionParameters`` takes it.
-        level: of LZ4HC.
+        search: zstd: match search settings, as ``ZstdCompressionParameters`` takes them.
+        level: level of LZ4HC.
     """
 
     method: str
@@ -30,7 +30,7 @@ class Packing:
     level: int = 0
 
     def packer(self) -> Callable[[Bytes], bytes]:
-        """What compresses a block. For one thread at a time."""
+        """Return a function that compresses a block. It is not thread-safe."""
         if self.method == "zstd":
             parameters = zstandard.ZstdCompressionParameters(write_content_size=False, **dict(self.search))
             return zstandard.ZstdCompressor(compression_params=parameters).compress
@@ -44,11 +44,11 @@ def _zstd(strategy: int, hash_log: int, min_match: int, search_log: int) -> Pack
     return Packing("zstd", (*search.items(), ("search_log", search_log), ("window_log", 15)))
 
 
-# Differences of decoded frames repeat themselves little, apart from zeros: what makes them small is coding each by its
-# frequency. So only long repetitions are looked for; looking for short ones costs who reads as well.
+# Differences of decoded frames have few repetitions apart from zeros; entropy coding is what makes them small. So only
+# long repetitions are searched for: short ones also slow down reading.
 DENSE = _zstd(zstandard.STRATEGY_LAZY, 15, 6, 5)
 QUICK = _zstd(zstandard.STRATEGY_FAST, 6, 7, 1)
-"""For the cache: 4 % larger than :data:`DENSE`, and written six times as fast."""
+"""Packing of the cache: 4 % larger than :data:`DENSE`, and written six times as fast."""
 FAST = Packing("lz4", level=6)
 
 SIZES = {"dense": DENSE, "fast": FAST}
@@ -56,18 +56,18 @@ METHODS = ("zstd", "lz4")
 
 
 class UnpackingError(Exception):
-    """A block does not give the bytes that it should."""
+    """A block does not unpack to the expected bytes."""
 
 
 def unpack(method: str, packed: Bytes, size: int) -> bytes:
-    """The ``size`` bytes of a block.
+    """Return the ``size`` bytes of a block.
 
     Raises:
         UnpackingError: it holds something else.
     """
     try:
         if method == "zstd":
-            # The decompressor allocates what a frame claims, whatever the limit is.
+            # The decompressor allocates the size that a frame claims, whatever the limit is.
             claimed = zstandard.frame_content_size(packed)
             if claimed > size:
                 raise UnpackingError(f"claims {claimed} bytes instead of {size}")

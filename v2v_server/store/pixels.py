@@ -1,10 +1,10 @@
-"""The pixels of a block and the differences that are stored for them, compiled.
+"""Convert the pixels of a block to the stored differences and back, compiled.
 
-A block is some frames of a rectangle of the picture. Of each frame but the first the differences to the frame before
-are stored, of the first the differences to the row above; all modulo 256, so that every value comes back. What is
-decoded from lossy video is mostly the same as a frame before, and differences of 0 compress to next to nothing.
+A block is some frames of a rectangle of the picture. The first frame is stored as differences to the row above, every
+other frame as differences to the frame before, all modulo 256, so every value is recovered exactly. Frames decoded from
+lossy video mostly repeat the frame before, and differences of 0 compress to almost nothing.
 
-Like :mod:`v2v_server.video.full_range` it uses nothing of other files, and its signatures hold for every layout.
+Like :mod:`v2v_server.video.full_range`, the module uses nothing of other files, and its signatures accept every layout.
 """
 
 # mypy: allow-untyped-defs
@@ -16,7 +16,7 @@ import numpy as np
 
 @numba.njit(numba.void(numba.uint8[:, :, :], numba.int64, numba.uint8[::1]), nogil=True, cache=True)
 def to_differences(band, width, out):
-    """The differences of the blocks of a band, one block after the other.
+    """Compute the differences of the blocks of a band, one block after the other.
 
     Args:
         band: [t, h, W] uint8, frames of a row of blocks.
@@ -49,14 +49,14 @@ _WHOLE = numba.int64
     numba.void(_READ_ONLY, _WHOLE, _WHOLE, _WHOLE, _WHOLE, _WHOLE, _WHOLE, numba.uint8[:, :, :]), nogil=True, cache=True
 )
 def from_differences(block, height, width, top, left, first, stride, out):
-    """Frames ``first``, ``first + stride`` ... of a part of a block.
+    """Restore frames ``first``, ``first + stride`` ... of a part of a block.
 
     Args:
-        block: [t height width] uint8, the differences of a block; t is larger than the last frame that is asked for.
-        height, width: of the block.
-        top, left: of the part, in the block.
-        first: the first frame that is asked for.
-        stride: distance of the frames.
+        block: [t height width] uint8, the differences of a block; t is larger than the last requested frame.
+        height, width: size of the block, pixels.
+        top, left: position of the part in the block, pixels.
+        first: the first requested frame.
+        stride: distance between the frames.
         out: [n, h, w] uint8, receives the part.
     """
     count, rows, columns = out.shape

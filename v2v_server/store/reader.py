@@ -1,4 +1,4 @@
-"""Reading from a store file: a crop of some frames costs the blocks that it touches."""
+"""Read from a store file. A crop of some frames costs only the blocks that it touches."""
 
 from __future__ import annotations
 
@@ -31,28 +31,30 @@ class StoreFile:
 
     Args:
         path: the file.
-        fingerprint: of the source whose pixels are wanted; "" takes any.
+        fingerprint: fingerprint of the expected source; "" accepts any.
 
     Attributes:
-        head: what it says of itself.
+        head: the file's head.
 
     Raises:
         VideoUnreadable: it cannot be read.
-        VideoChanged: it was made of another source.
-        VideoError: it is no store file, or its head is damaged.
+        VideoChanged: it was made from another source.
+        VideoError: it is not a store file, or its head is damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
         self._path = os.fspath(path)
         try:
-            self._file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # no waiting for a pipe
+            self._file = os.open(
+                self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
+            )  # opening a FIFO must not block
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         try:
             self.head, self._table = self._opened()
             if fingerprint not in ("", self.head.fingerprint):
                 made_of = self.head.fingerprint
-                raise VideoChanged(self._path, None, f"was made of another file: {made_of} instead of {fingerprint}")
+                raise VideoChanged(self._path, None, f"was made from another file: {made_of} instead of {fingerprint}")
         except BaseException:
             os.close(self._file)
             raise
@@ -72,18 +74,18 @@ class StoreFile:
         os.close(self._file)
 
     def read(self, start: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> None:
-        """Frames start, start + stride ... of a window.
+        """Read frames start, start + stride ... of a window.
 
         Args:
             start: ordinal of the first frame in the source.
-            stride: distance of the frames.
+            stride: distance between the frames.
             window: (top, left, height, width) in the source's upright picture, pixels.
             out: [n, height, width] uint8, receives them.
 
         Raises:
-            UsageError: a frame or a row that the file does not keep.
+            UsageError: the file does not hold a requested frame or row.
             VideoUnreadable: the system reports an error.
-            VideoError: a block that is needed is damaged or missing; ``frame`` is the first frame of it.
+            VideoError: a needed block is damaged or missing; ``frame`` is its first frame.
         """
         head, (top, left, height, width), count = self.head, window, len(out)
         at = start - head.first
@@ -103,7 +105,7 @@ class StoreFile:
             done += more
 
     def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> None:
-        # Whoever only lists what there is does without the compiler.
+        # Import lazily: listing files must not load numba.
         from v2v_server.store.pixels import from_differences
 
         head, (top, left, height, width) = self.head, window
@@ -127,7 +129,7 @@ class StoreFile:
         record = unpack_record(group, self._pread(size, self._table + group * size, group))
         if record is None:
             self._refuse(group, "its record in the table is damaged")
-        # Checked before anything is allocated: the author of a file also wrote its checksums.
+        # Check before allocating: the author of a hostile file also wrote its checksums.
         for number, (start, end) in enumerate(pairwise(record.starts)):
             if end - start > LARGEST_BLOCK_BYTES:
                 self._refuse(group, f"block {number} has {end - start} bytes, the limit is {LARGEST_BLOCK_BYTES}")
@@ -136,11 +138,11 @@ class StoreFile:
     def _blocks(
         self, group: int, record: BlockRecord, before: int, columns: range, column_bytes: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Neighbouring blocks of a row, checked and unpacked.
+        """Yield neighbouring blocks of a row, checked and unpacked.
 
         Args:
             before: number of blocks in front of the row.
-            column_bytes: of a column of pixels in a block.
+            column_bytes: bytes of a column of pixels in a block.
         """
         start, end = record.starts[before + columns.start], record.starts[before + columns.stop]
         data = memoryview(self._pread(end - start, start, group))
@@ -148,7 +150,7 @@ class StoreFile:
             number = before + column
             packed = data[record.starts[number] - start : record.starts[number + 1] - start]
             if block_check(packed, group, number) != record.checks[number]:
-                self._refuse(group, f"block {number} is damaged or cut short")
+                self._refuse(group, f"block {number} is damaged or truncated")
             wide = min(BLOCK_COLUMNS, self.head.width_px - column * BLOCK_COLUMNS)
             try:
                 yield np.frombuffer(unpack(self.head.packing, packed, wide * column_bytes), np.uint8)

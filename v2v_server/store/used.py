@@ -1,6 +1,6 @@
-"""How many bytes a folder holds that many processes fill: a number in a file behind a lock.
+"""Track the size of a folder that many processes fill: a number in a file behind a lock.
 
-Files lie one folder deep (``ab/ab12...``); what is being written lies in ``partial`` and does not count.
+Files lie one folder deep (``ab/ab12...``). Temporary files in ``partial`` do not count.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from pathlib import Path
 
 _USED, PARTIAL = "used", "partial"
 _WAIT_SECONDS = 0.06
-"""For the lock, by default: other workers hold it for less than a millisecond."""
+"""Default wait for the lock; other workers hold it for less than a millisecond."""
 
 
 @dataclass(slots=True)
 class Used:
-    """The number, for whoever has the lock."""
+    """The number of bytes, for the holder of the lock."""
 
     bytes: int
 
     def add(self, more: int) -> None:
-        """Counts so many more."""
+        """Add to the number of bytes."""
         self.bytes = max(0, self.bytes + more)
 
 
 def used_bytes(folder: Path) -> int:
-    """Return how many bytes the folder holds; 0 if that is unknown."""
+    """Return the number of bytes in the folder; 0 if it is unknown."""
     try:
         with open(_open_regular(folder / _USED, os.O_RDONLY), "rb") as file:
             text = file.read(64)
@@ -43,20 +43,20 @@ def used_bytes(folder: Path) -> int:
 
 @contextlib.contextmanager
 def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Used]:
-    """Lend the number of bytes to one process at a time.
+    """Lock the number of bytes for one process at a time.
 
     Args:
-        folder: that many processes fill.
-        wait_seconds: how long to try to take the lock.
+        folder: the folder that many processes fill.
+        wait_seconds: longest wait for the lock.
 
     Raises:
-        BlockingIOError: another process keeps the lock for longer than an update takes. Callers go on without.
+        BlockingIOError: another process keeps the lock for longer than an update takes. Callers continue without it.
         OSError: the file cannot be opened or written.
     """
     with open(_open_regular(folder / _USED, os.O_RDWR | os.O_CREAT), "r+b") as file:
         _lock(file.fileno(), wait_seconds)
         text = file.read(64)
-        used = Used(int(text) if text.isdigit() else counted(folder))
+        used = Used(int(text) if text.isdigit() else count_bytes(folder))
         yield used
         file.seek(0)
         file.write(b"%020d" % used.bytes)
@@ -64,7 +64,9 @@ def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Us
 
 
 def _open_regular(path: Path, flags: int) -> int:
-    """Open a file of ours that other users cannot read, since reading is enough to lock it. Never blocks."""
+    """Open one of our files without blocking. Other users must not be able to read it, since reading is enough to
+    lock it.
+    """
     descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW, 0o600)
     try:
         status = os.fstat(descriptor)
@@ -92,8 +94,8 @@ def _lock(descriptor: int, wait_seconds: float) -> None:
         pause = min(2 * pause, 0.1)
 
 
-def counted(folder: Path) -> int:
-    """The bytes of all files, counted anew."""
+def count_bytes(folder: Path) -> int:
+    """Count the bytes of all files in the folder."""
     sizes = 0
     for below in folder.iterdir():
         if below.is_dir() and below.name != PARTIAL:

@@ -1,4 +1,4 @@
-"""Writing a store file, frame by frame."""
+"""Write a store file, frame by frame."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from v2v_server.store.packing import Packing
 
 
 class StoreWriter:
-    """Writes the frames that a head announces. The file is one of the store once it is closed without an error.
+    """Write the frames that a head announces. The file is a store file once it is closed without an error.
 
     Memory: one group of frames, twice (see :func:`v2v_server.store.format.group_frames_for`), and the compressed blocks
     of one group.
 
     Args:
         path: the file; overwritten.
-        head: what is written.
-        packing: how; its method is the head's.
+        head: describes what is written.
+        packing: compression; its method is the head's.
 
     Raises:
-        OSError: the file cannot be written, then and in every call.
+        OSError: the file cannot be written; every call may raise it.
     """
 
     def __init__(self, path: str | os.PathLike[str], head: Head, packing: Packing) -> None:
@@ -43,15 +43,15 @@ class StoreWriter:
 
     @property
     def bytes(self) -> int:
-        """Size of the file so far."""
+        """Size of the file so far, bytes."""
         return self._end
 
     def fileno(self) -> int:
-        """Descriptor of the file."""
+        """Return the file descriptor."""
         return self._file.fileno()
 
     def add(self, picture: npt.NDArray[np.uint8]) -> None:
-        """The next frame: [rows, width] uint8.
+        """Add the next frame: [rows, width] uint8.
 
         Raises:
             UsageError: it has another size, or there are more frames than announced.
@@ -66,7 +66,7 @@ class StoreWriter:
             self._write_group(self._group[: at + 1])
 
     def _write_group(self, frames: npt.NDArray[np.uint8]) -> None:
-        # Whoever only lists what there is does without the compiler.
+        # Import lazily: listing files must not load numba.
         from v2v_server.store.pixels import to_differences
 
         group, head = len(self._table), self._head
@@ -86,10 +86,10 @@ class StoreWriter:
         self._end += sum(map(len, blocks))
 
     def close(self, *, lasting: bool = False) -> None:
-        """The end: the table, and last of all the head, without which the file is none.
+        """Write the table and then the head, without which the file is not a store file.
 
         Args:
-            lasting: wait until the disk has it.
+            lasting: wait until the data is on disk.
 
         Raises:
             UsageError: fewer frames were added than announced.

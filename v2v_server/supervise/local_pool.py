@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Withheld
+from v2v_server.broker.leases import Stall
 from v2v_server.supervise.child import (
     hung,
     is_stopped,
@@ -166,7 +166,7 @@ class Pool:
                         self._put_off(post, deaths[-1], now)
         return deaths
 
-    def withheld(self, now: float) -> dict[bytes, Withheld]:
+    def stalled(self, now: float) -> dict[bytes, Stall]:
         """Workers that were kept from working since the last call, and how long."""
         since = now - self._looked
         if since < _LOOK_SECONDS:
@@ -180,7 +180,7 @@ class Pool:
             stopped = min(since, 2 * _LOOK_SECONDS) if is_stopped(post.process.pid) else 0.0
             queued = min(since - stopped, post.queued_seconds - before)
             if stopped or queued > 0:
-                found[post.identity] = Withheld(stopped, max(queued, 0.0))
+                found[post.identity] = Stall(stopped, max(queued, 0.0))
         return found
 
     def _put_off(self, post: _Post, death: Death, now: float) -> None:

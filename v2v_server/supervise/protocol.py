@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from v2v_server.broker.blame import Loss
-from v2v_server.broker.leases import Withheld
+from v2v_server.broker.leases import Stall
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Supervisor(Protocol):
             WorkerCrashLoop: the workers die again and again without finishing anything.
         """
 
-    def withheld(self, now: float) -> dict[bytes, Withheld]:
+    def stalled(self, now: float) -> dict[bytes, Stall]:
         """Workers that were kept from working since the last call, and how long: no deadline runs meanwhile."""
 
     def watches(self, identity: bytes) -> bool:

@@ -26,7 +26,7 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Withheld
+from v2v_server.broker.leases import Stall
 from v2v_server.supervise.child import STOPPED, hung
 from v2v_server.supervise.protocol import Death
 from v2v_server.supervise.ray_actor import RayWorker, Sight
@@ -94,7 +94,7 @@ class RayWorkers:
         self._berths: list[_Berth] = []
         self._numbered = 0
         self._restarts = Restarts()
-        self._withheld: dict[bytes, Withheld] = {}
+        self._stalled: dict[bytes, Stall] = {}
         self._news: list[str] = []
         self._told = ""
         self._tell_at = -math.inf
@@ -168,10 +168,10 @@ class RayWorkers:
         self._tell(now)
         return deaths
 
-    def withheld(self, now: float) -> dict[bytes, Withheld]:
+    def stalled(self, now: float) -> dict[bytes, Stall]:
         """Workers that were seen kept from working, and how long since they were last looked at."""
-        withheld, self._withheld = self._withheld, {}
-        return withheld
+        stalled, self._stalled = self._stalled, {}
+        return stalled
 
     def give_up(self, identity: bytes, reason: str) -> Loss | None:
         """Kills a worker that hangs. What it was at is known as of the last look; of one whose node does not answer
@@ -236,7 +236,7 @@ class RayWorkers:
             since = now - berth.seen_at if berth.seen is not None else _FIRST_LOOK_SECONDS
             stopped = min(since, 2 * _LOOK_SECONDS) if seen.status in STOPPED else 0.0
             queued = seen.queued_seconds - (berth.seen.queued_seconds if berth.seen is not None else 0.0)
-            self._withheld[berth.name.encode()] = Withheld(stopped, max(0.0, min(queued, since - stopped)))
+            self._stalled[berth.name.encode()] = Stall(stopped, max(0.0, min(queued, since - stopped)))
         berth.seen, berth.seen_at = seen, now
 
     def _ended(self, berth: _Berth, now: float) -> Iterable[Death]:

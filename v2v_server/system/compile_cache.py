@@ -35,7 +35,7 @@ _OURS = re.compile(r"numba-[0-9a-f]{12}")
 
 
 def use_compile_cache() -> None:
-    """Makes numba keep what this process compiles in the folder of :func:`choose_compile_cache`."""
+    """Make numba keep what this process compiles in the folder of :func:`choose_compile_cache`."""
     choose_compile_cache()
     numba = sys.modules.get("numba")
     if numba is not None and not _is_users(numba.config.CACHE_DIR):
@@ -44,7 +44,7 @@ def use_compile_cache() -> None:
 
 
 def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Sets ``NUMBA_CACHE_DIR``, which numba reads when it is imported.
+    """Set ``NUMBA_CACHE_DIR``, which numba reads when it is imported.
 
     What the user has set stays, and is the user's to empty. Else it is a folder ``numba-DIGEST`` beside the code if
     that can be written; below ``V2V_CACHE_DIR``, or the user's cache folder where that is not set; below the folder for
@@ -111,7 +111,7 @@ def _parents(environment: Mapping[str, str]) -> Iterator[Path]:
 
 
 def _is_private(folder: Path) -> bool:
-    """Makes the folder if need be; whether nobody else can write into it."""
+    """Make the folder if need be; whether nobody else can write into it."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
@@ -121,7 +121,7 @@ def _is_private(folder: Path) -> bool:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Makes the folder if need be."""
+    """Make the folder if need be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

@@ -14,7 +14,7 @@ Level = Literal["info", "warning", "error"]
 
 
 def write(stream: TextIO, text: str) -> None:
-    """Says something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
+    """Say something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
     and there is nowhere left to say so."""
     with suppress(OSError):
         stream.write(text)

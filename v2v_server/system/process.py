@@ -46,7 +46,7 @@ class _SchedAttr(ctypes.Structure):
 
 
 def take_long_turns() -> bool:
-    """Asks for long turns on a core for the calling thread, instead of 3 ms, where several have to share one.
+    """Ask for long turns on a core for the calling thread, instead of 3 ms, where several have to share one.
 
     Each turn begins with the caches full of somebody else's pictures. Its share of the core stays what it was, and
     whoever wakes for a short moment (broker, client, trainer) comes sooner, not later.
@@ -69,7 +69,7 @@ def take_long_turns() -> bool:
 
 
 def open_many_files() -> None:
-    """Lets this process have as many files and connections open as the system allows, up to what a server can need.
+    """Let this process have as many files and connections open as the system allows, up to what a server can need.
 
     By default that is 1024, for the sake of programs that use select(2). With all of them taken ZeroMQ lets nobody in
     any more, without a word, or ends the process when a local worker connects.
@@ -161,13 +161,13 @@ def resident_bytes() -> int:
 
 
 def give_way() -> None:
-    """Lets others have this core at a good moment, where any are waiting, instead of at the end of the turn."""
+    """Let others have this core at a good moment, where any are waiting, instead of at the end of the turn."""
     if hasattr(os, "sched_yield"):
         os.sched_yield()
 
 
 def die_with_parent(parent_pid: int) -> None:
-    """Makes the kernel kill this process when its parent dies, even by SIGKILL (Linux; elsewhere nothing happens).
+    """Make the kernel kill this process when its parent dies, even by SIGKILL (Linux; elsewhere nothing happens).
 
     Args:
         parent_pid: who the parent was when this process was started; if it is gone already, so are we.

@@ -87,7 +87,7 @@ def can_confine() -> Confined:
 
 
 def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
-    """Confines this process, all of its threads as to calls, and what it starts from now on. There is no way back.
+    """Confine this process, all of its threads as to calls, and what it starts from now on. There is no way back.
 
     Args:
         writable: folders in which it may write; None leaves that as it is. Landlock holds the calling thread, and those

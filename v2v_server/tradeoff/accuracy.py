@@ -24,7 +24,7 @@ from v2v_server.simulation.view import apply_view
 from v2v_server.store.clips import clips_of
 from v2v_server.tradeoff.errors import Tally, Voxels, compare
 from v2v_server.video.collect import Cut
-from v2v_server.worker.produce import decode_for, draft_of
+from v2v_server.worker.produce import decode_for, plan_sample
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 
@@ -56,10 +56,10 @@ class CameraView:
 def seen(root: Path, lease: Lease) -> CameraView:
     """Return a lease's first sample before simulation, without hot pixels."""
     (decoded,) = decode_for(lease, lease.indices[:1], root)
-    recipe = decoded.draft.spec.recipe
-    params = dataclasses.replace(decoded.draft.params, hot_pixel_count=0)
+    recipe = decoded.plan.spec.recipe
+    params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
     return CameraView(
-        apply_view(decoded.clip.frames, params, recipe), params, recipe, draft_of(lease, lease.indices[1]).params
+        apply_view(decoded.clip.frames, params, recipe), params, recipe, plan_sample(lease, lease.indices[1]).params
     )
 
 

@@ -74,8 +74,8 @@ def diversity(root: Path, leases: Sequence[Lease], *, until: float = math.inf) -
 def _activities(root: Path, lease: Lease) -> list[tuple[SampleParams, _Activity]]:
     made = []
     for decoded in decode_for(lease, lease.indices, root):
-        recipe = decoded.draft.spec.recipe
-        params = dataclasses.replace(decoded.draft.params, hot_pixel_count=0)
+        recipe = decoded.plan.spec.recipe
+        params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
         voxels, _ = simulate_clip(apply_view(decoded.clip.frames, params, recipe), params, recipe, "float32")
         events = np.abs(voxels).reshape(-1, *voxels.shape[2:])
         # Every fourth pixel of every fourth row: the same coefficient at a sixteenth of the memory.

@@ -1,12 +1,12 @@
-"""The server worker: takes a lease, makes its sample, sends it, takes the next.
+"""The server worker takes a lease, makes its sample, sends it, and takes the next.
 
-conversation   what it says: a state machine without I/O
+conversation   what the worker says: a state machine without I/O
 process        the process that does what the conversation says
 produce        from a lease to its sample: decode, view, simulate
-arrays         what fills each array; those that others add are files beside it
+arrays         functions that fill each array; additional arrays are files beside it
 decode_cache   one decode for siblings
-handover       the sample in memory shared with its consumer, or in a message
-scene_choice   how much flow a clip needs
-warm_up        compiled kernels, once on a host
-logbook        which lease it is at, where that outlives it
+output_buffer  memory for a sample, shared with its consumer or private
+scene_choice   which flow method a clip needs
+warm_up        compiled kernels, compiled once on a host
+logbook        a record of the lease in work that outlives the worker
 """

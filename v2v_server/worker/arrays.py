@@ -1,12 +1,12 @@
-"""The arrays of a sample, each made of what was decoded for it.
+"""Fill the arrays of a sample from its decoded clip.
 
-An array is a line in ``v2v_protocol.sample.ARRAYS`` (its dtype and shape) and a function here or in a file of its own
+An array is a line in ``v2v_protocol.sample.ARRAYS`` (its dtype and shape) and a function, here or in a file of its own,
 that fills it:
 
     @makes("depth")
-    def depth(making: Making, out: npt.NDArray[Any]) -> None:
+    def depth(context: SampleContext, out: npt.NDArray[Any]) -> None:
 
-``v2v_server.worker.produce`` imports the files. ``docs/extending.md`` shows a new array.
+``v2v_server.worker.produce`` imports the files. ``docs/extending.md`` shows how to add an array.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from v2v_server.simulation.view import Frames
 
 
 @dataclass(slots=True)
-class Making:
-    """A sample that is being made.
+class SampleContext:
+    """Inputs of the functions that fill the arrays of one sample.
 
     Attributes:
         video: catalogue id.
-        spec, params: what was asked for, and the draw.
+        spec, params: the stream's spec, and the sample's draw.
         source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
         view: [n, H, W] uint8, the decoded frames as the camera sees them.
-        step_seconds: [steps] duration of each step; None where the recipe does not ask for it.
-        flow: of the clip, where it was asked for.
-        saturated_bins: how many bins of the voxels were clipped.
+        step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
+        flow: flow of the clip; None if it was not requested.
+        saturated_bins: number of voxel bins that were clipped, set by :func:`voxels`.
     """
 
     video: str
@@ -56,53 +56,53 @@ class Making:
         return self.spec.recipe
 
 
-Maker = Callable[[Making, npt.NDArray[Any]], None]
-MAKERS: dict[str, Maker] = {}
-"""What fills each array, by name."""
+ArrayBuilder = Callable[[SampleContext, npt.NDArray[Any]], None]
+ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
+"""The function that fills each array, by name."""
 
 
-def makes(name: str) -> Callable[[Maker], Maker]:
-    """Decorator of the function that fills the array of that name, which it is given C-contiguous."""
+def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
+    """Register a function that fills the array of this name. It gets a C-contiguous output array."""
 
-    def register(maker: Maker) -> Maker:
-        MAKERS[name] = maker
-        return maker
+    def register(builder: ArrayBuilder) -> ArrayBuilder:
+        ARRAY_BUILDERS[name] = builder
+        return builder
 
     return register
 
 
 @makes("voxels")
-def voxels(making: Making, out: npt.NDArray[Any]) -> None:
-    """Signed event counts.
+def voxels(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in signed event counts.
 
     Raises:
-        VideoError: what the corpus states of the video (thresholds, time stamps) is beyond what can be simulated.
+        VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated.
     """
-    recipe, dtype = making.recipe, making.spec.voxel_dtype
+    recipe, dtype = context.recipe, context.spec.voxel_dtype
     try:
-        made = simulate_clip(making.view, making.params, recipe, dtype, making.step_seconds, out)
+        made = simulate_clip(context.view, context.params, recipe, dtype, context.step_seconds, out)
     except UsageError as error:
-        # The recipe was checked; what is left is what the corpus says of the video.
-        raise VideoError(making.video, None, f"cannot be simulated: {error}") from error
-    making.saturated_bins = made.saturated_bins
+        # The recipe was checked before, so the values come from the corpus.
+        raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
+    context.saturated_bins = made.saturated_bins
 
 
 @makes("frames")
-def frames(making: Making, out: npt.NDArray[Any]) -> None:
-    """The frame at the end of each voxel, and the lead frame."""
-    # These indices are those of frames that are there; checking them once more would cost a copy.
-    np.take(making.view, making.source[list(making.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the frame at the end of each voxel, and the lead frame."""
+    # The indices are valid; checking them again would cost a copy.
+    np.take(context.view, context.source[list(context.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
 
 
 @makes("flow")
-def flow(making: Making, out: npt.NDArray[Any]) -> None:
-    """Flow over each voxel."""
-    if making.flow is not None:
-        out[...] = making.flow.flow
+def flow(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the flow over each voxel."""
+    if context.flow is not None:
+        out[...] = context.flow.flow
 
 
 @makes("flow_valid")
-def flow_valid(making: Making, out: npt.NDArray[Any]) -> None:
-    """Where the flow can be believed."""
-    if making.flow is not None and making.flow.valid is not None:
-        out[...] = making.flow.valid
+def flow_valid(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in where the flow is reliable."""
+    if context.flow is not None and context.flow.valid is not None:
+        out[...] = context.flow.valid

@@ -1,21 +1,21 @@
 """The worker's side of the conversation with its server: a state machine without I/O. Time is passed in.
 
-    start, heard, loaded, made, failed ──► [Send ..., Say ...] and one step: Listen, Load, Make or Leave
+    start, on_messages, on_kernels_loaded, on_sample, on_failure ──► [Send ..., Say ...] and one step
 
-Every event is answered with a list of actions. The last of them is the step to take next, and what comes of that step
-is the next event. So whoever has the socket and the kernels (:mod:`v2v_server.worker.process`) takes no decision:
+Every event returns a list of actions. The last action is the next step, and the result of that step is the next event.
+So the caller, which has the socket and the kernels (:mod:`v2v_server.worker.process`), takes no decisions:
 
-    Listen     take the messages that are there, waiting for the first     ──► heard
-    Load       have the kernels of this lease                              ──► loaded
-    Make       make this lease's sample                                    ──► made, or failed
+    Listen     receive the available messages, waiting for the first       ──► on_messages
+    Load       load the kernels of this lease                              ──► on_kernels_loaded
+    Make       make this lease's sample                                    ──► on_sample, or on_failure
     Leave      end
 
-The worker holds the leases of two clips at a time, so that the next one is at hand when a sample is done. After each
-sample it takes in its messages, then says what is done and along with it what it begins next. Siblings that are made in
-little time and lie in slots are announced together: server and consumer then wake once for all of them.
+The worker holds the leases of two clips at a time, so the next one is available as soon as a sample is done. After each
+sample it receives its messages. Then it reports the sample together with the lease that it begins next. Siblings that
+are made quickly and lie in slots are reported together, so server and consumer wake once for all of them.
 
-Only the lease that was said to be begun is ever blamed for the end of a worker. Whatever the server may not have heard,
-it sends again or gives to others; nothing here has to be undone.
+Only the lease that was last announced as begun can be blamed for the end of a worker. The server sends everything else
+again or gives it to other workers; nothing here has to be undone.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from v2v_protocol.wire import Frames, decode, encode
 CREDIT = 2
 _PING_SECONDS = 5.0
 _LONGEST_PING_SECONDS = 320.0
-"""ZeroMQ keeps what is said to a server that is away, which hears all of it when it is back: the waits double."""
+"""ZeroMQ queues pings to an absent server, which receives all of them when it returns. So the interval doubles."""
 _TOLD_SECONDS = 20.0
-"""Of silence until whoever started a worker is told that its server does not answer."""
+"""Silence of the server after which the worker logs it."""
 _TOGETHER_SECONDS = 0.1
-"""What is done waits for a sibling if less time than this has gone by since the first of them was begun. Not since it
-was done: where samples take long the server's clocks, which run from result to result, must see each of them."""
+"""A result waits for its sibling's if less than this has passed since the first of them was begun. The time does not
+count from the result: if samples take long, the server's clocks, which run between results, must see each one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +63,21 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Say:
-    """Tell whoever reads this worker's log."""
+    """Write this line to the worker's log."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Listen:
-    """Take every message that is there; wait at most this long for the first."""
+    """Receive every available message; wait at most this long for the first."""
 
     seconds: float
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """Have the kernels that this lease needs."""
+    """Load the kernels that this lease needs."""
 
     lease: Lease
 
@@ -91,15 +91,15 @@ class Make:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """The conversation is over."""
+    """End the conversation."""
 
 
 Action: TypeAlias = Send | Say | Listen | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
-    """What a sample took, as its :class:`v2v_protocol.messages.Result` says it."""
+class Timings:
+    """Cost of a sample, as reported in its :class:`v2v_protocol.messages.Result`."""
 
     decode_seconds: float = 0.0
     simulate_seconds: float = 0.0
@@ -108,13 +108,13 @@ class Spent:
 
 
 @dataclass(frozen=True, slots=True)
-class Tools:
-    """What the conversation asks about its process. An answer changes nothing.
+class Callbacks:
+    """Questions of the conversation to its process. They must not change anything.
 
     Attributes:
         is_ready: whether the kernels of a lease are loaded.
-        is_compiled: whether loading them takes no time to speak of.
-        is_decoded: whether a lease's sample needs no decoding, because its sibling's clip is at hand.
+        is_compiled: whether the kernels can be loaded without compiling.
+        is_decoded: whether a lease's sample needs no decoding, because a sibling's clip is available.
     """
 
     is_ready: Callable[[Lease], bool]
@@ -123,83 +123,83 @@ class Tools:
 
 
 class WorkerConversation:
-    """What one worker says.
+    """Conversation of one worker.
 
     Args:
-        hello: how it introduces itself.
-        address: of the server, for what is said to people.
-        tools: see there.
-        is_watched: the server sees in the worker's logbook which lease it is at.
+        hello: its first message.
+        address: address of the server, for log lines.
+        callbacks: questions to the process.
+        is_watched: whether the server sees the lease in work in the worker's logbook.
     """
 
-    def __init__(self, hello: WorkerHello, address: str, tools: Tools, *, is_watched: bool) -> None:
+    def __init__(self, hello: WorkerHello, address: str, callbacks: Callbacks, *, is_watched: bool) -> None:
         self._hello = hello
         self._address = address
-        self._tools = tools
+        self._callbacks = callbacks
         self._is_watched = is_watched
         self._leases: deque[Lease] = deque()
-        self._at: Lease | None = None  # made now
-        self._begun = 0  # the lease that was last said to be begun
-        self._unheard = False  # nothing says yet that the server took in our last hello
+        self._at: Lease | None = None  # in work
+        self._begun = 0  # the lease last announced as begun
+        self._unheard = False  # the server has not yet confirmed our last hello
         self._away = False  # we said goodbye to compile
         self._silence = Liveness(0.0)
-        self._told = False
-        # Leases that are done, what is to be said of their samples, and what these took.
-        self._unsent: list[tuple[int, Frames, Spent]] = []
+        self._silence_reported = False
+        # Finished leases with their messages and timings.
+        self._unsent: list[tuple[int, Frames, Timings]] = []
         self._unsent_since = 0.0
         self._stopping = False
 
     def stop(self) -> None:
-        """The worker finishes the sample it is at, gives the other leases back and leaves."""
+        """Finish the current sample, return the other leases, and leave."""
         self._stopping = True
 
     # --- events -------------------------------------------------------------------------------------------------------
 
     def start(self, now: float) -> list[Action]:
-        """The worker can work."""
-        self._listens_from(now)
-        return [self._say_hello(), *self._go_on(now)]
+        """Begin the conversation; call it when the worker is ready."""
+        self._restart_silence(now)
+        return [self._say_hello(), *self._next_actions(now)]
 
-    def heard(self, messages: Sequence[Any], now: float) -> list[Action]:
-        """The first frames of the messages that came, oldest first; none after the wait.
+    def on_messages(self, messages: Sequence[Any], now: float) -> list[Action]:
+        """Handle the first frames of the received messages, oldest first; empty after a wait without messages.
 
         Raises:
-            RemoteError: the server does not want this worker (another numerics version).
+            RemoteError: the server rejects this worker (another numerics version).
             VersionMismatch: the server speaks another version of the protocol.
         """
         actions: list[Action] = []
         if messages:
-            self._listens_from(now)
+            self._restart_silence(now)
             for frame in messages:
-                actions += self._take_in(frame)
+                actions += self._handle(frame)
         else:
-            actions += self._nothing_heard(now)
+            actions += self._handle_silence(now)
         if self._away:
             self._away = False
-            self._leases.clear()  # which were on their way when the server heard of our goodbye
+            self._leases.clear()  # they were in transit when the server received our goodbye
             actions.append(self._say_hello())
-        return actions + self._go_on(now)
+        return actions + self._next_actions(now)
 
-    def loaded(self, now: float) -> list[Action]:
-        """The kernels of the lease that was to be begun are there."""
-        self._listens_from(now)
-        return [Listen(0.0)] if self._away else self._go_on(now)
+    def on_kernels_loaded(self, now: float) -> list[Action]:
+        """Continue after the kernels of the next lease are loaded."""
+        self._restart_silence(now)
+        return [Listen(0.0)] if self._away else self._next_actions(now)
 
-    def made(self, frames: Frames, now: float, spent: Spent = Spent()) -> list[Action]:
-        """The sample is made.
+    def on_sample(self, frames: Frames, now: float, timings: Timings = Timings()) -> list[Action]:
+        """Report a sample that is made.
 
         Args:
             frames: its SampleHeader message.
-            now: the time.
-            spent: what it took.
+            now: monotonic time, seconds.
+            timings: what the sample took.
         """
         lease = self._done(now)
-        self._unsent.append((lease.lease, frames, spent))
+        self._unsent.append((lease.lease, frames, timings))
         may_wait = (
-            len(frames) == 1  # arrays that travel with it had better be on their way
-            and self._is_watched  # elsewhere the server blames what was begun to its knowledge
+            len(frames) == 1  # arrays in the message should be sent at once
+            and self._is_watched  # without a logbook the server blames the lease last announced
             and bool(self._leases)
-            and self._tools.is_decoded(self._leases[0])
+            and self._callbacks.is_decoded(self._leases[0])
             and now - self._unsent_since < _TOGETHER_SECONDS
         )
         if may_wait and not self._stopping:
@@ -207,19 +207,19 @@ class WorkerConversation:
             return [self._make(now)]
         return [Listen(0.0)]
 
-    def failed(self, error: VideoError, now: float) -> list[Action]:
-        """The video could not give what it promised. This is said at once."""
+    def on_failure(self, error: VideoError, now: float) -> list[Action]:
+        """Report at once that the video could not be used."""
         lease = self._done(now)
         here = isinstance(error, VideoChanged | VideoUnreadable)
         return [Send(encode(LeaseFailed(lease.lease, error.frame, error.reason, here))), Listen(0.0)]
 
     # --- what the server says -----------------------------------------------------------------------------------------
 
-    def _take_in(self, frame: Any) -> list[Action]:
+    def _handle(self, frame: Any) -> list[Action]:
         try:
             message: Message = decode(frame)
         except VersionMismatch:
-            raise  # a denial, in words that only its own version understands
+            raise  # a denial in a format of another protocol version
         except ProtocolError as error:
             return [Say(f"ignored a message from the server: {error}")]
         match message:
@@ -231,10 +231,9 @@ class WorkerConversation:
             case Stop():
                 self._stopping = True
             case Denied(ErrorCode.UNKNOWN_SESSION) if self._unheard:
-                pass  # what it denies was said before; another hello would take back the leases that this one brings
+                pass  # it answers an older message; another hello would revoke the leases that this one brings
             case Denied(ErrorCode.UNKNOWN_SESSION):
-                # The server was restarted, or had given us up: what we hold has been given to others, and the numbers
-                # of what is done as well.
+                # The server was restarted or had given us up: our leases, finished or not, belong to others now.
                 self._leases.clear()
                 self._unsent.clear()
                 return [self._say_hello()]
@@ -244,31 +243,31 @@ class WorkerConversation:
                 pass
         return []
 
-    def _nothing_heard(self, now: float) -> list[Action]:
+    def _handle_silence(self, now: float) -> list[Action]:
         actions: list[Action] = []
         if self._silence.ping_due(now):
-            self._unheard = False  # it may be lost
+            self._unheard = False  # the hello may be lost
             actions.append(Send(encode(Ping())))
-        if self._silence.silence(now) >= _TOLD_SECONDS and not self._told:
-            self._told = True
-            if not self._is_watched:  # of its own workers a server knows
+        if self._silence.silence(now) >= _TOLD_SECONDS and not self._silence_reported:
+            self._silence_reported = True
+            if not self._is_watched:  # a server sees the state of its own workers
                 actions.append(Say(f"{self._address} has not answered for {_TOLD_SECONDS:g} s; waiting"))
         return actions
 
-    def _listens_from(self, now: float) -> None:
-        """Silence is counted from here: while a sample is made nobody listens."""
+    def _restart_silence(self, now: float) -> None:
+        """Restart the measurement of silence. Exclude time during which this process was not polling."""
         self._silence = Liveness(now, ping_seconds=_PING_SECONDS, longest_ping_seconds=_LONGEST_PING_SECONDS)
-        self._told = False
+        self._silence_reported = False
 
     # --- what the worker does -----------------------------------------------------------------------------------------
 
     def _say_hello(self) -> Send:
-        self._begun = 0  # a server that does not know us counts its leases anew
+        self._begun = 0  # a server that does not know us numbers its leases from the start
         self._unheard = True
         return Send(encode(self._hello))
 
-    def _go_on(self, now: float) -> list[Action]:
-        """What is done is said; then the next step."""
+    def _next_actions(self, now: float) -> list[Action]:
+        """Report finished samples, then choose the next step."""
         actions = self._results()
         if self._stopping:
             return [*actions, Send(encode(Goodbye())), Leave()]
@@ -276,10 +275,10 @@ class WorkerConversation:
             return [*actions, Listen(min(_PING_SECONDS, self._silence.next_due(now)))]
         lease = self._leases[0]
         if self._begun != lease.lease:
-            if not self._tools.is_ready(lease):
-                # While they are compiled its leases are for others: that takes seconds, many where cores are few, and
-                # a video is not to be blamed for them, nor a worker.
-                self._away = not self._tools.is_compiled(lease)
+            if not self._callbacks.is_ready(lease):
+                # Compiling takes seconds, more on hosts with few cores. Meanwhile other workers get our leases, and
+                # neither a video nor this worker is blamed for the delay.
+                self._away = not self._callbacks.is_compiled(lease)
                 return [*actions, *([Send(encode(Goodbye()))] if self._away else []), Load(lease)]
             self._begun = lease.lease
             actions.append(Send(encode(Begun(lease.lease))))
@@ -295,25 +294,25 @@ class WorkerConversation:
         lease, self._at = self._at, None
         if lease is None:
             raise ValueError("nothing was to be made")
-        self._listens_from(now)
+        self._restart_silence(now)
         return lease
 
     def _results(self) -> list[Action]:
-        """Says what is done, and along with it what is begun next."""
+        """Report finished samples together with the lease that is begun next."""
         if not self._unsent:
             return []
-        may_go_on = self._leases and not self._stopping and self._tools.is_ready(self._leases[0])
+        may_go_on = self._leases and not self._stopping and self._callbacks.is_ready(self._leases[0])
         self._begun = self._leases[0].lease if may_go_on else 0
         begun = [*(number for number, *_ in self._unsent[1:]), self._begun]
         results = [
-            Send([*encode(_result(number, next_one, spent)), *frames])
-            for (number, frames, spent), next_one in zip(self._unsent, begun, strict=True)
+            Send([*encode(_result(number, next_one, timings)), *frames])
+            for (number, frames, timings), next_one in zip(self._unsent, begun, strict=True)
         ]
         self._unsent.clear()
         return list(results)
 
 
-def _result(lease: int, begins: int, spent: Spent) -> Result:
+def _result(lease: int, begins: int, timings: Timings) -> Result:
     return Result(
-        lease, begins, spent.decode_seconds, spent.simulate_seconds, spent.handover_seconds, spent.memory_bytes
+        lease, begins, timings.decode_seconds, timings.simulate_seconds, timings.handover_seconds, timings.memory_bytes
     )

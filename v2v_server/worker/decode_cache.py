@@ -16,11 +16,11 @@ from v2v_server.worker.produce import Decoded, decode_for
 
 
 class Clips:
-    """Decodes for leases, and for their siblings along with them.
+    """Decode clips for leases, together with those of their siblings.
 
     Args:
-        root: folder that the catalogue's ids are relative to, on this host; or their copies, from object storage.
-        cache: where what is decoded is kept for later epochs; None keeps nothing.
+        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        cache: cache of decoded pieces for later epochs; None stores nothing.
     """
 
     def __init__(self, root: Path | Copies, cache: Cache | None = None) -> None:
@@ -29,7 +29,7 @@ class Clips:
         self._kept: dict[tuple[object, ...], Decoded] = {}
 
     def take(self, lease: Lease) -> tuple[Decoded, bool]:
-        """What was decoded for the lease's sample, and whether that was done just now.
+        """Return the decoded clip of the lease's sample, and whether it was decoded just now.
 
         Raises:
             VideoError, ProtocolError: see :func:`v2v_server.worker.produce.decode_for`.
@@ -42,7 +42,7 @@ class Clips:
             try:
                 first, *others = decode_for(lease, lease.indices, self._root, self._cache)
             except VideoError:
-                pass  # a sibling may need more of the clip than this sample, whose fault that is not
+                pass  # a sibling may need more of the clip than this sample; try without siblings
             else:
                 self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
                 return first, True
@@ -51,11 +51,11 @@ class Clips:
         except (VideoChanged, VideoUnreadable):
             raise
         except VideoError:
-            # Storage may fail for a moment, which decoders do not always say. What the file does, it does again.
+            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
             return decode_for(lease, lease.indices[:1], self._root, self._cache)[0], True
 
     def said_of_cache(self, decoded: Decoded) -> str:
-        """What a sample's header says of the cache: see :class:`v2v_protocol.messages.SampleHeader`."""
+        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
         if self._cache is None or decoded.clip.origin == "store":
             return ""
         if decoded.clip.origin == "cache":
@@ -63,12 +63,12 @@ class Clips:
         return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
 
     def has(self, lease: Lease) -> bool:
-        """Whether the lease's sample needs no decoding."""
+        """Return whether the lease's sample needs no decoding."""
         return _key(lease, lease.indices[0]) in self._kept
 
 
 def _key(lease: Lease, index: int) -> tuple[object, ...]:
-    """Everything of a lease that its decoded clip depends on, and its index."""
+    """Return the fields of a lease that its decoded clip depends on, and its index."""
     return (
         lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
         lease.start_frame, lease.thresholds,

@@ -1,8 +1,8 @@
-"""The logbook: which lease a local worker is at, in its own hand, where it outlives the worker.
+"""The logbook: a record of the lease that a local worker works on, which outlives the worker.
 
-A worker that crashes takes its unsent messages with it: that it had finished one sample and begun the next may never
-reach the server, which would then blame the wrong one. So the worker also writes the number of the lease it is at into
-a nameless file that it shares with the pool; the kernel keeps that, whatever ends the worker.
+A worker that crashes loses its unsent messages. The server may then not know that it finished one sample and began the
+next, and would blame the wrong one. So the worker also writes the number of the lease in work into an unnamed file that
+it shares with the pool. The kernel keeps this file however the worker ends.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ IDLE = 0
 
 
 class Logbook:
-    """The pool's side: made before a worker is started, read when it is gone."""
+    """The pool's side: created before a worker starts, read after it ends."""
 
     def __init__(self) -> None:
         # In memory where the system can: a server needs no writable folder for this.
@@ -25,11 +25,11 @@ class Logbook:
 
     @property
     def descriptor(self) -> int:
-        """To be passed on to the worker process."""
+        """File descriptor to pass to the worker process."""
         return self._file.fileno()
 
     def lease(self) -> int | None:
-        """The lease the worker was at, IDLE for none; None when it never wrote anything."""
+        """The lease in work, or IDLE; None if the worker never wrote anything."""
         entry = os.pread(self.descriptor, _BYTES, 0)
         return int.from_bytes(entry, "little") if len(entry) == _BYTES else None
 
@@ -38,11 +38,11 @@ class Logbook:
         return os.pread(self.descriptor, 1, _BYTES) == _DECODES
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Close the file."""
         self._file.close()
 
 
 def note(descriptor: int | None, lease: int, *, decodes: bool = False) -> None:
-    """The worker's side: it is at this lease now, or IDLE; and whether at the decoding of its video."""
+    """Record the lease in work, or IDLE, and whether its video is being decoded. The worker's side."""
     if descriptor is not None:
         os.pwrite(descriptor, lease.to_bytes(_BYTES, "little") + (_DECODES if decodes else _SIMULATES), 0)

@@ -1,6 +1,6 @@
-"""The server worker's process: it does what its conversation says, one step after another.
+"""The process of a server worker, which carries out the steps of its conversation.
 
-Sending happens in ZeroMQ's own thread while the next sample is made. The process may be killed at any moment, and does
+Sending happens in ZeroMQ's own thread while the next sample is made. The process may be killed at any moment; it leaves
 nothing that would have to be undone.
 """
 
@@ -41,52 +41,52 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
+    Callbacks,
     Listen,
     Load,
     Make,
     Say,
     Send,
-    Spent,
-    Tools,
+    Timings,
     WorkerConversation,
 )
 from v2v_server.worker.decode_cache import Clips
-from v2v_server.worker.handover import room_for, sample_message
 from v2v_server.worker.logbook import IDLE, note
+from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
-"""A video up to this size is waited for with its leases in hand; they are for others while a larger one comes."""
+"""The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
 LARGEST_MEMORY_BYTES = 8 << 30
-"""Four times the frames of the largest clip that a lease may have; who needs more ends, and its sample is refused."""
+"""Four times the frames of the largest clip of a lease. A worker that needs more ends, and its sample is refused."""
 LONGEST_LEASE_SECONDS = 3600.0
-"""Of processor time, for one lease. The server gives up its own workers sooner, by the clock; one elsewhere would go on
-for ever."""
+"""Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
+ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
-"""What an operator may call a worker; a routing identity has 255 at most."""
+"""Bytes of an operator's name for a worker; a routing id has at most 255."""
 _MORE = int(zmq.SNDMORE)
-"""A plain number: send_multipart works with an enumeration, which takes longer than sending a small frame."""
+"""A plain number: send_multipart combines flags of an enumeration, which takes longer than sending a small frame."""
 
 
 class Worker:
-    """One worker: a socket, kernels and clips, and the conversation that says what to do with them.
+    """One worker: a socket, kernels and clips, and the conversation that decides what to do with them.
 
-    Only a VideoError is reported as the video's failure. Anything else ends the process with its trace: the sample is
-    given to another worker, and an installation that is broken ends in the server's crash budget instead of a stream
-    that quietly lacks samples.
+    Only a VideoError is reported as a failure of the video. Any other exception ends the process with a traceback. Its
+    sample is then given to another worker, and a broken installation exhausts the server's crash budget instead of
+    producing a stream that silently lacks samples.
 
     Args:
-        name: unique name, also its routing identity.
-        root: the corpus folder on this host, or the copies of what is in object storage.
+        name: unique name, also its routing id.
+        root: the corpus folder on this host, or local copies of a corpus in object storage.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
-        cache: where what is decoded is kept for later epochs; None keeps nothing.
-        keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
-        log: for what people should know.
+        cache: cache of decoded clips for later epochs; None stores nothing.
+        keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
+        log: log for people.
 
     Raises:
-        UsageError: the address cannot be connected to.
+        UsageError: the socket cannot connect to the address.
         KeyRefused: the key file cannot be used.
     """
 
@@ -106,15 +106,15 @@ class Worker:
         self._logbook = logbook
         self._clips = Clips(root, cache)
         self._copies = root if isinstance(root, Copies) else None
-        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be had
+        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
         self._is_remote = leaves_host(address)
-        self._kernels = set(USUAL)  # that are loaded
-        self._handover_seconds = 0.0  # that no result has named yet
+        self._kernels = set(USUAL)  # loaded kernels
+        self._handover_seconds = 0.0  # not yet reported in a result
         self._memory_bytes, self._weigh_at = 0, -math.inf
         self._conversation = WorkerConversation(
             WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
             address,
-            Tools(
+            Callbacks(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
                 is_compiled=lambda lease: (
                     all(map(is_compiled, kernels_of(lease) - self._kernels))
@@ -129,7 +129,7 @@ class Worker:
         self._socket.setsockopt(zmq.ROUTING_ID, name.encode())
         self._socket.setsockopt(zmq.LINGER, 5000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
-        # Leases bound what is queued: at most CREDIT samples in either direction.
+        # Leases bound the queues: at most CREDIT samples in either direction.
         self._socket.setsockopt(zmq.SNDHWM, 0)
         self._socket.setsockopt(zmq.RCVHWM, 0)
         self._socket.setsockopt(zmq.IPV6, int("[" in address))
@@ -147,16 +147,16 @@ class Worker:
         self._poller.register(self._monitor, zmq.POLLIN)
 
     def stop(self) -> None:
-        """Finishes the sample in work, gives the other leases back and leaves. May be called from a signal handler."""
+        """Finish the current sample, return the other leases, and leave. Safe to call from a signal handler."""
         self._conversation.stop()
 
     def run(self) -> None:
-        """Works until told to stop.
+        """Work until told to stop.
 
         Raises:
-            RemoteError: the server does not want this worker (another numerics version).
+            RemoteError: the server rejects this worker (another numerics version).
             VersionMismatch: the server speaks another version of the protocol.
-            KeyRefused: the server takes no such key.
+            KeyRefused: the server rejects the key.
         """
         try:
             actions = self._conversation.start(time.monotonic())
@@ -180,45 +180,47 @@ class Worker:
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
     def _take(self, step: Action) -> list[Action]:
-        """Takes the next step; returns what the conversation says to what came of it."""
+        """Carry out a step and return the conversation's next actions."""
         conversation = self._conversation
         match step:
             case Listen(seconds):
                 messages = self._messages(seconds)
-                return conversation.heard(messages, time.monotonic())
+                return conversation.on_messages(messages, time.monotonic())
             case Load(lease):
                 for variant in kernels_of(lease) - self._kernels:
                     load_in_turn(variant)
                     self._kernels.add(variant)
                 self._fetch(lease)
-                return conversation.loaded(time.monotonic())
+                return conversation.on_kernels_loaded(time.monotonic())
             case Make(lease):
                 if not self._clips.has(lease):
-                    give_way()  # this clip finds the caches cold anyhow; in the middle of one they are warm
+                    give_way()  # processor caches are cold before a new clip, but warm within one
                 limit_processor_time(LONGEST_LEASE_SECONDS)
                 note(self._logbook, lease.lease, decodes=True)
                 try:
-                    made: tuple[Frames, Spent] | VideoError = self._made(lease)
+                    made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
                 except VideoError as error:
                     made = error
-                note(self._logbook, IDLE)  # not where an exception ends the worker: it was this lease
+                note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
                 if isinstance(made, VideoError):
-                    return conversation.failed(made, now)
-                frames, spent = made
-                return conversation.made(frames, now, spent)
+                    return conversation.on_failure(made, now)
+                frames, timings = made
+                return conversation.on_sample(frames, now, timings)
             case _:
                 return []  # Leave
 
     def _has_video(self, lease: Lease) -> bool:
-        """Whether there is nothing to wait for: its video is on this host, or could not be had, which is to be said."""
+        """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
+        reported.
+        """
         if self._copies is None or self._clips.has(lease):
             return True
         video = lease.video, lease.fingerprint
         return (self._unfetched is not None and self._unfetched[0] == video) or self._copies.has(*video)
 
     def _fetch(self, lease: Lease) -> None:
-        """Before the lease is begun: nobody is to blame for the time that a network takes."""
+        """Fetch the lease's video before the lease is begun, so that network time does not count against the sample."""
         if self._copies is None or self._has_video(lease):
             return
         try:
@@ -227,7 +229,7 @@ class Worker:
             self._unfetched = (lease.video, lease.fingerprint), error
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
-        """The first frames of all messages that are there."""
+        """Return the first frames of all available messages."""
         messages: list[bytes] = []
         timeout_ms = math.ceil(wait_seconds * 1000)
         while ready := dict(self._poller.poll(0 if messages else timeout_ms)):
@@ -236,36 +238,36 @@ class Worker:
                     lambda: self._monitor.poll(0), lambda: self._monitor.recv_multipart(flags=zmq.NOBLOCK)
                 )
             if self._socket not in ready:
-                break  # the conversation looks at the time
+                break  # the conversation checks the time
             first, *_ = self._socket.recv_multipart()
             messages.append(first)
         return messages
 
-    def _made(self, lease: Lease) -> tuple[Frames, Spent]:
-        """The message of a lease's sample, and what it took.
+    def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
+        """Make a lease's sample and return its message with the timings.
 
         Raises:
-            VideoError: its video cannot give it.
+            VideoError: its video cannot be used.
         """
         if self._unfetched is not None and self._unfetched[0] == (lease.video, lease.fingerprint):
             error, self._unfetched = self._unfetched[1], None
             raise error
         began = time.monotonic()
-        room = room_for(lease, sample_layout(lease))
+        buffer = open_output_buffer(lease, sample_layout(lease))
         has_room = time.monotonic()
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
         note(self._logbook, lease.lease)
         if decoded and not clip.clip.origin:
-            # PyAV ties a frame whose side data was read (its orientation) into a reference cycle: few objects to
-            # Python's collector, which waits for many, but each holds pictures.
+            # PyAV creates a reference cycle for a frame whose side data (its orientation) was read. Python's collector
+            # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sample = make_sample(lease, clip, room.arrays)
+        sample = make_sample(lease, clip, buffer.arrays)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
-            room,
+            buffer,
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=time.process_time() - started,
@@ -273,31 +275,32 @@ class Worker:
             cache=self._clips.said_of_cache(clip) if decoded else "",
             packed=self._is_remote,
         )
-        spent = Spent(
+        timings = Timings(
             decode_seconds=has_clip - has_room,
             simulate_seconds=has_sample - has_clip,
             handover_seconds=self._handover_seconds + has_room - began,
             memory_bytes=self._memory(has_sample),
         )
         self._handover_seconds = time.monotonic() - has_sample
-        return frames, spent
+        return frames, timings
 
     def _memory(self, now: float) -> int:
-        """Bytes of this process in memory, looked at once a second."""
+        """Return the resident memory of this process, bytes, measured at most once a second."""
         if now >= self._weigh_at:
             self._weigh_at, self._memory_bytes = now + 1.0, resident_bytes()
         return self._memory_bytes
 
 
 def unshared_name(beginning: str | None) -> str:
-    """A name that no other worker has: of two of one name the server would hear one, and the other wait for ever.
+    """Return a name that no other worker has. With equal names the server would hear one worker and the other would
+    wait.
 
     Args:
-        beginning: what its operator calls it, and perhaps others too; None: host and process id, which in containers
-            may be the same for all.
+        beginning: the operator's name for the worker, which may be shared; None: host and process id, which may be
+            equal in containers.
 
     Raises:
-        UsageError: it is too long to be a routing identity with what is added to it.
+        UsageError: the name with its suffix would be too long for a routing id.
     """
     if beginning is not None and len(beginning.encode()) > MOST_NAME_BYTES:
         raise UsageError(f"--name has {len(beginning.encode())} bytes: give at most {MOST_NAME_BYTES}")
@@ -305,14 +308,15 @@ def unshared_name(beginning: str | None) -> str:
 
 
 def _size_bytes(lease: Lease) -> int:
-    """Of its video, which begins the fingerprint."""
+    """Return the size of the lease's video, which starts the fingerprint."""
     size = lease.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
 
 
 def _written(root: Path | Copies, address: str, cache: Cache | None) -> list[Path] | None:
-    """Folders that a worker writes to, where those are all; None where its samples may go to a consumer's memory, or
-    tools of object storage write where they like."""
+    """Return the folders that a worker writes to; None if they cannot be listed, because its samples may go to a
+    consumer's memory or the tools for object storage write elsewhere.
+    """
     if isinstance(root, Copies) or not leaves_host(address):
         return None
     return [*compile_cache(), *([] if cache is None else [cache.folder])]
@@ -328,37 +332,37 @@ def run_worker(
     keys: str | None = None,
     log: Log | None = None,
 ) -> None:
-    """Runs one worker in this process until the server stops it.
+    """Run one worker in this process until the server stops it.
 
     Args:
         address: where the server listens for workers.
-        root: the corpus folder on this host, or the copies of what is in object storage.
-        name: unique name; by default host, process id and something random.
-        parent_pid: the server, when this is one of its own processes: we die with it.
+        root: the corpus folder on this host, or local copies of a corpus in object storage.
+        name: unique name; by default host, process id and a random suffix.
+        parent_pid: process id of the server if it started this worker, which then ends with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
-        cache: where what is decoded is kept for later epochs; None keeps nothing.
-        keys: file of its key; None takes what ``V2V_KEYS`` names, "" none.
-        log: for what people should know.
+        cache: cache of decoded clips for later epochs; None stores nothing.
+        keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
+        log: log for people.
 
     Raises:
-        UsageError: the address cannot be connected to, or the server takes no such key.
-        RemoteError, VersionMismatch: the server refuses this worker.
+        UsageError: the socket cannot connect to the address, or the server rejects the key.
+        RemoteError, VersionMismatch: the server rejects this worker.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    key_for(address, "worker", keys)  # a wrong one is said at once
+    key_for(address, "worker", keys)  # reports a wrong key at once
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
-    # A worker is one core's worth of work. OpenCV reads this when it is loaded, which some recipes never do.
+    # A worker uses one core. OpenCV reads this when it is loaded, which some recipes never do.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
-    # Compile or load the kernels first: a worker that has said hello can work at full speed.
+    # Compile or load the kernels first, so that a worker that says hello works at full speed.
     warm_up_in_turn()
-    # What is there by now stays: without it a collection takes a fraction of a millisecond.
+    # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
     confine(_written(root, address, cache), network=not address.startswith("ipc:") or isinstance(root, Copies))
     worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys, log)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
-    # Now that ZeroMQ's threads are there, which had better come at once.
+    # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()
     worker.run()

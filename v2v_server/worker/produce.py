@@ -1,6 +1,6 @@
-"""From a lease to its samples: decode, view, simulate.
+"""Make the samples of a lease: decode, view, simulate.
 
-Server workers and `v2v-simulate` both come through here, which is why a sample made by either is the same.
+Server workers and `v2v-simulate` both use this module, so they make equal samples.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
-from v2v_server.cloud.copies import Copies, lent
+from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.variants import Variant, variants
@@ -35,21 +35,21 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import MAKERS, Making
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
 @dataclass(frozen=True, slots=True)
-class Draft:
+class SamplePlan:
     """What one sample needs of its clip.
 
     Attributes:
         spec: the stream's spec.
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
-        cut: the frames that the pauses leave to be decoded, cropped as far as that can be done before the resize.
-        flow: how flow is made where the lease asks for it; then ``cut`` has its margin too.
-        plan: what the statistics of the scene say about flow; None where the spec does not ask them.
+        cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
+        flow: settings of the flow if the lease asks for it; ``cut`` then includes its margin.
+        flow_plan: flow methods chosen from the statistics of the scene; None if the spec does not use them.
     """
 
     spec: StreamSpec
@@ -57,22 +57,22 @@ class Draft:
     source: npt.NDArray[np.int64]
     cut: Cut
     flow: FlowSettings | None
-    plan: FlowPlan | None
+    flow_plan: FlowPlan | None
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The decoded part of a sample."""
+    """The decoded clip of a sample, with its plan."""
 
-    draft: Draft
+    plan: SamplePlan
     clip: DecodedClip
 
 
-def draft_of(lease: Lease, index: int) -> Draft:
-    """Draws the camera of one of a lease's indices.
+def plan_sample(lease: Lease, index: int) -> SamplePlan:
+    """Draw the camera for one of a lease's indices, and plan what to decode.
 
     Raises:
-        ProtocolError: the lease does not fit its form.
+        ProtocolError: the lease is malformed.
     """
     spec = _spec(lease.spec)
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
@@ -88,54 +88,54 @@ def draft_of(lease: Lease, index: int) -> Draft:
     )
     source = params.source_index(spec.recipe.steps)
     window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
-    plan = _plan(lease, spec, params, bottom - top)
+    flow_plan = _flow_plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
-        if plan is not None and plan.still:
+        if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return Draft(spec, params, source, Cut(int(source[-1]) + 1, window), flow, plan)
+    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), flow, flow_plan)
 
 
 def decode_for(
     lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
 ) -> tuple[Decoded, ...]:
-    """Decodes, in one pass, the frames that some of a lease's indices need, and no more.
+    """Decode, in one pass, exactly the frames that some of a lease's indices need.
 
     Args:
         lease: the work.
-        indices: of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to, on this host; or their copies, from object storage.
-        cache: where what is decoded is kept, and read by later epochs; None keeps nothing.
+        indices: a subset of ``lease.indices``.
+        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        cache: cache of decoded pieces for later epochs; None stores nothing.
 
     Raises:
-        VideoError: the file is not what was catalogued, or cannot give the frames it promised.
-        ProtocolError: the lease does not fit its form.
+        VideoError: the file is not the catalogued one, or cannot deliver the expected frames.
+        ProtocolError: the lease is malformed.
     """
-    drafts = [draft_of(lease, index) for index in indices]
-    spec = drafts[0].spec
+    plans = [plan_sample(lease, index) for index in indices]
+    spec = plans[0].spec
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [draft.cut for draft in drafts]
+        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
-        with lent(root, lease.video, lease.fingerprint) as path:
+        with open_local(root, lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
             if clips is None:
                 clips = clips_of(path, lease.fingerprint, *what)
     except VideoError as error:
-        # The consumer and the log know videos by id; a path of this host says nothing elsewhere.
+        # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return tuple(Decoded(draft, clip) for draft, clip in zip(drafts, clips, strict=True))
+    return tuple(Decoded(plan, clip) for plan, clip in zip(plans, clips, strict=True))
 
 
 def sample_layout(lease: Lease) -> Layout:
-    """dtype and shape of each array of a lease's sample.
+    """Return dtype and shape of each array of a lease's sample.
 
     Raises:
-        ProtocolError: the lease asks for an array that nobody makes.
+        ProtocolError: the lease asks for an unknown array.
     """
     try:
         return _layout(lease.spec, lease.arrays)
@@ -144,25 +144,25 @@ def sample_layout(lease: Lease) -> Layout:
 
 
 def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
-    """Makes a lease's sample of what was decoded for it: view, flow, simulation.
+    """Make a lease's sample from its decoded clip: view, flow, simulation.
 
     Args:
         lease: the work.
-        decoded: what was decoded for it.
-        into: C-contiguous arrays for the sample, of :func:`sample_layout`; None makes them.
+        decoded: its decoded clip.
+        into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
 
     Raises:
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
-        ProtocolError: the lease does not fit its form.
+        ProtocolError: the lease is malformed.
     """
-    draft, index = decoded.draft, lease.indices[0]
-    params, recipe, source = draft.params, draft.spec.recipe, draft.source
+    plan, index = decoded.plan, lease.indices[0]
+    params, recipe, source = plan.params, plan.spec.recipe, plan.source
     frames, flow = decoded.clip.frames, None
-    if draft.flow is not None:
-        plan = () if draft.plan is None else draft.plan.methods
-        flow = flow_for(frames, params, recipe, draft.flow, validity="flow_valid" in lease.arrays, plan=plan)
-        frames = view_part(frames, params, recipe, draft.flow.margin_px)
+    if plan.flow is not None:
+        methods = () if plan.flow_plan is None else plan.flow_plan.methods
+        flow = flow_for(frames, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        frames = view_part(frames, params, recipe, plan.flow.margin_px)
     view = apply_view(frames, params, recipe)
     seconds, irregular = None, 0
     if recipe.needs_seconds:
@@ -171,9 +171,9 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     if into is None:
         into = new_arrays(sample_layout(lease))
-    making = Making(lease.video, draft.spec, params, source, view, seconds, flow)
+    context = SampleContext(lease.video, plan.spec, params, source, view, seconds, flow)
     for name, array in into.items():
-        MAKERS[name](making, array)
+        ARRAY_BUILDERS[name](context, array)
     return Sample(
         arrays=into,
         provenance=Provenance(
@@ -184,23 +184,23 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             candidate=lease.candidate,
             refusals=_refusals(lease),
             params=params,
-            saturated_bins=making.saturated_bins,
+            saturated_bins=context.saturated_bins,
             irregular_timestamps=irregular,
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
-            scene="" if draft.plan is None else draft.plan.reason,
+            scene="" if plan.flow_plan is None else plan.flow_plan.reason,
         ),
     )
 
 
 def _decoder(clip: DecodedClip) -> str:
-    """What a provenance says of where the pixels came from."""
+    """Describe the source of the pixels for the provenance."""
     host = "" if clip.bit_exact else " (host-dependent)"
     return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
-    """The compiled kernels that a lease's sample may need."""
+    """Return the compiled kernels that a lease's sample may need."""
     if "voxels" not in lease.arrays:
         return frozenset()
     return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds)
@@ -224,7 +224,7 @@ def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
     return array_layout(spec.recipe, spec.voxel_dtype, arrays)
 
 
-def _plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
+def _flow_plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
     if spec.scene == "off":
         return None
     scene = Scene.from_bytes(lease.scene)
@@ -236,16 +236,16 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
 
 
 def _frame_index(lease: Lease, frames: int) -> FrameIndex:
-    """The index that a lease carries, of which its server may not have looked at a single byte.
+    """Decode the frame index of a lease. Its server may not have checked it.
 
     Raises:
-        VideoError: it is damaged.
+        VideoError: the index is damaged.
     """
     try:
         frame_index = FrameIndex.from_bytes(lease.frame_index)
         frame_index.position(lease.start_frame, frames)
     except (ProtocolError, UsageError) as error:
-        raise VideoError(lease.video, None, f"the server's index of it is damaged: {error}") from error
+        raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return frame_index
 
 
@@ -254,7 +254,7 @@ def _refusals(lease: Lease) -> tuple[Refusal, ...]:
 
 
 def _refuse_outside(video: str) -> None:
-    """A catalogue id may not lead out of the root, whatever a message says."""
+    """Reject a catalogue id that leads out of the root."""
     relative = PurePosixPath(video)
     if relative.is_absolute() or ".." in relative.parts:
         raise ProtocolError(f"video id {video!r} leads out of the corpus folder")

@@ -1,17 +1,18 @@
-"""How much flow a clip needs, from the statistics of its video. Pure.
+"""Choose how much flow a clip needs, from the statistics of its video. Pure.
 
-Each voxel's flow is made by the cheapest method that keeps the tolerance, judged in the tiles of the picture that the
-crop touches and in the segments between the voxel's two frames:
+Each voxel's flow is made by the cheapest method within the tolerance. The choice considers the tiles of the picture
+that the crop touches, and the segments between the voxel's two frames:
 
     still     no block changes its mean by more than 1.5 grey levels (0.25 in a dark scene, where the
-              gradations are finer): zero, without looking at a pixel
+              gradations are finer): zero, without reading a pixel
     slow      nothing moves half a pixel from one end of the voxel to the other: dis-ultrafast
-    mixed     half of the tiles and segments are slow, or the voxel reaches beyond what was looked at: "auto" looks
-              at the pair itself
-    moving    else: dis-fast-lean
+    mixed     half of the tiles and segments are slow, or the voxel reaches beyond the analysed frames: "auto"
+              examines the pair itself
+    moving    otherwise: dis-fast-lean
 
-The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.methods`), spared its look.
-Where it would take dis-fast, dis-fast-lean refines three times instead of five, within the tolerance (docs/scene.md).
+The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.methods`), without its cost.
+Where "auto" would use dis-fast, dis-fast-lean refines three times instead of five, within the tolerance
+(docs/scene.md).
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVEL
 
 MOVING = "dis-fast-lean"
 TOLERANCE_PX = 0.05
-"""Most that the choice may add to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
+"""Largest addition of the choice to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
 DARK_SHARE = 0.9
-"""A scene is dark where this share of it lies below grey level 16."""
+"""A scene is dark if this share of it lies below grey level 16."""
 DARK_STILL_GREY_LEVELS = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class FlowPlan:
-    """What was decided for one sample.
+    """Flow methods of one sample.
 
     Attributes:
-        methods: of each voxel of the target sequence; "auto" where the statistics do not decide. Empty where the spec
-            names a method, which is then obeyed.
+        methods: of each voxel of the target sequence; "auto" where the statistics do not decide. Empty if the spec
+            names a method, which is then used.
         reason: the decision and the figures behind it, for the provenance.
     """
 
@@ -53,7 +54,7 @@ class FlowPlan:
 
     @property
     def still(self) -> bool:
-        """Whether no flow has to be estimated at all."""
+        """Whether no flow has to be estimated."""
         return bool(self.methods) and all(name == STILL for name in self.methods)
 
 
@@ -65,12 +66,12 @@ def plan_flow(
     picture_height_px: int,
     picture_width_px: int,
 ) -> FlowPlan:
-    """The method of each voxel of one drawn sample.
+    """Choose the flow method of each voxel of one drawn sample.
 
     Args:
-        scene: statistics of the usable picture; at least of what the sample shows, as far as it was looked at.
+        scene: statistics of the usable picture; they cover at least what the sample shows, as far as it was analysed.
         start_frame: first frame of the sequence.
-        params, spec: the draw and what it was drawn for.
+        params, spec: the draw, and the spec that it was drawn for.
         picture_height_px, picture_width_px: size of the usable picture before the resize.
     """
     recipe = spec.recipe
@@ -96,7 +97,7 @@ def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_]
     change = values[:, CHANGE][:, tiles].max() * max(1.0, (later - earlier) / LAG_FRAMES)
     if change <= (DARK_STILL_GREY_LEVELS if dark else STILL_GREY_LEVELS):
         return STILL
-    # NaN, a motion that is not known, is not below anything.
+    # NaN means unknown motion; every comparison with it is False.
     pace = values[:, MOTION][:, tiles] * scale * (later - earlier)
     if pace.max() < SLOW_PX:
         return SLOW
@@ -104,7 +105,7 @@ def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_]
 
 
 def _tiles(params: SampleParams, recipe: Recipe, height_px: int, width_px: int) -> npt.NDArray[np.bool_]:
-    """[16] which tiles of the picture the crop touches."""
+    """Return [16] bool, which tiles of the picture the crop touches."""
     rows = _touched(params.crop_top_px, recipe.crop_height_px, height_px * params.scale)
     columns = _touched(params.crop_left_px, recipe.crop_width_px, width_px * params.scale)
     return (rows[:, None] & columns).ravel()
@@ -119,7 +120,7 @@ def _touched(start_px: int, extent_px: int, side_px: float) -> npt.NDArray[np.bo
 
 
 def _kind(methods: tuple[str, ...]) -> str:
-    """What a clip is called whose most demanding voxel takes that method."""
+    """Name a clip after its most demanding voxel's method."""
     kinds = {MOVING: "moving", AUTO: "mixed", SLOW: "slow", STILL: "still"}
     return next(kind for name, kind in kinds.items() if name in methods)
 
@@ -132,7 +133,7 @@ def _counted(methods: tuple[str, ...]) -> str:
 
 
 def _figures(values: npt.NDArray[np.float64], tiles: npt.NDArray[np.bool_]) -> str:
-    """The statistics of a clip as text: of its tiles motion and change, of the whole picture the rest."""
+    """Format the statistics of a clip: motion and change of its tiles, the rest of the whole picture."""
     if not len(values):
         return "not looked at"
     motion, noise = values[:, MOTION][:, tiles], values[:, NOISE]

@@ -1,17 +1,17 @@
-"""The kernels of a worker: one process compiles them, the others load what it has left in the cache.
+"""Load a worker's kernels: one process compiles them, the others load them from the cache.
 
-Compiling takes tens of seconds of processor time. Workers that are all started at once on a new host would each spend
-them, since none finds the work of another. So the first takes a lock, which the operating system gives back should it
-die, and the others wait. Once everything is in the cache a file there says so, and nobody takes the lock any more.
+Compiling takes tens of seconds of processor time. Workers that start together on a new host would each spend it,
+because none finds the results of another. So the first takes a lock, which the operating system releases if it dies,
+and the others wait. Once everything is in the cache, a marker file there says so, and the lock is not taken any more.
 
-Both are hints. If that file is wrong, because somebody has emptied the cache around it, or if there are no locks on
-that file system, or the holder of the lock does not get on, each process compiles for itself.
+Both are hints. Each process compiles for itself if the marker file is wrong (the cache was emptied), if the file system
+has no locks, or if the holder of the lock makes no progress.
 
-The compiler needs about 90 MB that it never gives back. They go with the child process in which it runs.
+The compiler needs about 90 MB that it never frees. This memory goes with the child process that compiles.
 
-Kernels that only some streams need (``simulation/variants.py``) are had in the same way, when the first of them comes.
-By then a worker is confined (:mod:`v2v_server.system.sandbox`) and may start no process: the one whose turn it is
-compiles in its own memory.
+Kernels that only some streams need (``simulation/variants.py``) are compiled in the same way when they are first
+needed. By then a worker is confined (:mod:`v2v_server.system.sandbox`) and cannot start a process, so it compiles in
+its own memory.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _POLL_SECONDS = 0.1
 
 
 def warm_up_in_turn() -> None:
-    """Loads what every worker runs; before that, compiles it or waits for another process that does."""
+    """Load the kernels that every worker runs, after compiling them or waiting for another process that does."""
     with one_compiles(*_place()) as is_to_compile:
         if is_to_compile:
             _compile_apart()
@@ -46,7 +46,7 @@ def warm_up_in_turn() -> None:
 
 
 def load_in_turn(variant: Variant) -> None:
-    """The same for a variant of the kernels that is not among the usual ones."""
+    """Load one variant of the kernels in the same way."""
     with one_compiles(*_place(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
@@ -55,30 +55,30 @@ def load_in_turn(variant: Variant) -> None:
 
 
 def is_compiled(variant: Variant) -> bool:
-    """Whether a process is known to have compiled it, so that to load it takes no time to speak of."""
+    """Return whether a variant is known to be compiled, so that loading it is quick."""
     folder, key = _place(variant)
     return _mark(folder, key).exists()
 
 
 def load_kernels() -> None:
-    """Loads from the cache, or compiles, what every worker runs."""
+    """Load the kernels that every worker runs from the cache; compile those that are missing."""
     warm_up()
-    import_module("v2v_server.video.full_range")  # importing it compiles, or loads, what is in it
+    import_module("v2v_server.video.full_range")  # importing it compiles or loads its functions
 
 
 def _place(variant: Variant | None = None) -> tuple[Path, str]:
-    """Where the compiled code is kept, and a name for what is compiled."""
+    """Return the folder of the compiled code, and a name for what is compiled."""
     kernel: Any = simulate_pixels
-    # Numba keeps apart what was compiled by other Pythons and for other processors, and so do we.
+    # As Numba does, separate code compiled by other Pythons or for other processors.
     processor = kernel.targetctx.codegen().magic_tuple()
     key = repr((sources_digest(), sys.implementation.cache_tag, processor, *(variant or ())))
     return Path(kernel.stats.cache_path), hashlib.sha256(key.encode()).hexdigest()[:12]
 
 
 def _compile_apart(*variant: str) -> None:
-    """Compiles in a child process. Should that fail, so will the caller's loading, or it does the work."""
+    """Compile in a child process. If that fails, loading in the caller compiles, or fails with the reason."""
     command = [sys.executable, "-m", __name__, str(os.getpid()), *variant]
-    with suppress(PermissionError):  # a confined worker starts no program: its loading compiles, and keeps the memory
+    with suppress(PermissionError):  # a confined worker cannot start programs; loading then compiles
         subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
 
 
@@ -88,15 +88,15 @@ def _mark(folder: Path, key: str) -> Path:
 
 @contextmanager
 def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_WAIT_SECONDS) -> Iterator[bool]:
-    """What is done inside is done by one process at a time until one has come to its end; after that by all at once.
+    """Let one process at a time run the body until one has completed it; later ones run it without a lock.
 
     Args:
         folder: the cache.
-        key: names what is compiled; another key has another lock.
-        longest_wait_seconds: after that we no longer wait for the others.
+        key: name of what is compiled; each key has its own lock.
+        longest_wait_seconds: longest wait for other processes.
 
     Yields:
-        whether none is known to have come to its end.
+        whether no process is known to have completed it.
     """
     complete = _mark(folder, key)
     with ExitStack() as turn:
@@ -106,13 +106,13 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
         if not is_first:
             turn.close()
         yield is_first
-        with suppress(OSError):  # a full disk, a folder of another user: then the next process takes the lock again
+        with suppress(OSError):  # full disk or folder of another user: the next process takes the lock again
             complete.touch()
 
 
 @contextmanager
 def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
-    """Holds a lock on the file, or none after that time or where there are no locks."""
+    """Hold a lock on the file; continue without it after the wait, or if the file system has no locks."""
     try:
         file = path.open("ab")
     except OSError:

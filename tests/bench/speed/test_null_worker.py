@@ -13,7 +13,7 @@ from v2v_client import V2VStreamDataset
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode_map, decode_sample
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import inspected, lease_for
+from v2v_server.broker.terms import check_result, lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 
@@ -29,7 +29,7 @@ def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ..
     )  # fmt: skip
     frames = answer(lease, "null-1")
     layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
-    header = inspected(frames, request, Form.of(layout))
+    header = check_result(frames, request, Form.of(layout))
     found = decode_sample(header, frames[1:])
     assert {name: (array.dtype.name, array.shape) for name, array in found.items()} == layout
     assert all(np.all(array == 1) for array in found.values())

@@ -114,7 +114,7 @@ def sample(value: int) -> dict[str, np.ndarray]:
 def filled(memory: BatchMemory) -> dict[str, np.ndarray]:
     for row in range(4):
         memory.fill(row, sample(row))
-    return memory.whole()
+    return memory.finish()
 
 
 def arena_of(memory: BatchMemory) -> str:
@@ -140,10 +140,10 @@ def test_a_batch_leaves_its_arena_where_a_worker_may_still_write():
         if row in (1, 3):
             arena.put(row, sample(row))  # as a worker does
         memory.fill(row, None if row in (1, 3) else sample(row), slot_is_free=row != 2)
-    assert memory.lent
+    assert memory.has_slots
     assert memory.in_place == 2
     left = memory._left
-    whole = memory.whole()
+    whole = memory.finish()
     left.put(2, sample(99))
     assert all((array[row] == row).all() for array in whole.values() for row in range(4))
 
@@ -222,7 +222,7 @@ def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
             memory = buffers.take(shared=True)
             assert arena_of(memory) != name
             memory.fill(2, sample(99))
-            memory.whole()
+            memory.finish()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

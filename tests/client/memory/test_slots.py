@@ -33,25 +33,25 @@ def test_what_is_asked_again_is_asked_without_a_slot() -> None:
 def test_a_sample_in_its_slot_comes_once() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.answered(5, 6, in_message=False) is Answer.THERE
-    assert slots.answered(5, 6, in_message=False) is Answer.NOWHERE
+    assert slots.record_arrival(5, 6, in_message=False) is Answer.THERE
+    assert slots.record_arrival(5, 6, in_message=False) is Answer.NOWHERE
 
 
 def test_a_worker_that_could_not_reach_the_slot_writes_there_no_more() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.answered(5, 6, in_message=True) is Answer.MESSAGE
+    assert slots.record_arrival(5, 6, in_message=True) is Answer.MESSAGE
 
 
 def test_a_sample_made_by_another_worker_leaves_its_slot_to_the_first() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.answered(5, 7, in_message=False) is Answer.NOWHERE  # in another's slot: nobody may read that
-    assert slots.answered(5, NO_SLOT, in_message=True) is Answer.ABANDONED
+    assert slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE  # in another's slot: nobody may read that
+    assert slots.record_arrival(5, NO_SLOT, in_message=True) is Answer.ABANDONED
 
 
 def test_where_nothing_is_offered_nothing_is_lent() -> None:
     slots = Slots()
     assert slots.want(2, [4, 5]) == Want(2, (4, 5))
-    assert slots.answered(4, 1, in_message=False) is Answer.NOWHERE
-    assert slots.answered(4, NO_SLOT, in_message=True) is Answer.MESSAGE
+    assert slots.record_arrival(4, 1, in_message=False) is Answer.NOWHERE
+    assert slots.record_arrival(4, NO_SLOT, in_message=True) is Answer.MESSAGE

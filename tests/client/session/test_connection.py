@@ -43,7 +43,7 @@ def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(se
         connection.want(range(4))
         until(lambda: len(server.wants) == 4)
         server.call(lambda: server.answer(0, 0))
-        connection._conversation.happens(Event.CUT, connection._now())
+        connection._conversation.handle_event(Event.DISCONNECTED, connection._now())
         connection.want(())  # and all four are asked for again
         until(lambda: len(server.wants) == 8)
         assert _next(connection) == 0

@@ -29,9 +29,9 @@ FORGOTTEN = Denied(ErrorCode.UNKNOWN_SESSION, "say Hello")
 
 def begun(*, welcomed: bool = True, patience: Patience = PATIENCE) -> Conversation:
     talk = Conversation("tcp://x:1", HELLO, 0, pinned=STREAM, pinned_by="a test", patience=patience, now=0.0)
-    talk.happens(Event.OPENED, 0.0)
+    talk.handle_event(Event.OPENED, 0.0)
     if welcomed:
-        talk.hear(WELCOME, [], 0.0)
+        talk.handle_message(WELCOME, [], 0.0)
         talk.want([0, 1])
         talk.outbox.clear()
     return talk
@@ -59,7 +59,7 @@ def timeline(
         for message in messages:
             reply = answer(message)
             if reply is not None:
-                talk.hear(reply, [], now)
+                talk.handle_message(reply, [], now)
                 done += [(now, type(message)) for message in said(talk)]
     return done
 
@@ -88,7 +88,7 @@ def test_nothing_is_asked_before_the_server_knows_us(events: list[Event]) -> Non
     talk.want([7, 8])
     greeted = False
     for event in events:
-        talk.happens(event, 0.0)
+        talk.handle_event(event, 0.0)
         for message in said(talk):
             match message:
                 case Hello():
@@ -104,9 +104,9 @@ def test_nothing_is_asked_before_the_server_knows_us(events: list[Event]) -> Non
 def test_a_forgotten_session_is_opened_again_once_and_everything_is_asked_again() -> None:
     talk = begun()
     for _ in range(2):  # each request is denied
-        talk.hear(FORGOTTEN, [], 1.0)
+        talk.handle_message(FORGOTTEN, [], 1.0)
     assert [type(message) for message in said(talk)] == [Hello]
-    talk.hear(WELCOME, [], 1.0)
+    talk.handle_message(WELCOME, [], 1.0)
     assert said(talk) == [Want(0, (0, 1))]
 
 
@@ -160,7 +160,7 @@ def timeline_raising(talk: Conversation, answer: Callable[[Message], Message | N
         now += talk.next_due(now)
         talk.tick(now)
         for reply in filter(None, map(answer, said(talk))):
-            talk.hear(reply, [], now)
+            talk.handle_message(reply, [], now)
 
 
 def test_trouble_that_passes_is_forgotten() -> None:
@@ -187,9 +187,9 @@ def test_time_spent_elsewhere_does_not_count(away: float, listened: float) -> No
 
 def test_a_time_in_which_this_process_was_stopped_does_not_count() -> None:
     clock = ListeningClock(0.0)
-    clock.woke(1.5, due=1.0)
+    clock.wake(1.5, due=1.0)
     assert clock.time(1.5) == 1.5
-    clock.woke(1000.0, due=2.0)
+    clock.wake(1000.0, due=2.0)
     assert clock.time(1000.0) == 2.0
 
 
@@ -222,7 +222,7 @@ class Queues:
     def close(self) -> None:
         pass
 
-    def remade(self) -> bool:
+    def has_reconnected(self) -> bool:
         return False
 
     def send(self, frames: Sequence[Any]) -> None:
@@ -270,19 +270,19 @@ def test_a_wait_is_told_once_a_second_and_at_the_end() -> None:
     talk = begun()
     said(talk)
     for tenth in range(1, 35):
-        talk.waits(0.1, tenth / 10)
+        talk.record_wait(0.1, tenth / 10)
     told = [message.waited_seconds for message in said(talk) if isinstance(message, Want)]
     assert 3 <= len(told) <= 4
     assert told == sorted(told)
-    talk.happens(Event.LEFT, 1010.0)
+    talk.handle_event(Event.LEFT, 1010.0)
     assert said(talk) == [Goodbye(pytest.approx(3.4))]
 
 
 def test_a_session_that_is_opened_again_begins_to_wait_anew() -> None:
     talk = begun()
-    talk.waits(5.0, 5.0)
-    talk.hear(FORGOTTEN, [], 6.0)
-    talk.hear(WELCOME, [], 6.0)
-    talk.waits(0.5, 6.5)
-    talk.happens(Event.LEFT, 7.0)
+    talk.record_wait(5.0, 5.0)
+    talk.handle_message(FORGOTTEN, [], 6.0)
+    talk.handle_message(WELCOME, [], 6.0)
+    talk.record_wait(0.5, 6.5)
+    talk.handle_event(Event.LEFT, 7.0)
     assert said(talk)[-1] == Goodbye(0.5)

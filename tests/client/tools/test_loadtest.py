@@ -123,7 +123,7 @@ def test_a_server_of_its_own_has_the_recipe_that_is_asked_for(server, monkeypatc
 def test_no_server_is_status_2(capsys):
     arguments = ["--connect", "tcp://127.0.0.1:9", "--timeout-seconds", "0.2"]
     assert loadtest.main(arguments) == 2
-    assert "nothing heard" in capsys.readouterr().err
+    assert "nothing received" in capsys.readouterr().err
 
 
 def test_changes_to_the_recipe_are_yaml():

@@ -12,11 +12,11 @@ from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8
-VERDICTS = [Verdict(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
+VERDICTS = [QuarantineEntry(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
 
 
 def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Admission:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from v2v_server.broker.blame import ALONE_AFTER, Cause, Loss, judged, runs_alone
+from v2v_server.broker.blame import ALONE_AFTER, Cause, Loss, judge, runs_alone
 from v2v_server.broker.leases import Request
 
 REQUEST = Request(b"consumer", 3, 7, candidate=2)
@@ -37,7 +37,7 @@ REFUSED = "a worker did something over it"
     ],
 )
 def test_verdicts(cause: Cause, deaths: int, verdict: Request | str) -> None:
-    assert judged(after(deaths), Loss(cause, "did something")) == verdict
+    assert judge(after(deaths), Loss(cause, "did something")) == verdict
 
 
 def test_every_cause_is_in_the_table() -> None:

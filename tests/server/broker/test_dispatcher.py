@@ -41,11 +41,11 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import Condemn, CutOff, GiveUp, ToConsumer
+from v2v_server.broker.actions import AddToQuarantine, CutOff, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import MOST_FAULTS
-from v2v_server.broker.quarantine import Quarantine, Verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
 from v2v_server.broker.terms import work_seconds
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
@@ -840,7 +840,9 @@ def test_a_slow_spec_gets_the_time_it_needs_and_speaks_against_nobody_elses() ->
     sequence = lone.schedule.candidate(0, 0, 0, 0)
     plain = work_seconds(lone.spec, ("voxels",), sequence.video)
     assert work_seconds(lone.spec, ("voxels", "flow"), sequence.video) > 10 * max(plain, 1.0)
-    verdict = Verdict(1, sequence.video.id, sequence.video.fingerprint, sequence.start_frame, "slow", "t", "one spec")
+    verdict = QuarantineEntry(
+        1, sequence.video.id, sequence.video.fingerprint, sequence.start_frame, "slow", "t", "one spec"
+    )
     quarantine = Quarantine([verdict, replace(verdict, snapshot=2)])
     of_video = (2, sequence.video.id, sequence.video.fingerprint, sequence.start_frame)
     assert quarantine.refusal(*of_video, "one spec") is not None
@@ -1037,7 +1039,7 @@ def test_any_conversation_leaves_it_serving(said: list[tuple[bool, bytes, list[A
     for by_worker, identity, frames, seconds in said:
         speak = at.dispatcher.from_worker if by_worker else at.dispatcher.from_consumer
         for instruction in speak(identity, [*frames, b"payload"] if by_worker else frames, at.now):
-            assert not isinstance(instruction, Condemn)
+            assert not isinstance(instruction, AddToQuarantine)
             assert instruction.identity in (b"c", b"d", b"w", b"")
         at.tick(seconds)
     for identity in (b"c", b"d", b"w", b""):

@@ -370,7 +370,7 @@ class WithSlots(Interleaving):
         slots = self.slots[identity]
         key = header.epoch * 1000 + header.index
         slot = slots._named.get(key)
-        answer = slots.answered(key, header.slot, in_message=in_message)
+        answer = slots.record_arrival(key, header.slot, in_message=in_message)
         assert answer is not Answer.NOWHERE
         self.abandoned += answer is Answer.ABANDONED
         if answer is Answer.THERE:

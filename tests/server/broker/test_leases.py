@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 
-from v2v_server.broker.leases import LeaseBook, Request, Withheld
+from v2v_server.broker.leases import LeaseBook, Request, Stall
 
 DEADLINE = 60.0
 A, B = b"worker a", b"worker b"
@@ -43,8 +43,8 @@ def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_susp
     numbers = [book.grant(numbered(index), A, 0.0) for index in range(3)]
     other = book.grant(numbered(9), B, 0.0)
     assert book.finished(numbers[0], A, 0.0) == numbered(0)
-    book.begun(numbers[1], A, 1.0)
-    book.begun(numbers[2], B, 1.0)
+    book.mark_begun(numbers[1], A, 1.0)
+    book.mark_begun(numbers[2], B, 1.0)
     assert (book.request(numbers[1], A), book.request(numbers[1], B), book.request(0, A)) == (numbered(1), None, None)
     assert book.lost(A) == [(numbered(1), True), (numbered(2), False)]
     assert book.lost(A) == []
@@ -59,15 +59,15 @@ def test_a_deadline_scales_with_the_work_also_of_what_is_in_front() -> None:
     assert book.limit_seconds(A) == DEADLINE + 100.0
     assert overdue_workers(book, DEADLINE + 100.0) == []
     assert overdue_workers(book, DEADLINE + 100.5) == [A]
-    book.begun(long, A, 10.0)
+    book.mark_begun(long, A, 10.0)
     assert overdue_workers(book, DEADLINE + 110.0) == []
 
 
 def test_time_stopped_is_not_time_worked() -> None:
     book = LeaseBook(DEADLINE)
-    book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    book.mark_begun(book.grant(REQUEST, A, 0.0), A, 0.0)
     book.grant(numbered(1), B, 0.0)
-    book.put_off(A, Withheld(stopped_seconds=DEADLINE / 2))
+    book.extend_deadlines(A, Stall(stopped_seconds=DEADLINE / 2))
     assert overdue_workers(book, 1.5 * DEADLINE) == [B]
     assert overdue_workers(book, 1.5 * DEADLINE + 0.5) == [A, B]
 
@@ -77,30 +77,30 @@ def where_others_are_quick() -> LeaseBook:
     book = LeaseBook(DEADLINE)
     for index in range(20):
         number = book.grant(numbered(index), B, 0.0)
-        book.begun(number, B, 0.0)
+        book.mark_begun(number, B, 0.0)
         book.finished(number, B, 0.1)
-    book.begun(book.grant(REQUEST, A, 0.0), A, 0.0)
+    book.mark_begun(book.grant(REQUEST, A, 0.0), A, 0.0)
     return book
 
 
 def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_and_slow_before() -> None:
     book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
-        book.put_off(A, Withheld(queued_seconds=0.75))
+        book.extend_deadlines(A, Stall(queued_seconds=0.75))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 4 * DEADLINE)
         assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
     book = LeaseBook(DEADLINE)
     first, second = (book.grant(numbered(index), A, 0.0) for index in range(2))
-    book.begun(first, A, 0.0)
-    book.put_off(A, Withheld(queued_seconds=100.0))
-    book.begun(second, A, 50.0)  # what it waited over the first is no time of the second
+    book.mark_begun(first, A, 0.0)
+    book.extend_deadlines(A, Stall(queued_seconds=100.0))
+    book.mark_begun(second, A, 50.0)  # what it waited over the first is no time of the second
     assert overdue_workers(book, 50.5 + DEADLINE) == [A]
 
 
 def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_before() -> None:
     book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
-        book.put_off(A, Withheld(stopped_seconds=1.0))
+        book.extend_deadlines(A, Stall(stopped_seconds=1.0))
         assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 2 * DEADLINE)
         assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
 
@@ -108,7 +108,7 @@ def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_be
 def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_it() -> None:
     book = LeaseBook(DEADLINE)
     numbers = [book.grant(numbered(index), A, 0.0) for index in range(3)]
-    book.begun(numbers[0], A, 1.0)
+    book.mark_begun(numbers[0], A, 1.0)
     assert book.abandoned(b"consumer") == 0
     book.forget_session(b"consumer")
     assert book.abandoned(b"consumer") == 3
@@ -127,7 +127,7 @@ def test_a_late_answer_finds_nothing_even_when_the_task_went_back_to_the_same_wo
     book.lost(A)
     second = book.grant(REQUEST, A, 1.0)
     assert second != first
-    book.begun(first, A, 2.0)
+    book.mark_begun(first, A, 2.0)
     assert book.finished(first, A, 0.0) is None
     assert book.lost(A) == [(REQUEST, False)]
 
@@ -137,10 +137,10 @@ def test_the_deadline_counts_from_the_grant_and_from_each_beginning() -> None:
     first, second = book.grant(numbered(0), A, 0.0), book.grant(numbered(1), A, 0.0)
     assert overdue_workers(book, DEADLINE) == []
     assert overdue_workers(book, DEADLINE + 0.5) == [A]
-    book.begun(first, A, 50.0)
+    book.mark_begun(first, A, 50.0)
     assert overdue_workers(book, 50.0 + DEADLINE) == []
     book.finished(first, A, 0.0)
-    book.begun(second, A, 100.0)
+    book.mark_begun(second, A, 100.0)
     assert overdue_workers(book, 100.0 + DEADLINE) == []
     assert overdue_workers(book, 100.5 + DEADLINE) == [A]
     assert book.held_by(A) == 1
@@ -153,7 +153,7 @@ def test_a_forgotten_consumer_gets_no_answer_but_its_leases_still_fill_the_worke
     book.forget_session(b"gone")
     assert book.held_by(A) == 2
     assert overdue_workers(book, DEADLINE + 1) == [A]
-    book.begun(gone, A, 50.0)
+    book.mark_begun(gone, A, 50.0)
     assert overdue_workers(book, 50.0 + DEADLINE) == []
     assert book.finished(gone, A, 0.0) is None
     assert book.held_by(A) == 1
@@ -164,7 +164,7 @@ def test_a_forgotten_consumer_gets_no_answer_but_its_leases_still_fill_the_worke
 def test_a_worker_lost_over_forgotten_leases_returns_nothing() -> None:
     book = LeaseBook(DEADLINE)
     number = book.grant(numbered(0, b"gone"), A, 0.0)
-    book.begun(number, A, 0.0)
+    book.mark_begun(number, A, 0.0)
     book.forget_session(b"gone")
     assert book.lost(A) == []
     assert len(book) == 0
@@ -176,7 +176,7 @@ def test_a_lease_begins_once() -> None:
     book = LeaseBook(DEADLINE)
     number = book.grant(REQUEST, A, 0.0)
     for second in range(2 * int(DEADLINE)):
-        book.begun(number, A, float(second))
+        book.mark_begun(number, A, float(second))
     assert overdue_workers(book, DEADLINE) == []
     assert overdue_workers(book, DEADLINE + 0.5) == [A]
 
@@ -203,7 +203,7 @@ def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
 def test_losing_one_of_two_returns_nothing_and_losing_both_returns_it_once(first: bytes) -> None:
     book = LeaseBook(DEADLINE)
     for worker in (A, B):
-        book.begun(book.grant(REQUEST, worker, 0.0), worker, 0.0)
+        book.mark_begun(book.grant(REQUEST, worker, 0.0), worker, 0.0)
     assert book.lost(first) == []
     assert book.lost(B if first == A else A) == [(REQUEST, True)]
     assert len(book) == 0
@@ -212,7 +212,7 @@ def test_losing_one_of_two_returns_nothing_and_losing_both_returns_it_once(first
 def test_a_retired_twin_returns_nothing_when_its_worker_is_lost() -> None:
     book = LeaseBook(DEADLINE)
     number = book.grant(REQUEST, A, 0.0)
-    book.begun(book.grant(REQUEST, B, 0.0), B, 0.0)
+    book.mark_begun(book.grant(REQUEST, B, 0.0), B, 0.0)
     assert book.finished(number, A, 1.0) is REQUEST
     assert book.lost(B) == []
     assert len(book) == 0
@@ -236,7 +236,7 @@ def practised(seconds: float, samples: int = 8, session: bytes = b"consumer") ->
     book = LeaseBook(DEADLINE)
     for index in range(samples):
         number = book.grant(numbered(1000 + index, session), B, 0.0)
-        book.begun(number, B, 0.0)
+        book.mark_begun(number, B, 0.0)
         assert book.finished(number, B, seconds) is not None
     return book
 
@@ -253,7 +253,7 @@ def practised(seconds: float, samples: int = 8, session: bytes = b"consumer") ->
 )
 def test_slow_is_three_times_the_median_and_a_second(seconds: float, samples: int, limit: float | None) -> None:
     book = practised(seconds, samples)
-    book.begun(book.grant(REQUEST, A, 100.0), A, 100.0)
+    book.mark_begun(book.grant(REQUEST, A, 100.0), A, 100.0)
     if limit is None:
         assert book.slow(100.0 + DEADLINE) == []
     else:
@@ -265,9 +265,9 @@ def test_the_median_is_of_the_last_samples_and_of_the_consumer_itself() -> None:
     book = practised(1.0, 8)
     for _ in range(64):
         number = book.grant(numbered(1), B, 0.0)
-        book.begun(number, B, 0.0)
+        book.mark_begun(number, B, 0.0)
         book.finished(number, B, 10.0)
-    book.begun(book.grant(REQUEST, A, 100.0), A, 100.0)
+    book.mark_begun(book.grant(REQUEST, A, 100.0), A, 100.0)
     assert book.slow(130.0) == []
     assert book.slow(130.5) == [(REQUEST, A)]
     book.grant(numbered(0, b"a consumer of one sample"), b"worker c", 100.0)
@@ -293,10 +293,10 @@ def test_a_task_queued_behind_one_that_hangs_is_slow() -> None:
     hanging = book.grant(numbered(0, b"other"), A, 0.0)
     between = book.grant(numbered(1, b"other"), A, 0.0)
     book.grant(numbered(2), A, 0.0)
-    book.begun(hanging, A, 0.0)
+    book.mark_begun(hanging, A, 0.0)
     assert book.slow(3.5) == [(numbered(2), A)]
     book.finished(hanging, A, 3.5)
-    book.begun(between, A, 3.5)
+    book.mark_begun(between, A, 3.5)
     assert book.slow(6.5) == []
     assert book.slow(6.6) == [(numbered(2), A)]
 
@@ -363,7 +363,7 @@ class LeaseModel(RuleBasedStateMachine):
 
     @rule(number=numbers, worker=workers)
     def begun(self, number: int, worker: bytes) -> None:
-        self.book.begun(number, worker, self.now)
+        self.book.mark_begun(number, worker, self.now)
         place = self.out.get(number)
         if place is not None and place.worker == worker and not place.begun:
             place.begun = True

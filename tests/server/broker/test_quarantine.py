@@ -22,21 +22,21 @@ from v2v_server.broker import quarantine as quarantine_module
 from v2v_server.broker.quarantine import (
     VERDICTS_PER_VIDEO,
     Quarantine,
-    Verdict,
+    QuarantineEntry,
     clearing,
     quarantine_path,
     read_quarantine,
-    write_verdict,
+    write_entry,
 )
 
 TIME = "2024-02-29T12:00:00+00:00"
 
 
-def verdict(path: str = "v.mp4", frame: int = 0, fingerprint: str = "f", reason: str = "crash") -> Verdict:
-    return Verdict(0, path, fingerprint, frame, reason, TIME)
+def verdict(path: str = "v.mp4", frame: int = 0, fingerprint: str = "f", reason: str = "crash") -> QuarantineEntry:
+    return QuarantineEntry(0, path, fingerprint, frame, reason, TIME)
 
 
-def numbered(*verdicts: Verdict) -> list[Verdict]:
+def numbered(*verdicts: QuarantineEntry) -> list[QuarantineEntry]:
     return [replace(each, snapshot=number) for number, each in enumerate(verdicts, 1)]
 
 
@@ -46,11 +46,11 @@ def numbered(*verdicts: Verdict) -> list[Verdict]:
 def test_snapshot_0_is_empty_and_there_is_no_other_at_first() -> None:
     quarantine = Quarantine()
     assert quarantine.latest == 0
-    assert quarantine.verdicts(0) == []
+    assert quarantine.entries(0) == []
     assert quarantine.refusal(0, "v.mp4", "f", 0) is None
     for snapshot in (-1, 1):
         with pytest.raises(CorpusError, match=rf"snapshot {snapshot}: there are 0 \.\. 0"):
-            quarantine.verdicts(snapshot)
+            quarantine.entries(snapshot)
         with pytest.raises(CorpusError, match=rf"snapshot {snapshot}: there are 0 \.\. 0"):
             quarantine.refusal(snapshot, "v.mp4", "f", 0)
 
@@ -82,7 +82,7 @@ def test_a_clearing_begins_anew_and_leaves_the_old_snapshots() -> None:
     assert [quarantine.refusal(n, "v.mp4", "f", 5) is not None for n in range(4)] == [False, True, False, False]
     # Verdicts of before the clearing do not make up two with those after it.
     assert [quarantine.refusal(n, "v.mp4", "f", 10) is not None for n in range(4)] == [False, False, False, True]
-    assert [len(quarantine.verdicts(n)) for n in range(4)] == [0, 1, 0, 1]
+    assert [len(quarantine.entries(n)) for n in range(4)] == [0, 1, 0, 1]
 
 
 @pytest.mark.parametrize("number", [0, 1, 3, -1])
@@ -101,18 +101,18 @@ _verdicts = st.lists(
 
 @given(_verdicts)
 @settings(max_examples=150, deadline=None)
-def test_every_snapshot_against_its_definition(verdicts: list[Verdict]) -> None:
+def test_every_snapshot_against_its_definition(verdicts: list[QuarantineEntry]) -> None:
     """Snapshot n + 1 is snapshot n and one verdict more, or nothing."""
     quarantine = Quarantine()
-    held: list[Verdict] = []
-    snapshots: list[list[Verdict]] = [[]]
+    held: list[QuarantineEntry] = []
+    snapshots: list[list[QuarantineEntry]] = [[]]
     for each in numbered(*verdicts):
         quarantine.extend([each])
         held = [*held, each] if each.path else []
         snapshots.append(held)
     assert quarantine.latest == len(verdicts)
     for number, expected in enumerate(snapshots):
-        assert quarantine.verdicts(number) == expected
+        assert quarantine.entries(number) == expected
         counts = Counter((each.path, each.fingerprint) for each in expected)
         for path in "vw":
             for fingerprint in "fg":
@@ -131,11 +131,11 @@ def test_lines_read_well() -> None:
 # --- the file ---------------------------------------------------------------------------------------------------------
 
 
-def write(file: Path, *verdicts: Verdict) -> Quarantine:
+def write(file: Path, *verdicts: QuarantineEntry) -> Quarantine:
     """A process of its own that reads, and writes these."""
     quarantine = read_quarantine(file)
     for each in verdicts:
-        quarantine.extend(write_verdict(file, each, quarantine))
+        quarantine.extend(write_entry(file, each, quarantine))
     return quarantine
 
 
@@ -159,7 +159,7 @@ def test_no_file_is_an_empty_quarantine(tmp_path: Path) -> None:
     )
 )
 @settings(max_examples=40, deadline=None)
-def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, verdicts: list[Verdict]) -> None:
+def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, verdicts: list[QuarantineEntry]) -> None:
     file = tmp_path_factory.mktemp("quarantine") / "new folder" / "q.jsonl"
     assert write(file, *verdicts).lines == tuple(numbered(*verdicts)) == read_quarantine(file).lines
     if verdicts:
@@ -203,10 +203,10 @@ def test_any_other_damaged_line_is_named_and_left_alone(tmp_path: Path, line: by
     known = write(file, verdict())
     damaged = file.read_bytes() + line + b"\n"
     file.write_bytes(damaged)
-    with pytest.raises(CorpusError, match=r"q\.jsonl, line 2 is damaged .*; mend or delete it"):
+    with pytest.raises(CorpusError, match=r"q\.jsonl, line 2 is damaged .*; correct or delete the line"):
         read_quarantine(file)
     with pytest.raises(CorpusError, match=r"line 2 is damaged"):
-        write_verdict(file, verdict(), known)
+        write_entry(file, verdict(), known)
     assert file.read_bytes() == damaged
 
 
@@ -214,10 +214,10 @@ def test_what_is_no_file_can_neither_be_read_nor_written(tmp_path: Path) -> None
     with pytest.raises(CorpusError, match="cannot be read"):
         read_quarantine(tmp_path)
     with pytest.raises(OSError, match="directory"):
-        write_verdict(tmp_path, verdict(), Quarantine())
+        write_entry(tmp_path, verdict(), Quarantine())
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="exists"):
-        write_verdict(tmp_path / "file" / "q.jsonl", verdict(), Quarantine())
+        write_entry(tmp_path / "file" / "q.jsonl", verdict(), Quarantine())
 
 
 def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
@@ -228,13 +228,13 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
     program = f"""
 import resource, signal
 from pathlib import Path
-from v2v_server.broker.quarantine import Verdict, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import QuarantineEntry, read_quarantine, write_entry
 file = Path({str(file)!r})
 known = read_quarantine(file)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before) + 20}, {len(before) + 20}))
 try:
-    write_verdict(file, Verdict(0, "w.mp4", "f", 0, "crash", "t"), known)
+    write_entry(file, QuarantineEntry(0, "w.mp4", "f", 0, "crash", "t"), known)
 except OSError as error:
     print(error.errno)
 """
@@ -250,13 +250,13 @@ except OSError as error:
 def test_two_servers_and_a_clearing_share_one_numbering(tmp_path: Path) -> None:
     file = tmp_path / "q.jsonl"
     here, there = read_quarantine(file), read_quarantine(file)
-    here.extend(write_verdict(file, verdict("a.mp4"), here))
+    here.extend(write_entry(file, verdict("a.mp4"), here))
     write(file, clearing(TIME))
-    written = write_verdict(file, verdict("b.mp4"), there)
+    written = write_entry(file, verdict("b.mp4"), there)
     # Whoever writes learns of everything that was written since it last looked, its own line last.
     assert written == numbered(verdict("a.mp4"), clearing(TIME), verdict("b.mp4"))
     there.extend(written)
-    here.extend(write_verdict(file, verdict("c.mp4"), here))
+    here.extend(write_entry(file, verdict("c.mp4"), here))
     assert here.lines[:3] == there.lines
     assert here.lines == read_quarantine(file).lines
     assert [each.snapshot for each in here.lines] == [1, 2, 3, 4]
@@ -270,7 +270,7 @@ def test_a_file_that_was_replaced_gives_no_number_twice(tmp_path: Path, keep: in
     write(file, *[verdict("a.mp4")][:keep], verdict("other.mp4"))
     before = file.read_bytes()
     with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, and not the 2 known here"):
-        write_verdict(file, verdict("c.mp4"), known)
+        write_entry(file, verdict("c.mp4"), known)
     assert file.read_bytes() == before
 
 
@@ -300,7 +300,7 @@ def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
         "import sys\nfrom pathlib import Path\nfrom v2v_server.broker.quarantine import *\n"
         "file, name = Path(sys.argv[1]), sys.argv[2]\nknown = read_quarantine(file)\n"
         "for frame in range(20):\n"
-        "    known.extend(write_verdict(file, Verdict(0, name, 'f', frame, 'crash', 't'), known))\n"
+        "    known.extend(write_entry(file, QuarantineEntry(0, name, 'f', frame, 'crash', 't'), known))\n"
     )
     writers = [subprocess.Popen([sys.executable, "-c", program, str(file), name], env=os.environ) for name in "ab"]
     assert [writer.wait(60.0) for writer in writers] == [0, 0]
@@ -318,6 +318,6 @@ def test_a_lock_that_somebody_keeps_stops_nobody(tmp_path: Path, monkeypatch: py
     with file.open("rb") as reader:
         fcntl.flock(reader, fcntl.LOCK_SH)
         with pytest.raises(OSError, match="another process has locked it"):
-            write_verdict(file, verdict(), Quarantine())
+            write_entry(file, verdict(), Quarantine())
     assert file.read_bytes() == b""
-    assert len(write_verdict(file, verdict(), Quarantine())) == 1
+    assert len(write_entry(file, verdict(), Quarantine())) == 1

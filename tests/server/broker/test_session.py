@@ -71,7 +71,7 @@ def test_what_is_waited_for_already_is_not_made_twice() -> None:
     assert [request.index for request in a.waiting] == [2, 3]
     sessions.want(a, 1, [1])
     assert len(a.unanswered) == 4
-    assert sessions.answered(taken, 0.0)
+    assert sessions.mark_answered(taken, 0.0)
     sessions.want(a, 0, [1])
     assert [(request.epoch, request.index) for request in a.waiting] == [(0, 2), (0, 3), (1, 1), (0, 1)]
 
@@ -109,8 +109,8 @@ def test_credit_is_free_again_after_the_answer_and_not_before() -> None:
     with pytest.raises(LimitExceeded):
         sessions.want(a, 0, [1])
     assert take(sessions) == request
-    assert sessions.answered(request, 0.1)
-    assert not sessions.answered(request, 0.1)
+    assert sessions.mark_answered(request, 0.1)
+    assert not sessions.mark_answered(request, 0.1)
     sessions.want(a, 0, [1])
 
 
@@ -134,13 +134,13 @@ def test_nothing_comes_back_to_a_session_that_is_gone_or_was_opened_again() -> N
     sessions.forget(b"a")
     sessions.forget(b"a")
     assert sessions.get(b"a") is None
-    assert not sessions.answered(request, 1.0)
+    assert not sessions.mark_answered(request, 1.0)
     sessions.put_back(request)
     assert sessions.next_request() is None
     new = session()
     sessions.open(new)
     sessions.put_back(request)
-    assert not sessions.answered(request, 1.0)
+    assert not sessions.mark_answered(request, 1.0)
     assert sessions.next_request() is None
     assert len(sessions) == 1
 
@@ -156,7 +156,7 @@ def test_the_silent_are_idle() -> None:
     sessions = opened(a, b)
     assert sessions.idle(599.5) == []
     assert sessions.idle(600.0) == [b"a"]
-    b.liveness.heard(0.0)
+    b.liveness.mark_heard(0.0)
     assert sorted(sessions.idle(601.0)) == [b"a", b"b"]
 
 
@@ -184,7 +184,7 @@ def serve(
         while len(in_work) < workers:
             in_work.append(take(sessions))
         request = in_work.pop(0)
-        assert sessions.answered(request, costs[request.session])
+        assert sessions.mark_answered(request, costs[request.session])
         got[request.session] += 1
     return got
 
@@ -232,7 +232,7 @@ def test_a_consumer_in_debt_that_waits_alone_is_served_at_once() -> None:
         request = take(sessions)
         assert request.session == b"a"
         sessions.want(a, 1, [request.index])
-        assert sessions.answered(request, cost)
+        assert sessions.mark_answered(request, cost)
 
 
 def test_the_largest_debt_that_is_accepted_does_not_stall() -> None:
@@ -240,7 +240,7 @@ def test_the_largest_debt_that_is_accepted_does_not_stall() -> None:
     sessions = opened(a, b)
     sessions.want(a, 0, [0, 1, 2, 3])
     for _ in range(3):
-        assert sessions.answered(take(sessions), 86_400.0)
+        assert sessions.mark_answered(take(sessions), 86_400.0)
     assert take(sessions).index == 3
 
 
@@ -271,7 +271,7 @@ def test_nothing_is_saved_up_while_idle() -> None:
     sessions = opened(a, b)
     a.balance_seconds = 1000.0
     sessions.want(a, 0, [0])
-    assert sessions.answered(take(sessions), 0.1)
+    assert sessions.mark_answered(take(sessions), 0.1)
     assert a.balance_seconds == 0.0
 
 
@@ -333,8 +333,8 @@ class SessionModel(RuleBasedStateMachine):
         request, owner = self.in_work.pop(which % len(self.in_work))
         alive = self.sessions.get(request.session) is owner
         if alive:
-            assert self.sessions.answered(request, cost)
-            assert not self.sessions.answered(request, cost)
+            assert self.sessions.mark_answered(request, cost)
+            assert not self.sessions.mark_answered(request, cost)
 
     @precondition(lambda self: self.in_work)
     @rule(which=st.integers(0, 100))

@@ -9,7 +9,7 @@ from v2v_protocol.errors import ProtocolError
 from v2v_protocol.sample import Form
 from v2v_protocol.wire import encode_sample
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import inspected
+from v2v_server.broker.terms import check_result
 
 SIZE = 1000
 FORM = Form.of({"voxels": ("int8", (SIZE,))})
@@ -31,7 +31,7 @@ def test_a_packed_array_is_bounded_by_what_incompressible_bytes_take(length: int
     )
     request = Request(b"consumer", 0, 0)
     if passes:
-        assert inspected(payload, request, FORM).packed
+        assert check_result(payload, request, FORM).packed
     else:
         with pytest.raises(ProtocolError, match="sizes"):
-            inspected(payload, request, FORM)
+            check_result(payload, request, FORM)

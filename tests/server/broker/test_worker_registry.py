@@ -56,7 +56,7 @@ def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
     table.workers.remove(b"a")
     table.workers.remove(b"a")
     assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)
-    assert not table.workers.heard(b"a", 0.0)
+    assert not table.workers.mark_heard(b"a", 0.0)
 
 
 @given(
@@ -253,13 +253,13 @@ def test_leases_of_somebody_who_never_said_hello_are_nobodys_fault() -> None:
 def test_the_silent_have_vanished_unless_they_are_at_work() -> None:
     table = Table(a=1, b=1, c=1)
     number = table.load("b")
-    assert table.workers.heard(b"c", 1.0)
+    assert table.workers.mark_heard(b"c", 1.0)
     assert table.workers.vanished(SILENCE_SECONDS - 0.1) == []
     assert table.workers.vanished(SILENCE_SECONDS + 0.5) == [b"a"]
     assert table.workers.vanished(SILENCE_SECONDS + 0.6) == []
     assert table.workers.vanished(SILENCE_SECONDS + 1.5) == [b"c"]
     assert table.workers.for_lone_request() is None
     table.book.finished(number, b"b", 40.0)
-    assert table.workers.heard(b"b", 40.0)
+    assert table.workers.mark_heard(b"b", 40.0)
     assert table.workers.vanished(39.9 + SILENCE_SECONDS) == []
     assert table.workers.vanished(40.5 + SILENCE_SECONDS) == [b"b"]

@@ -225,12 +225,12 @@ def test_a_video_that_is_doubted_is_probed_at_the_next_start_and_served_until_th
     corpus: Path, opener: Opener
 ) -> None:
     first = opener(corpus)
-    first.doubt("a.mp4")
+    first.mark_stale("a.mp4")
     assert len(first.frame_index("a.mp4")) == 30
-    first.wait_no_more()
+    first.fail_fast()
     with closing(sqlite3.connect(next(opener.cache.iterdir()), isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
-        first.doubt("sub/b.mp4")  # another process writes: neither waited for nor an error
+        first.mark_stale("sub/b.mp4")  # another process writes: neither waited for nor an error
         other.execute("ROLLBACK")
     assert opener(corpus).digest == first.digest
     opener(corpus)
@@ -560,7 +560,7 @@ def test_an_index_that_another_process_holds_is_said_at_once(
     corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     catalogue = opener(corpus)
-    catalogue.wait_no_more()
+    catalogue.fail_fast()
     assert catalogue._store._database.execute("PRAGMA busy_timeout").fetchone() == (0,)
     name = ids(catalogue)[0]
     (file,) = (file for _, _, file in catalogue._store._database.execute("PRAGMA database_list"))

@@ -235,7 +235,7 @@ def test_a_mark_names_a_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         other.put([IndexRow("a", 1)])
         first = mark(one)
         assert mark(other) == first != ""
-        other.doubt("a")
+        other.mark_stale("a")
         assert mark(one) != first
         assert mark(other) == mark(one)
     with closing(Store(None)) as memory:

@@ -14,7 +14,7 @@ from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoCha
 from v2v_server.cloud import bucket as bucket_module
 from v2v_server.cloud.bucket import AccessDenied, Bucket, ObjectGone, StoreFault, is_url
 from v2v_server.cloud.copies import Copies, copies_of
-from v2v_server.store.used import PARTIAL, counted, used_bytes
+from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
@@ -44,7 +44,7 @@ _MADE: list[Copies] = []
 def _nothing_held() -> Iterator[None]:
     yield
     while _MADE:
-        _MADE.pop().let_go()
+        _MADE.pop().release()
 
 
 def copies(store: Path, most: int = 10 * SIZE) -> Copies:
@@ -57,7 +57,7 @@ def copies(store: Path, most: int = 10 * SIZE) -> Copies:
 def files(made: Copies) -> set[bytes]:
     """The first byte of each copy."""
     found = list(made.folder.glob("??/*"))
-    assert sum(path.stat().st_size for path in found) == used_bytes(made.folder) == counted(made.folder)
+    assert sum(path.stat().st_size for path in found) == used_bytes(made.folder) == count_bytes(made.folder)
     return {path.read_bytes()[:1] for path in found}
 
 
@@ -84,12 +84,12 @@ def test_an_address_is_told_from_a_path(source: str, expected: bool) -> None:
 def test_a_video_is_fetched_once(store: Path) -> None:
     made, mark = copies(store), fingerprint(store / "a.mp4")
     assert not made.has("a.mp4", mark)
-    with made.lent("a.mp4", f"{mark}-content") as path:
+    with made.open_local("a.mp4", f"{mark}-content") as path:
         assert path.read_bytes() == (store / "a.mp4").read_bytes()
         assert path.suffix == ".mp4"
     (store / "a.mp4").unlink()
     assert made.has("a.mp4", mark)
-    with made.lent("a.mp4", mark) as path:
+    with made.open_local("a.mp4", mark) as path:
         assert path.stat().st_size == SIZE
     assert [each.name for each in (made.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
@@ -166,11 +166,11 @@ def test_what_was_not_read_for_longest_goes(store: Path) -> None:
     made = copies(store, most=2 * SIZE)
     marks = {name: fingerprint(store / name) for name in ("a.mp4", "b.mp4", "deep/c.mp4")}
     for name in ("a.mp4", "b.mp4"):
-        with made.lent(name, marks[name]):
+        with made.open_local(name, marks[name]):
             pass
     assert files(made) == {b"\0", b"\1"}
     assert made.has("a.mp4", marks["a.mp4"])  # read again: b is the older one now
-    made.let_go()
+    made.release()
     made.fetch("deep/c.mp4", marks["deep/c.mp4"])
     assert b"\1" not in files(made)
     assert b"\2" in files(made)
@@ -179,7 +179,7 @@ def test_what_was_not_read_for_longest_goes(store: Path) -> None:
 def test_what_is_being_read_stays(store: Path) -> None:
     made, other = copies(store, most=SIZE), copies(store, most=SIZE)
     mark = fingerprint(store / "a.mp4")
-    with made.lent("a.mp4", mark) as path:
+    with made.open_local("a.mp4", mark) as path:
         with pytest.raises(VideoUnreadable, match="raise --copies-gib"):
             other.fetch("b.mp4", fingerprint(store / "b.mp4"))
         assert path.exists()
@@ -192,9 +192,9 @@ def _read(made: Copies, marks: dict[str, str], turns: int) -> set[tuple[str, byt
     got = set()
     for _ in range(turns):
         for name, mark in marks.items():
-            with made.lent(name, mark) as path:
+            with made.open_local(name, mark) as path:
                 got.add((name, path.read_bytes()))
-    made.let_go()
+    made.release()
     return got
 
 

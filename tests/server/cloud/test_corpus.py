@@ -85,7 +85,7 @@ def test_what_is_new_or_changed_is_fetched(store: Path, fetched: list[str]) -> N
         assert [video.id for video in later.videos] == ["a.mp4", "c.mkv"]
         assert sorted(fetched) == ["a.mp4", "c.mkv"]
         later.check("a.mp4", later.videos[0].fingerprint)
-        later.doubt("a.mp4")
+        later.mark_stale("a.mp4")
         with pytest.raises(VideoChanged):  # that it is in doubt must not hide that it was found wanting
             later.check("a.mp4", later.videos[0].fingerprint)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2v_server.broker.quarantine import Quarantine, Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.commands.quarantine import main
 
 TIME = "2024-02-29T12:00:00+00:00"
@@ -28,8 +28,8 @@ def fill(corpus: Path, *frames: int) -> Path:
     file = quarantine_path(corpus.resolve(), corpus.parent / "cache")
     quarantine = read_quarantine(file)
     for frame in frames:
-        verdict = Verdict(0, "a/v.mp4", "f", frame, "a worker was ended by SIGSEGV over it", TIME)
-        quarantine.extend(write_verdict(file, verdict, quarantine))
+        verdict = QuarantineEntry(0, "a/v.mp4", "f", frame, "a worker was ended by SIGSEGV over it", TIME)
+        quarantine.extend(write_entry(file, verdict, quarantine))
     return file
 
 
@@ -63,14 +63,14 @@ def test_clearing_begins_a_snapshot_only_when_there_is_something_to_clear(
         run(corpus, "--clear")
         assert capsys.readouterr().out.splitlines()[-1].startswith("snapshot 3 holds 0 verdicts")
     quarantine = read_quarantine(file)
-    assert [len(quarantine.verdicts(number)) for number in range(4)] == [0, 1, 2, 0]
+    assert [len(quarantine.entries(number)) for number in range(4)] == [0, 1, 2, 0]
 
 
 def test_a_server_that_runs_meanwhile_goes_on_with_the_numbers(corpus: Path) -> None:
     file = fill(corpus, 40)
     server = read_quarantine(file)
     run(corpus, "--clear")
-    server.extend(write_verdict(file, Verdict(0, "b.mp4", "f", 0, "crash", "t"), server))
+    server.extend(write_entry(file, QuarantineEntry(0, "b.mp4", "f", 0, "crash", "t"), server))
     assert server.lines == read_quarantine(file).lines
     assert [(line.snapshot, line.path) for line in server.lines] == [(1, "a/v.mp4"), (2, ""), (3, "b.mp4")]
 
@@ -84,7 +84,7 @@ def test_json_has_a_record_a_line(corpus: Path, tmp_path: Path) -> None:
         (2, "", False),
     ]
     fields = [{key: value for key, value in record.items() if key != "in_force"} for record in records]
-    assert Quarantine(Verdict(**each) for each in fields).lines == read_quarantine(file).lines
+    assert Quarantine(QuarantineEntry(**each) for each in fields).lines == read_quarantine(file).lines
 
 
 @pytest.mark.parametrize("source", ["folder", "video", "list"])

@@ -17,7 +17,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import Show, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
-from v2v_server.broker.quarantine import Verdict
+from v2v_server.broker.quarantine import QuarantineEntry
 from v2v_server.console.state import STATE_VERSION
 from v2v_server.console.survey import MOST_SHOWN
 from v2v_server.console.watch import ANSWER_SECONDS, MOST_LOOKERS
@@ -81,7 +81,7 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
     at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
     at.now = 31.0
     for name in (b"idle", b"resting"):
-        at.dispatcher.registry.heard(name, at.now)
+        at.dispatcher.registry.mark_heard(name, at.now)
     at.dispatcher.registry.vanished(at.now)
     states = {worker.name: worker for worker in watched.state().workers}
     assert {name: worker.state for name, worker in states.items()} == {
@@ -165,7 +165,7 @@ def test_refusals_and_verdicts_are_told_newest_first() -> None:
     at.fail(reason="cut short", frame=7)
     at.begin()
     at.fail(reason="<b>gone</b>", frame=None)
-    at.quarantine.extend([Verdict(1, "v3.mp4", "f", 12, "crash", WALL)])
+    at.quarantine.extend([QuarantineEntry(1, "v3.mp4", "f", 12, "crash", WALL)])
     state = watched.state()
     assert [(each.reason, each.frame, each.kind, each.time) for each in state.refusals] == [
         ("<b>gone</b>", None, "failed", WALL), ("cut short", 7, "failed", WALL),
@@ -244,7 +244,9 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
     at = peers()
     for _ in range(20):
         at.dispatcher.candidates.latest.append((WALL, Refusal("\x01" * 4000, None, "\x02" * 4000)))
-    at.quarantine.extend([Verdict(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)])
+    at.quarantine.extend(
+        [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
+    )
     state = service(at, cache="/not-utf8-\udcff").state()
     encoded = state.to_json()
     assert len(encoded) < 1 << 18

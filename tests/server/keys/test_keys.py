@@ -26,7 +26,7 @@ from v2v_server.broker.actions import ToConsumer
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main
 from v2v_server.keys.folder import KeyFolder
-from v2v_server.worker.handover import pack
+from v2v_server.worker.output_buffer import pack
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a door")
 
@@ -68,7 +68,7 @@ def refusal(link: Link) -> str:
     while time.monotonic() < ends:
         try:
             assert link.receive(0.1) is None
-            link.remade()
+            link.has_reconnected()
         except KeyRefused as error:
             return str(error)
     raise AssertionError("it was not told")
@@ -144,7 +144,7 @@ def test_a_revoked_key_loses_its_open_connection(
     assert len(arrivals(sockets, 1.5)) == 1  # the other's
     said = refusal(link)
     assert "refuses consumer key 'gpu1': it was revoked" in said
-    assert not other.remade()
+    assert not other.has_reconnected()
 
 
 def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(

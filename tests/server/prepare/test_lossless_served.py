@@ -24,7 +24,7 @@ from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import draft_of
+from v2v_server.worker.produce import plan_sample
 
 ROWS = "top:0.9"
 SMALL = Recipe(voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32)
@@ -160,8 +160,8 @@ def test_another_video_under_the_name_is_refused(pair: tuple[Path, Path], tmp_pa
         lease: Lease = next(leases)
         (other,) = [name for name in ("a.mp4", "b.webm") if name != lease.video][:1]
         shutil.copy(pair[1] / other, store / lease.video)
-        assert draft_of(lease, lease.indices[0]).cut.count
-        with pytest.raises(VideoChanged, match="was made of another file"):
+        assert plan_sample(lease, lease.indices[0]).cut.count
+        with pytest.raises(VideoChanged, match="was made from another file"):
             whole_sample(lease, folder)
         (store / lease.video).unlink()
         with pytest.raises(VideoError, match="cannot be read"):

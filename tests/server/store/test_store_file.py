@@ -171,14 +171,14 @@ def test_what_is_not_kept_is_refused(sound: tuple[Path, npt.NDArray[np.uint8]]) 
 
 
 def test_a_file_of_another_source_is_refused(sound: tuple[Path, npt.NDArray[np.uint8]], tmp_path: Path) -> None:
-    with pytest.raises(VideoChanged, match="was made of another file: f instead of g"):
+    with pytest.raises(VideoChanged, match="was made from another file: f instead of g"):
         StoreFile(sound[0], "g")
     with pytest.raises(VideoUnreadable, match="No such file"):
         StoreFile(tmp_path / "none", "f")
     (tmp_path / "video").write_bytes(b"\0\0\0\x1cftypisom" * 5)
     assert not is_store_file(tmp_path / "video")
     assert not is_store_file(tmp_path / "none")
-    with pytest.raises(VideoError, match="no file of the store"):
+    with pytest.raises(VideoError, match="not a store file"):
         StoreFile(tmp_path / "video")
 
 

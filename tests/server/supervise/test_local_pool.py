@@ -316,7 +316,7 @@ def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int
     pid, _ = pool.pids()
 
     def stopped(now: float) -> dict[bytes, float]:
-        seconds = {name: withheld.stopped_seconds for name, withheld in pool.withheld(now).items()}
+        seconds = {name: stalled.stopped_seconds for name, stalled in pool.stalled(now).items()}
         return {name: each for name, each in seconds.items() if each}
 
     assert stopped(0.0) == {}
@@ -340,7 +340,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
     looks = count(1.0)  # a second between one look and the next, as it goes by the clock that it is told
 
     def all_waited() -> bool:
-        found = pool.withheld(next(looks)).values()
+        found = pool.stalled(next(looks)).values()
         return len(found) == 4 and all(0 < each.queued_seconds <= 1 and not each.stopped_seconds for each in found)
 
     until(all_waited)

@@ -27,13 +27,13 @@ from v2v_protocol.messages import (
 from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
     Action,
+    Callbacks,
     Leave,
     Listen,
     Load,
     Make,
     Say,
     Send,
-    Tools,
     WorkerConversation,
 )
 
@@ -69,12 +69,12 @@ class Talk:
         self.unready: set[int] = set()
         self.compiled = True
         self.decoded: set[int] = set()
-        tools = Tools(
+        callbacks = Callbacks(
             is_ready=lambda one: one.lease not in self.unready,
             is_compiled=lambda one: self.compiled,
             is_decoded=lambda one: one.lease in self.decoded,
         )
-        self.conversation = WorkerConversation(HELLO, "tcp://there", tools, is_watched=is_watched)
+        self.conversation = WorkerConversation(HELLO, "tcp://there", callbacks, is_watched=is_watched)
         self.step: Action = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]
@@ -96,25 +96,25 @@ class Talk:
 
     def hears(self, *messages: Message) -> list[Message]:
         assert isinstance(self.step, Listen)
-        self._take(self.conversation.heard([encode(message)[0] for message in messages], self.now))
+        self._take(self.conversation.on_messages([encode(message)[0] for message in messages], self.now))
         return self.said()
 
     def makes(self, number: int, frames: Frames = IN_SLOT, seconds: float = 0.0) -> list[Message]:
         """It makes that lease's sample."""
         assert self.step == Make(lease(number))
         self.now += seconds
-        self._take(self.conversation.made(frames, self.now))
+        self._take(self.conversation.on_sample(frames, self.now))
         return self.said()
 
     def fails(self, number: int, error: VideoError = FAILURE) -> list[Message]:
         assert self.step == Make(lease(number))
-        self._take(self.conversation.failed(error, self.now))
+        self._take(self.conversation.on_failure(error, self.now))
         return self.said()
 
     def loads(self) -> list[Message]:
         assert isinstance(self.step, Load)
         self.unready.clear()
-        self._take(self.conversation.loaded(self.now))
+        self._take(self.conversation.on_kernels_loaded(self.now))
         return self.said()
 
 
@@ -216,7 +216,7 @@ def test_the_time_that_a_sample_takes_is_no_silence() -> None:
 def test_what_is_no_message_is_told_and_nothing_more() -> None:
     talk = at_work(1)
     talk.makes(1)
-    actions = talk.conversation.heard([b"nonsense", encode(lease(2))[0]], talk.now)
+    actions = talk.conversation.on_messages([b"nonsense", encode(lease(2))[0]], talk.now)
     assert [type(action) for action in actions] == [Say, Send, Make]
 
 
@@ -224,7 +224,7 @@ def test_a_server_of_another_version_ends_the_worker() -> None:
     """It says so in its own version, which is no message to ours; to ask it again every five seconds is no use."""
     denial = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "denied", "code": "version", "text": "", "more": 0})
     with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
-        Talk().conversation.heard([denial], 0.0)
+        Talk().conversation.on_messages([denial], 0.0)
 
 
 def test_a_server_that_does_not_want_this_worker_ends_it() -> None:

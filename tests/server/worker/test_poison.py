@@ -15,7 +15,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import ALONE_AFTER, Cause
-from v2v_server.broker.quarantine import Quarantine, Verdict, clearing
+from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, clearing
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake
@@ -25,8 +25,8 @@ BLAMING = (Cause.CRASHED, Cause.HUNG)
 VIDEOS = corpus(*(video(f"v{number}.mp4") for number in range(5)))
 
 
-def against(lease: Lease, reason: str = "a worker died over it", snapshot: int = 1) -> Verdict:
-    return Verdict(snapshot, lease.video, lease.fingerprint, lease.start_frame, reason, TIME)
+def against(lease: Lease, reason: str = "a worker died over it", snapshot: int = 1) -> QuarantineEntry:
+    return QuarantineEntry(snapshot, lease.video, lease.fingerprint, lease.start_frame, reason, TIME)
 
 
 def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> Lease:
@@ -359,7 +359,7 @@ def test_when_it_cannot_be_written_there_is_no_snapshot_and_the_sample_says_what
 # --- snapshots --------------------------------------------------------------------------------------------------------
 
 
-def in_quarantine(index: int = 0, candidate: int = 0) -> Verdict:
+def in_quarantine(index: int = 0, candidate: int = 0) -> QuarantineEntry:
     """A verdict on what index 0 of epoch 0 is made from."""
     at = peers()
     at.hello()

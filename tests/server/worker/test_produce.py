@@ -17,7 +17,7 @@ from tests.server.corpus import SMALL_SPEC
 from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Verdict, quarantine_path, read_quarantine, write_verdict
+from v2v_server.broker.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.terms import lease_for
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.commands.simulate import main as simulate
@@ -145,7 +145,7 @@ def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalog
     mark = next(video.fingerprint for video in catalogue.videos if video.id == first)
     file = quarantine_path(catalogue.root, cache)
     for frame in (0, 10):  # two verdicts refuse the file
-        write_verdict(file, Verdict(0, first, mark, frame, "crash", "t"), read_quarantine(file))
+        write_entry(file, QuarantineEntry(0, first, mark, frame, "crash", "t"), read_quarantine(file))
     assert (made(), made("--quarantine=2")) == (first, {"a.mp4": "b.mp4", "b.mp4": "a.mp4"}[first])
     with pytest.raises(AssertionError):
         made("--quarantine=3")
@@ -160,7 +160,7 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
         "cut short": index.to_bytes()[:-3],
         "too few frames": index.slice(0, lease.start_frame + 1).to_bytes(),
     }[damage]
-    with pytest.raises(VideoError, match=r"^a\.mp4.*: the server's index of it is damaged: "):
+    with pytest.raises(VideoError, match=r"^a\.mp4.*: its index from the server is damaged: "):
         decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.root)
 
 

@@ -23,7 +23,7 @@ from v2v_server.commands.worker import main as worker_command
 from v2v_server.simulation.variants import Variant
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.decode_cache import Clips
-from v2v_server.worker.handover import Room
+from v2v_server.worker.output_buffer import OutputBuffer
 from v2v_server.worker.process import Worker, run_worker
 
 WAIT_MS = 20_000
@@ -67,7 +67,9 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{port}", logbook.fileno())
         monkeypatch.setattr(worker_module, "make_sample", make)
         monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
-        monkeypatch.setattr(worker_module, "room_for", lambda lease, layout: Room(new_arrays(layout), in_slot=True))
+        monkeypatch.setattr(
+            worker_module, "open_output_buffer", lambda lease, layout: OutputBuffer(new_arrays(layout), in_slot=True)
+        )
         monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset({VARIANT} if lease.lease > 3 else ()))
         monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)
         monkeypatch.setattr(worker_module, "load_in_turn", lambda variant: at.did.append("load"))

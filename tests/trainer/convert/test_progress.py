@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from io import StringIO
 
-from trainer.convert.cli import lines_of_progress
+from trainer.convert.cli import log_progress
 
 
 def test_a_line_every_thirty_seconds_and_none_of_what_is_done() -> None:
     out, times = StringIO(), iter([0.0, 10.0, 40.0, 60.0, 75.0])
-    progress = lines_of_progress("a.bag", out, clock=lambda: next(times))
+    progress = log_progress("a.bag", out, clock=lambda: next(times))
     for done in (1, 4, 6, 5):
         progress(done, 10)
     progress(10, 10)

@@ -122,9 +122,9 @@ def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path
     assert published[0]["as_published"] is True
 
 
-@pytest.mark.parametrize(("folder", "name", "cut"), [("evaid", "outdoor", 1.4), ("ijrr", "slider_depth", 2.5)])
+@pytest.mark.parametrize(("folder", "name", "end"), [("evaid", "outdoor", 1.4), ("ijrr", "slider_depth", 2.5)])
 def test_as_published_evaid_is_cut_a_picture_later(
-    tmp_path: Path, weights: Path, folder: str, name: str, cut: float
+    tmp_path: Path, weights: Path, folder: str, name: str, end: float
 ) -> None:
     """Its script keeps the picture at the end, and then drops the first one; the other scripts do neither."""
     random_recording(tmp_path / folder / f"{name}.h5", images=30, period=0.125)
@@ -134,7 +134,7 @@ def test_as_published_evaid_is_cut_a_picture_later(
         evaluate(*given, "--per-frame", per_frame, *flags)
         seconds = [float(line["seconds"]) for line in csv.DictReader(per_frame.read_text().splitlines())]
         last[flags] = seconds[-1], len(seconds)
-    ends, count = 1 + 0.125 * np.array([np.ceil(cut / 0.125) - 1, np.ceil(cut / 0.125)]), last[()][1]
+    ends, count = 1 + 0.125 * np.array([np.ceil(end / 0.125) - 1, np.ceil(end / 0.125)]), last[()][1]
     assert last[()] == (pytest.approx(ends[0]), count)
     assert last["--as-published",] == (pytest.approx(ends[int(folder == "evaid")]), count)
 
@@ -252,7 +252,7 @@ def test_mistakes_end_with_status_2(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "if it is already cut, give --cuts none"),
+        ((), "holds only that range, give --cuts none"),
         (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: cannot be written: no folder"),
     ],
 )

@@ -99,7 +99,7 @@ def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path
 def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
     path = recording(tmp_path / "a.h5")
     assert evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.11))["zeros"].windows == 1
-    with pytest.raises(UsageError, match=r"1 flow fields in the cut .*v2v-convert takes MVSEC's"):
+    with pytest.raises(UsageError, match=r"1 flow fields in the time range .*v2v-convert reads MVSEC's"):
         evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.06))
 
 

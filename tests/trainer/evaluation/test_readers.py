@@ -134,16 +134,16 @@ def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
         assert windows[0].begin == pytest.approx(2.0)
         assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a cut is not in it, as released
         assert len(picture_windows(opened, (0.0, 60.0))) == 50
-        with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the cut is from 5 to 20 s.*--cuts none"):
+        with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the time range is from 5 to 20 s.*--cuts none"):
             picture_windows(opened, (5.0, 20.0))
-        with pytest.raises(UsageError, match=r"1 pictures in the cut .* 2 or more"):
+        with pytest.raises(UsageError, match=r"1 pictures in the time range .* at least 2"):
             picture_windows(opened, (4.96, 5.5))
 
 
 def test_a_later_cut_begins_and_ends_so_many_pictures_on(tmp_path: Path) -> None:
     with Recording(random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)) as opened:
-        for cut, first, last in (((1.05, 3.05), 12, 31), ((0.0, 60.0), 1, 50)):
-            windows = picture_windows(opened, cut, later=1)
+        for time_range, first, last in (((1.05, 3.05), 12, 31), ((0.0, 60.0), 1, 50)):
+            windows = picture_windows(opened, time_range, later=1)
             assert (windows[0].begin, windows[-1].end) == (opened.images[first].time, opened.images[last].time)
 
 
@@ -155,7 +155,7 @@ def test_windows_end_at_every_third_picture(tmp_path: Path) -> None:
         assert [len(opened.events(window)) for window in windows] == [
             sum(len(opened.events(part)) for part in one_by_one[start : start + 3]) for start in (0, 3, 6)
         ]
-        with pytest.raises(UsageError, match="12 pictures; 13 or more"):
+        with pytest.raises(UsageError, match="12 pictures; a window needs at least 13"):
             picture_windows(opened, pictures=12)
         with pytest.raises(UsageError, match="at least 1"):
             picture_windows(opened, pictures=0)
@@ -196,10 +196,17 @@ def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
     tmp_path_factory: pytest.TempPathFactory, events: int, seconds: float, is_cut: bool
 ) -> None:
     path = random_recording(tmp_path_factory.mktemp("any") / "a.h5", images=21)
-    cut = (0.1, 0.35) if is_cut else None
+    time_range = (0.1, 0.35) if is_cut else None
     with Recording(path) as opened:
-        allowed = {image.key for image in opened.images if cut is None or cut[0] <= image.time - 1.0 < cut[1]}
-        for windows in (windows_of_seconds(opened, seconds, cut), windows_of_events(opened, min(events, 200), cut)):
+        allowed = {
+            image.key
+            for image in opened.images
+            if time_range is None or time_range[0] <= image.time - 1.0 < time_range[1]
+        }
+        for windows in (
+            windows_of_seconds(opened, seconds, time_range),
+            windows_of_events(opened, min(events, 200), time_range),
+        ):
             for one, other in itertools.pairwise(windows):
                 assert (one.stop, one.end) == (other.start, other.begin)
             for window in windows:
@@ -226,16 +233,16 @@ def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch:
     import h5py
 
     open_datasets = []
-    increasing = Recording._increasing
+    repair = Recording._repair_times
 
-    def look(self: Recording, times: list[float]) -> list[float]:
+    def count_and_repair(self: Recording, times: list[float]) -> list[float]:
         open_datasets.append(h5py.h5f.get_obj_count(self._file.id, h5py.h5f.OBJ_DATASET))
-        return increasing(self, times)
+        return repair(self, times)
 
-    monkeypatch.setattr(Recording, "_increasing", look)
+    monkeypatch.setattr(Recording, "_repair_times", count_and_repair)
     with Recording(random_recording(tmp_path / "a.h5", images=50, events=50)) as opened:
         assert len(opened.images) == 50
-    assert open_datasets[0] <= 6, "four columns, and at most the picture that was looked at last"
+    assert open_datasets[0] <= 6, "four columns, and at most the picture read last"
 
 
 @settings(max_examples=30)

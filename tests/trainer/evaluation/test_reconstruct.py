@@ -10,7 +10,7 @@ import torch
 
 from tests.trainer.evaluation.h5_file import random_recording
 from trainer.evaluation.readers import Recording
-from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, _stretched, reconstruct
+from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, _stretch, reconstruct
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import picture_windows, regular_windows
 from trainer.models import E2VID, FireNet, VoxelNetwork
@@ -85,7 +85,7 @@ def test_stretching_maps_each_picture_to_the_whole_range() -> None:
     rng = np.random.default_rng(0)
     pictures = rng.normal(0.3, 0.05, (2, 20, 30)).astype(np.float32)
     pictures[1] += 3
-    plain, whole, robust = (_stretched(pictures, stretch) for stretch in ("none", "min-max", "robust"))
+    plain, whole, robust = (_stretch(pictures, stretch) for stretch in ("none", "min-max", "robust"))
     np.testing.assert_array_equal(plain, pictures.clip(0, 1))
     assert whole.min(axis=(1, 2)).tolist() == [0, 0]
     assert whole.max(axis=(1, 2)).tolist() == [1, 1]
@@ -95,7 +95,7 @@ def test_stretching_maps_each_picture_to_the_whole_range() -> None:
             after.ravel()[before.ravel().argsort()[300]], (np.median(before) - low) / (high - low), atol=0.02
         )
         assert ((after == 0).sum(), (after == 1).sum()) == (6, 6)
-    assert np.isfinite(_stretched(np.ones((1, 4, 4), np.float32), "min-max")).all()
+    assert np.isfinite(_stretch(np.ones((1, 4, 4), np.float32), "min-max")).all()
 
 
 def test_networks_are_recognised(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
 
 def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
-    with pytest.raises(UsageError, match=r"of none of e2vid, .*--model"):
+    with pytest.raises(UsageError, match=r"is none of e2vid, .*--model"):
         load_network(tmp_path / "a.pth")
     with pytest.raises(UsageError, match="model 'unet': give one of"):
         load_network(tmp_path / "a.pth", name="unet")
@@ -134,7 +134,7 @@ def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
 def test_equalized_pictures_have_every_grey_value_as_often() -> None:
     """Whatever the order-preserving curve that a network's pictures went through."""
     ramp = np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(1, 64, 64)
-    (equal,) = _stretched(ramp**1.3, "equalized")
+    (equal,) = _stretch(ramp**1.3, "equalized")
     counts, _ = np.histogram(equal, 8, (0, 1))
     assert counts.min() > 0.8 * 512
     assert counts.max() < 1.2 * 512

@@ -198,10 +198,10 @@ def test_weight_files_of_whole_networks_load(tmp_path: Path, squeeze: LPIPS) -> 
 
 def test_missing_or_wrong_files_say_where_to_get_them(tmp_path: Path, squeeze: LPIPS) -> None:
     backbone, heads = tmp_path / "backbone.pth", tmp_path / "heads.pth"
-    with pytest.raises(UsageError, match=r"Nothing is downloaded.*pytorch.org/models/squeezenet"):
+    with pytest.raises(UsageError, match=r"not downloaded automatically.*pytorch.org/models/squeezenet"):
         LPIPS.from_files("squeeze", backbone, heads)
     torch.save(torchvision_like(squeeze), backbone)
-    with pytest.raises(UsageError, match=r"Nothing is downloaded.*lpips/weights/v0.1/squeeze.pth"):
+    with pytest.raises(UsageError, match=r"not downloaded automatically.*lpips/weights/v0.1/squeeze.pth"):
         LPIPS.from_files("squeeze", backbone, heads)
     torch.save(heads_file(LPIPS("alex")), heads)
     with pytest.raises(UsageError, match=r"of 7 LPIPS weights .*lpips/weights/v0.1/squeeze.pth"):

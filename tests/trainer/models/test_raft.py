@@ -143,7 +143,7 @@ def test_weights_that_do_not_serve_are_refused_with_a_source(tmp_path: Path) -> 
     (tmp_path / "text.pth").write_text("hello")
     with pytest.raises(UsageError, match=r"not a PyTorch file.*raft_large"):
         RaftFlow("large", tmp_path / "text.pth")
-    with pytest.raises(UsageError, match=r"not those of the large network: \d+ of \d+ entries differ"):
+    with pytest.raises(UsageError, match=r"do not fit the large network: \d+ of \d+ entries differ"):
         RaftFlow("large", saved(tmp_path, "small"))
     state = formula_weights(RAFT("small").state_dict())
     torch.save({**state, "more": torch.zeros(1)}, tmp_path / "more.pth")

@@ -1,13 +1,11 @@
-"""Weights of others (safe unpickling, names, strictness) and our own checkpoints (atomic, complete, plain)."""
+"""Weights of others: safe unpickling, names, strictness."""
 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import os
 import pickle
 import random
-import resource
 from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ import torch
 from torch import Tensor
 
 from trainer.models import E2VID, FireNet
-from trainer.run.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from trainer.unpickle import Placeholder, read_torch_file
 from trainer.weights import load_into, load_network, read_weights
 from v2v_protocol.errors import UsageError
@@ -175,7 +172,7 @@ def test_e2vid_plus_gives_its_image_channel(tmp_path: Path) -> None:
     other = small(seed=1)
     report = load_into(other, tmp_path / "plus.pth")
     assert same(other.state_dict(), model.state_dict())
-    assert report.cut == ("unetrecurrent.pred.conv2d.weight", "unetrecurrent.pred.conv2d.bias")
+    assert report.sliced == ("unetrecurrent.pred.conv2d.weight", "unetrecurrent.pred.conv2d.bias")
     assert len(report.renamed) == len(state)
     assert "(in the file unetflow.head.conv2d.weight)" in str(report)
     assert "channel 0 only" in str(report)
@@ -243,7 +240,7 @@ def test_the_variant_of_e2vid_is_read_from_its_file(tmp_path: Path, options: dic
     if "final_activation" in options:
         content["model"] = {"num_bins": 5, "skip_type": "sum", "recurrent_block_type": "convlstm", "norm": "BN"}
     torch.save(content, tmp_path / "e2vid.pth.tar")
-    name, found = read_weights(tmp_path / "e2vid.pth.tar").recognised()
+    name, found = read_weights(tmp_path / "e2vid.pth.tar").recognise()
     assert name == "e2vid"
     assert found == {
         "bins": 5,
@@ -273,158 +270,3 @@ def test_published_files_say_how_their_network_was_trained(published: Path) -> N
     assert (name, first.normalizes, first.padding) == ("firenet", True, "centred")
     plus, name = load_network(published / "firenet_plus_state_dict.pth")
     assert (name, plus.normalizes, plus.padding) == ("firenet", False, "bottom-right")
-
-
-# our own checkpoints
-
-
-class Run:
-    """A training run in small, with a stream position."""
-
-    def __init__(self) -> None:
-        self.model = small()
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-2, amsgrad=True)
-        self.position = 0
-
-    def train(self, steps: int) -> list[float]:
-        losses = []
-        for _ in range(steps):
-            voxels = (torch.arange(2560.0).view(1, 2, 5, 16, 16) + self.position).sin()
-            loss = (self.model.forward_sequence(voxels) - 0.5).square().mean()
-            self.optimizer.zero_grad()
-            loss.backward()
-            self.optimizer.step()
-            self.position += 1
-            losses.append(loss.item())
-        return losses
-
-    def checkpoint(self) -> Checkpoint:
-        return Checkpoint(
-            step=self.position,
-            epoch=1,
-            model=self.model.state_dict(),
-            optimizer=self.optimizer.state_dict(),
-            ema=None,
-            stream={
-                "version": 1,
-                "stream": {"spec": {"seed": 2**64 - 1}, "list": ["a", 0.5, None]},
-                "at": self.position,
-            },
-            config={"batch_size": 12, "network": {"name": "e2vid"}},
-        )
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        self.model.load_state_dict(checkpoint.model)
-        self.optimizer.load_state_dict(dict(checkpoint.optimizer))
-        assert checkpoint.stream is not None
-        self.position = checkpoint.stream["at"]
-
-
-def test_a_resumed_run_has_the_losses_of_the_uninterrupted_one(tmp_path: Path) -> None:
-    path = tmp_path / "runs" / "last.pt"
-    run = Run()
-    run.train(3)
-    save_checkpoint(path, run.checkpoint())
-    expected = run.train(4)
-    resumed = Run()
-    resumed.train(1)
-    resumed.restore(load_checkpoint(path))
-    assert resumed.train(4) == expected
-    assert same(resumed.model.state_dict(), run.model.state_dict())
-
-
-def test_a_checkpoint_comes_back_whole_and_needs_no_code(tmp_path: Path) -> None:
-    run = Run()
-    run.train(1)
-    ema = {name: tensor + 1 for name, tensor in run.model.state_dict().items()}
-    written = dataclasses.replace(run.checkpoint(), ema=ema)
-    save_checkpoint(tmp_path / "a.pt", written)
-    assert isinstance(torch.load(tmp_path / "a.pt", weights_only=True), dict)
-    read = load_checkpoint(tmp_path / "a.pt")
-    assert (read.step, read.epoch, read.stream, read.config) == (1, 1, written.stream, written.config)
-    assert same(dict(read.model), dict(written.model))
-    assert read.ema is not None
-    assert same(dict(read.ema), ema)
-    other = small(seed=1)
-    load_into(other, tmp_path / "a.pt")
-    assert same(other.state_dict(), run.model.state_dict())
-    load_into(other, tmp_path / "a.pt", ema=True)
-    assert same(other.state_dict(), ema)
-
-
-@pytest.mark.parametrize("fails", ["fsync", "write"])
-def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
-    path = tmp_path / "last.pt"
-    run = Run()
-    save_checkpoint(path, run.checkpoint())
-    old = path.read_bytes()
-    run.train(1)
-
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(*((os, "fsync", full) if fails == "fsync" else (torch, "save", full)))
-    with pytest.raises(OSError, match="No space"):
-        save_checkpoint(path, run.checkpoint())
-    assert path.read_bytes() == old
-    assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
-
-
-def test_what_the_disk_says_is_what_is_raised(tmp_path: Path) -> None:
-    """Not what PyTorch's writer makes of it."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    large = dataclasses.replace(Run().checkpoint(), ema={"weight": torch.zeros(60_000)})
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-        with pytest.raises(OSError, match="File too large"):
-            save_checkpoint(tmp_path / "last.pt", large)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_data_are_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    fsync, replace = os.fsync, Path.replace
-
-    def spy_fsync(descriptor: int) -> None:
-        calls.append("folder" if Path(f"/proc/self/fd/{descriptor}").is_dir() else "file")
-        fsync(descriptor)
-
-    def spy_replace(self: Path, target: Path) -> Path:
-        calls.append("replace")
-        return replace(self, target)
-
-    monkeypatch.setattr(os, "fsync", spy_fsync)
-    monkeypatch.setattr(Path, "replace", spy_replace)
-    save_checkpoint(tmp_path / "last.pt", Run().checkpoint())
-    assert calls == ["file", "replace", "folder"]
-
-
-def test_what_needs_code_to_be_read_is_refused_before_writing(tmp_path: Path) -> None:
-    checkpoint = dataclasses.replace(Run().checkpoint(), config={"sizes": [1, {"seed": np.int64(3)}]})
-    with pytest.raises(UsageError, match=r"config\['sizes'\]\[1\]\['seed'\] is a int64"):
-        save_checkpoint(tmp_path / "a.pt", checkpoint)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
-    path = tmp_path / "a.pt"
-    with pytest.raises(UsageError, match="no file"):
-        load_checkpoint(path)
-    torch.save({"state_dict": small().state_dict()}, path)
-    with pytest.raises(UsageError, match="for weights alone use read_weights"):
-        load_checkpoint(path)
-    save_checkpoint(path, Run().checkpoint())
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UsageError, match="or damaged"):
-        load_checkpoint(path)
-    torch.save(torch.load(_written(path, whole), weights_only=True) | {"format": 99}, path)
-    with pytest.raises(UsageError, match="format 99, this release reads 2"):
-        load_checkpoint(path)
-
-
-def _written(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path

@@ -264,7 +264,7 @@ class Store:
         """
         self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
 
-    def doubt(self, id: str) -> None:
+    def mark_stale(self, id: str) -> None:
         """Let the next start probe a file again.
 
         Raises:
@@ -272,7 +272,7 @@ class Store:
         """
         self._change("UPDATE video SET size_bytes = -1 WHERE id = ?", [(id,)])
 
-    def wait_no_more(self) -> None:
+    def fail_fast(self) -> None:
         """From now on an index that another process holds is an error at once."""
         self._database.execute("PRAGMA busy_timeout = 0")
 

@@ -39,7 +39,7 @@ def positions(
 
 @hook
 def start(tables, own, block, at):
-    """Finds those of the block."""
+    """Find those of the block."""
     if len(tables.position) > 0:
         end = 0 if at.first == 0 else tables.of_block[1]
         tables.of_block[0] = end

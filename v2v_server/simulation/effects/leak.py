@@ -29,7 +29,7 @@ def prepare(value: float, clip: Clip) -> Tables:
 
 @hook
 def change(tables, own, block, at):
-    """Adds the leak."""
+    """Add the leak."""
     if len(tables.leak) > 0:
         leaked = tables.leak[at.step]
         for i in range(BLOCK_PX):

@@ -117,7 +117,7 @@ def start(tables, own, block, at):
 
 @hook
 def after(tables, own, block, at):
-    """Adds the events."""
+    """Add the events."""
     if len(tables.shot) > 0:
         of_step, drawn = tables.table_of_step[at.step], tables.drawn
         _draw(drawn, tables.of_steps[0, at.step], tables.of_steps[1, at.step])
@@ -143,7 +143,7 @@ def _draw(drawn, step_pos, step_neg):
 
 @compiled
 def _fire(chances, largest, shown, drawn, chance, signed, residual):
-    """Adds shot events to ``signed`` and clears the residual of the pixels that had any.
+    """Add shot events to ``signed`` and clears the residual of the pixels that had any.
 
     A function that is compiled by itself: as a part of the kernel its loops would not become vector instructions.
 

@@ -22,7 +22,7 @@ try:
     if slow == "handover" and is_worker:
         from v2v_server.worker import process
 
-        process.room_for = _slowly(process.room_for, 0.1)
+        process.open_output_buffer = _slowly(process.open_output_buffer, 0.1)
     if slow == "broker" and not is_worker:
         from v2v_server.broker.dispatcher import Dispatcher
 

@@ -14,7 +14,7 @@ _FAULTS = {
 }
 
 
-def farewell(state: ServiceState) -> list[str]:
+def format_shutdown_summary(state: ServiceState) -> list[str]:
     """Lines on all that a server did, for people.
 
     Args:
@@ -25,15 +25,15 @@ def farewell(state: ServiceState) -> list[str]:
     clips = f", from {totals.decodes} decoded clips" if totals.decodes < totals.samples else ""
     lines = [
         f"in all {totals.samples} samples ({totals.batches:.1f} batches, {totals.bytes / GIB:.2f} GiB{clips}) in "
-        f"{span(seconds)}: {rate:.2f} samples/s",
+        f"{format_duration(seconds)}: {rate:.2f} samples/s",
         f"faults {totals.faults}{_faults(totals)}",
     ]
     busy = totals.decode_seconds + totals.simulate_seconds + totals.handover_seconds
     if busy > 0.0:
         lines.append(
-            f"workers spent {span(busy)} on them: decoding {totals.decode_seconds / busy:.0%}, simulating "
+            f"workers spent {format_duration(busy)} on them: decoding {totals.decode_seconds / busy:.0%}, simulating "
             f"{totals.simulate_seconds / busy:.0%}, handing over {totals.handover_seconds / busy:.0%}; consumers "
-            f"waited {span(totals.waited_seconds)}"
+            f"waited {format_duration(totals.waited_seconds)}"
         )
     return lines
 
@@ -43,7 +43,7 @@ def _faults(totals: Totals) -> str:
     return f": {', '.join(named)}" if named else ""
 
 
-def span(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A time as people read it."""
     if seconds < 120.0:
         return f"{seconds:.1f} s"

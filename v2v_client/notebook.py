@@ -1,5 +1,7 @@
-"""Pictures of batches and samples for notebooks. Opens ``v2v_pictures`` when a picture is drawn: it needs more packages
-than a consumer does."""
+"""Draw batches and samples for notebooks.
+
+``v2v_pictures`` is imported when a picture is drawn, because it needs more packages than a consumer does.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +20,21 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance
 
 
-def picture(
+def draw_samples(
     samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], frames_per_bin: int | None, title: str
 ) -> npt.NDArray[np.uint8]:
-    """A sheet of samples: frame, bins, flow, and activity over time.
+    """Draw a sheet of samples: frame, bins, flow, and activity over time.
 
     Args:
         samples: arrays and provenance of each, at least one.
-        frames_per_bin: of the recipe. None: nobody knows, so pauses cannot be placed; they are not marked, and the
+        frames_per_bin: the recipe's; None if it is unknown. Then pauses cannot be placed: they are not marked, and the
             title says so.
-        title: of the sheet.
 
     Returns:
         [height, width, 3] uint8 RGB.
 
     Raises:
-        UsageError: voxels or frames are not among the arrays, or a package that draws is not installed.
+        UsageError: voxels or frames are not among the arrays, or pillow or av is not installed.
     """
     camera, sheet = _drawing("camera"), _drawing("sheet")
     cameras = []
@@ -49,30 +50,33 @@ def picture(
 _UNMARKED = " (pauses are not marked)"
 
 
-def png(image: npt.NDArray[np.uint8]) -> bytes:
-    """The picture as PNG."""
+def to_png(image: npt.NDArray[np.uint8]) -> bytes:
+    """Encode the picture as PNG."""
     encoded: bytes = _drawing("files").png_bytes(image)
     return encoded
 
 
-def png_or_none(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
-    """The picture as PNG, or None where none can be made: a notebook goes on with the text."""
+def try_png(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
+    """Return the drawn picture as PNG, or None if it cannot be drawn: the notebook then shows only text."""
     try:
-        return png(draw())
+        return to_png(draw())
     except UsageError:
         return None
 
 
-def img(encoded: bytes | None) -> str:
-    """A PNG as HTML; nothing for None."""
+def html_image(encoded: bytes | None) -> str:
+    """Return an HTML image element for a PNG, or "" for None."""
     return "" if encoded is None else f'<img src="data:image/png;base64,{base64.b64encode(encoded).decode()}">'
 
 
-def shown(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
-    """The picture as a PIL image, which a notebook displays; written to ``path`` as PNG where one is given.
+def to_pil_image(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
+    """Return the picture as a PIL image, which a notebook displays.
+
+    Args:
+        path: PNG file to write as well; None writes no file.
 
     Raises:
-        UsageError: the file cannot be written.
+        UsageError: the file cannot be written, or pillow or av is not installed.
     """
     if path is not None:
         _drawing("files").write_png(Path(path), image)
@@ -87,4 +91,4 @@ def _imported(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise UsageError(f"a picture needs the package {error.name}: pip install pillow av") from error
+        raise UsageError(f"drawing a picture needs the package {error.name}: pip install pillow av") from error

@@ -1,7 +1,7 @@
-"""The worker's end of a slot: a sample is made in its consumer's memory, or where that cannot be reached, in its own.
+"""Provide memory for a sample: its consumer's slot, or private memory if the slot is not accessible.
 
-The arena is opened and mapped anew for each sample, which takes less than a millisecond: nothing is kept that would
-hold the memory of a consumer that is gone, or have to be tidied up after a worker that is killed.
+The arena is opened and mapped for each sample, which takes less than a millisecond. So no mapping keeps the memory of a
+consumer that is gone, and a killed worker leaves nothing to clean up.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
-    """Where a sample is made.
+class OutputBuffer:
+    """Memory for a sample.
 
     Attributes:
-        arrays: C-contiguous, of its layout, of unspecified content. Memory of another process is let go with them.
+        arrays: C-contiguous, of the sample's layout, with unspecified content. Shared memory is unmapped when they are
+            freed.
         in_slot: whether they are the slot that the lease names.
     """
 
@@ -38,23 +39,23 @@ class Room:
     in_slot: bool
 
 
-def room_for(lease: Lease, layout: Layout) -> Room:
-    """The lease's slot, where it names one that can be reached; fresh memory otherwise.
+def open_output_buffer(lease: Lease, layout: Layout) -> OutputBuffer:
+    """Return the lease's slot if it names an accessible one, otherwise new memory.
 
     Args:
-        lease: what was asked.
-        layout: of its sample.
+        lease: the work.
+        layout: layout of its sample.
     """
     if lease.slot != NO_SLOT:
         there = slot_arrays(Slot(lease.arena, lease.slot), layout)
         if there is not None:
-            return Room(there, in_slot=True)
-    return Room(new_arrays(layout), in_slot=False)
+            return OutputBuffer(there, in_slot=True)
+    return OutputBuffer(new_arrays(layout), in_slot=False)
 
 
 def sample_message(
     lease: Lease,
-    room: Room,
+    buffer: OutputBuffer,
     *,
     provenance: Mapping[str, Any],
     worker: str,
@@ -63,42 +64,42 @@ def sample_message(
     cache: str = "",
     packed: bool = False,
 ) -> Frames:
-    """The frames of a lease's sample. Who sends them writes to the room no more.
+    """Build the frames of a lease's sample. The buffer must not be changed afterwards.
 
     Args:
-        lease: what was asked.
-        room: where its sample was made.
+        lease: the work.
+        buffer: where its sample was made.
         provenance, worker, cpu_seconds, decoded, cache: see :class:`v2v_protocol.messages.SampleHeader`.
-        packed: arrays that do not lie in a slot are compressed, whatever the lease says of it.
+        packed: compress arrays outside a slot even if the lease does not ask for it.
     """
     return encode_sample(
         epoch=lease.epoch,
         index=lease.indices[0],
-        arrays=room.arrays,
+        arrays=buffer.arrays,
         provenance=provenance,
         worker=worker,
         cpu_seconds=cpu_seconds,
         decoded=decoded,
         cache=cache,
         slot=lease.slot,
-        in_slot=room.in_slot,
+        in_slot=buffer.in_slot,
         quarantine=lease.quarantine,
         pack=pack if packed or lease.packed else None,
     )
 
 
 def pack(raw: Buffer) -> bytes:
-    """An array's bytes as one zstd frame that states their number."""
-    # Level 1: a twelfth of the bytes is left, and higher levels take longer for little more (v2v-tradeoff).
+    """Compress an array's bytes to one zstd frame that states their number."""
+    # Level 1 leaves a twelfth of the bytes; higher levels take longer and save little more (v2v-tradeoff).
     return zstandard.ZstdCompressor(level=1, write_checksum=False).compress(raw)
 
 
 def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | None:
-    """The slot's arrays, mapped.
+    """Map the arrays of a slot.
 
     Returns:
-        None where that is not possible: the arena is not on this host, not this user's, gone, of another size, or could
-        be cut short by its owner while we write.
+        None if that is not possible: the arena is not on this host, belongs to another user, is gone, has another size,
+        or could be truncated by its owner during a write.
     """
     try:
         name = ArenaName.parse(slot.arena)
@@ -119,7 +120,9 @@ _Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
 
 @lru_cache(maxsize=16)  # the same for every sample of a stream
 def _places(layout: tuple[tuple[str, tuple[str, tuple[int, ...]]], ...], slots: int) -> tuple[list[_Place], int]:
-    """(name, dtype, shape, bytes of one sample, offset of the first) of each array in an arena; the arena's bytes."""
+    """Return (name, dtype, shape, bytes of one sample, offset of the first) of each array in an arena, and the
+    arena's bytes.
+    """
     sizes = Form.of(dict(layout)).sizes
     *offsets, total = array_offsets(sizes, slots)
     places = [
@@ -133,11 +136,11 @@ class _OpenArena:
     """An open arena.
 
     Raises:
-        OSError: it is not there, not of that many bytes, or its size is not sealed.
+        OSError: it does not exist, has another size, or its size is not sealed.
     """
 
     def __init__(self, name: ArenaName, size: int) -> None:
-        # The link is read first: opening something else, a device or a pipe, may have effects of its own.
+        # Read the link first: opening another file type, such as a device or a pipe, may have side effects.
         if os.readlink(name.path) != name.link:
             raise FileNotFoundError(name.path)
         self._descriptor = os.open(name.path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -150,9 +153,9 @@ class _OpenArena:
             raise
 
     def map(self, offset: int, size: int) -> npt.NDArray[np.uint8]:
-        """Bytes of the arena; unmapped when nothing refers to them any more."""
+        """Map bytes of the arena; they are unmapped when nothing refers to them any more."""
         begin = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
-        # All pages at once: taken one by one as they are written, they cost more than copying the sample.
+        # Map all pages at once: faulting them in one by one costs more than copying the sample.
         flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
         mapping = mmap.mmap(self._descriptor, offset - begin + size, flags, offset=begin)
         return np.frombuffer(mapping, np.uint8, size, offset - begin)
@@ -162,10 +165,14 @@ class _OpenArena:
 
 
 def _require_sealed(descriptor: int, size: int) -> None:
-    """A page beyond the end of a file cannot be written to: that would be the end of this process."""
-    from fcntl import F_GET_SEALS, F_SEAL_SHRINK, fcntl  # of Linux, like arenas
+    """Check that the file cannot shrink. Writing to a page beyond the end of a file would kill this process.
+
+    Raises:
+        OSError: it can shrink, or has another size.
+    """
+    from fcntl import F_GET_SEALS, F_SEAL_SHRINK, fcntl  # only on Linux, like arenas
 
     if not fcntl(descriptor, F_GET_SEALS) & F_SEAL_SHRINK:
         raise OSError("its size is not sealed")
     if os.fstat(descriptor).st_size != size:
-        raise OSError(f"it is not of {size} bytes")
+        raise OSError(f"it does not have {size} bytes")

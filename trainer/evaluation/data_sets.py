@@ -1,6 +1,6 @@
-"""The paper's four data sets: their sequences, and which seconds of each are scored.
+"""Define the paper's four data sets: their sequences, and which seconds of each are scored.
 
-Seconds count from the first picture of the raw recording; a picture at the end of a cut does not belong to it.
+Seconds count from the first picture of the raw recording. A picture at the end of a time range does not belong to it.
 Sequences of EVAID that the paper leaves out (blocks, umbrella, room2) are not listed.
 """
 
@@ -9,24 +9,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-Cut = tuple[float, float]
+TimeRange = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """Sequences that are averaged together.
+    """Hold sequences that are averaged together.
 
     Attributes:
         name: as in the paper's tables.
-        folder: under the folder of data.
-        cuts: first and last second by sequence; None scores all of it.
-        published_later: by how many pictures the released conversion cuts later.
+        folder: subfolder of the data folder.
+        time_ranges: first and last second to score, by sequence; None scores all of it.
+        published_shift: number of pictures by which the released conversion moves the time ranges later.
     """
 
     name: str
     folder: str
-    cuts: Mapping[str, Cut | None]
-    published_later: int = 0
+    time_ranges: Mapping[str, TimeRange | None]
+    published_shift: int = 0
 
 
 HQF = (
@@ -50,8 +50,8 @@ DATA_SETS = {
                 "outdoor": (0.0, 1.4),
                 "playball": (25.0, 30.0),
             },
-            # It takes the picture at the end as well, and then drops the first one.
-            published_later=1,
+            # The released conversion also takes the picture at the end, and then drops the first one.
+            published_shift=1,
         ),
         DataSet(
             "IJRR",
@@ -76,4 +76,4 @@ DATA_SETS = {
         ),
     )
 }
-"""By the name in the paper's tables."""
+"""Data sets by their names in the paper's tables."""

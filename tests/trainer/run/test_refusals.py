@@ -1,0 +1,174 @@
+"""What ends a run: settings, folders and servers that do not fit, and a disk that refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.client.fake_server import FakeServer
+from tests.trainer.training import arguments, losses, refused, same, trained
+from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, save_checkpoint
+from trainer.run.reporting import METRICS
+from trainer.train import main
+from v2v_protocol.errors import UsageError
+
+
+def test_a_folder_with_a_run_is_not_written_over(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained(tmp_path, server.address, "run", run__steps=1)
+    assert "holds a run: go on with --resume" in refused(tmp_path, server.address, capsys)
+
+
+@pytest.mark.parametrize("out", ["file", "file/run"])
+def test_a_folder_that_cannot_be_written_is_said_before_anything_is_asked(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    (tmp_path / "file").touch()
+    before = len(server.hellos)
+    assert main(arguments(tmp_path, server.address, out, run__steps=1)) == 2
+    assert re.search(r"run\.out = .*file.*; give another folder with --out", capsys.readouterr().err)
+    assert len(server.hellos) == before
+
+
+def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(_: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "exists", denied)
+    with pytest.raises(UsageError, match=r"run\.out = .*: Permission denied; give another folder"):
+        require_fresh(tmp_path)
+
+
+def test_a_run_goes_on_in_its_own_folder(server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    without_out = ["small.yaml", "--connect", server.address, "--set", "run.steps=1"]
+    trained(tmp_path, server.address, "elsewhere", run__steps=1)
+    assert main(without_out) == 0
+    first = (tmp_path / "runs" / "small" / LAST).read_bytes()
+    assert main([*without_out, "--set", "run.steps=2", "--resume", f"elsewhere/{LAST}"]) == 0
+    assert load_checkpoint(tmp_path / "elsewhere" / LAST).step == 2
+    assert (tmp_path / "runs" / "small" / LAST).read_bytes() == first
+
+
+def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trained(tmp_path, server.address, "run", run__steps=1)
+    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", optimizer__learning_rate=0.5)
+    assert "optimizer.learning_rate: 0.01 -> 0.5" in message
+    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", stream__seed=9)
+    assert "stream.seed: 0 -> 9" in message
+
+
+def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeServer(sequences=23) as server:
+        trained(tmp_path, server.address, "run", run__steps=1)
+        server.restart(catalogue="catalogue-2")
+        message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}")
+    assert "catalogue_digest" in message
+
+
+def test_a_refused_resume_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither the configuration nor readings of the other corpus, and no reading is dropped."""
+    with FakeServer(sequences=23) as server:
+        run = trained(tmp_path, server.address, "run", run__steps=4, run__save_every=2, run__keep_epochs=1)
+        early = trained(tmp_path, server.address, "early", run__steps=2)
+        shutil.copy(early / LAST, run / "early.pt")
+
+        def content() -> dict[str, bytes]:
+            return {str(path): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+        before = content()
+        server.restart(catalogue="catalogue-2")
+        message = refused(
+            tmp_path, server.address, capsys, resume="run/early.pt", run__steps=9, run__judge_every=1, run__log_every=3
+        )
+    assert "catalogue_digest" in message
+    assert content() == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"loss__lpips_weight": 1.0}, "loss.lpips_backbone is missing.*download.pytorch.org/models/vgg16"),
+        (
+            {"loss__lpips_weight": 1.0, "loss__lpips_backbone": "no.pth", "loss__lpips_heads": "no.pth"},
+            "no file no.pth",
+        ),
+        (
+            {"loss__temporal_weight": 1.0, "loss__temporal_first_step": 1},
+            "loss.raft_weights is missing.*raft_small_C_T_V2",
+        ),
+        ({"network__options": {"chanels": 3}}, "network.options.chanels: firenet knows base_channels"),
+        ({"network__options": {"base_channels": 2.5}}, "network.options.base_channels = 2.5: give a whole number"),
+        ({"network__options": {"normalize_voxels": "no"}}, "network.options.normalize_voxels = 'no': give true or fal"),
+        (
+            {"network__name": "e2vid", "network__options": {"norm": "BN"}},
+            "network.options.norm = 'BN': choose one of none, batch",
+        ),
+        ({"network__weights": "no.pt"}, "no file no.pt"),
+    ],
+)
+def test_what_is_missing_is_said_before_anything_is_asked_of_the_server(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, object], message: str
+) -> None:
+    before = len(server.hellos)
+    assert re.search(message, refused(tmp_path, server.address, capsys, **settings))
+    assert len(server.hellos) == before
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_videos_or_address_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--videos DIR, or --connect ADDRESS" in refused(tmp_path, "", capsys)
+
+
+def test_a_diverged_run_keeps_the_checkpoint_before(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(tmp_path, server.address, "run", run__steps=1)
+    good = load_checkpoint(run / LAST)
+    spoilt = {name: tensor * torch.nan for name, tensor in good.model.items()}
+    save_checkpoint(tmp_path / "spoilt.pt", dataclasses.replace(good, model=spoilt))
+    assert main(arguments(tmp_path, server.address, "run", resume="spoilt.pt", run__steps=3, run__save_every=1)) == 1
+    message = capsys.readouterr().err
+    assert "step 2: loss nan" in message
+    assert "nothing was saved since this start" in message
+    assert same(load_checkpoint(run / LAST).model, good.model)
+
+
+def test_a_disk_that_refuses_is_said(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("trainer.loop.save_checkpoint", full)
+    message = refused(tmp_path, server.address, capsys, run__steps=2)
+    assert re.search(r"step 2 cannot be saved as .*last\.pt: No space left on device; .* start the run again", message)
+
+
+def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeServer(sequences=23) as server:
+        sent = []
+
+        def silent_from_the_third_batch(frames: list[object]) -> list[object]:
+            sent.append(frames)
+            if len(sent) == 12:
+                server.mute = True
+            return frames
+
+        server.alter = silent_from_the_third_batch
+        message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=2.0)
+    assert "nothing received" in message
+    assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
+    assert (tmp_path / "run" / METRICS).is_file()
+
+
+def test_a_server_that_never_was_there_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = refused(tmp_path, f"ipc://{tmp_path}/nobody", capsys, stream__timeout_seconds=0.1)
+    assert "nothing received" in message
+    assert not (tmp_path / "run" / LAST).exists()
