@@ -63,7 +63,7 @@ _RECORDED: tuple[Column, ...] = (
     ("active_share_real", "active pixels", "{:.1%}", 1),
     ("active_share_v2v", "V2V", "{:.1%}", 1),
     ("correlation_signed", "signed counts", "{:.2f}", 1),
-    ("correlation_mirrored", "mirrored", "{:.2f}", 1),
+    ("correlation_mirrored", "counts, mirrored", "{:.2f}", 1),
 )
 
 
@@ -199,18 +199,19 @@ def recorded(recording: Recording) -> Records:
             real = float(sum(side[mask].sum() for side in counts))
             threshold = min(made, key=lambda c: abs(np.abs(made[c][:, mask]).sum() - real))
             v2v = [np.maximum(sign * made[threshold], 0).sum(0) for sign in (1, -1)]
-            blurred = [
-                ndimage.gaussian_filter(side[0] - side[1], BLUR_SIGMA_PX)[mask]
-                for side in (counts, v2v, [each[:, ::-1] for each in v2v])
-            ]
+            pairs = {
+                "signed": (counts[0] - counts[1], v2v[0] - v2v[1]),
+                "mirrored": ((counts[0] + counts[1])[:, ::-1], v2v[0] + v2v[1]),  # a control
+            }
             records.append(
                 {"measure": "recorded", "part": part, "gamma": gamma, "events_real": real, "threshold": threshold}
                 | {f"rising_share_{name}": float(side[0][mask].sum() / max(1.0, (side[0] + side[1])[mask].sum()))
                    for name, side in (("real", counts), ("v2v", v2v))}
                 | {f"active_share_{name}": float(((side[0] + side[1]) > 0)[mask].mean())
                    for name, side in (("real", counts), ("v2v", v2v))}
-                | {f"correlation_{name}": float(np.corrcoef(blurred[0], other)[0, 1])
-                   for name, other in (("signed", blurred[1]), ("mirrored", blurred[2]))}
+                | {f"correlation_{name}": float(np.corrcoef(
+                       *(ndimage.gaussian_filter(each, BLUR_SIGMA_PX)[mask] for each in pair))[0, 1])
+                   for name, pair in pairs.items()}
             )  # fmt: skip
     return records
 

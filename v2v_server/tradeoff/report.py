@@ -143,6 +143,7 @@ def plot(records: Sequence[Record], file: Path) -> None:
             axes.plot([], [], marker, color="grey", label=label)
         axes.set_title("What speed costs: right is faster, down is more accurate")
         axes.set(xscale="log", xlabel="samples a second of processor time", ylabel="voxel error at c = 0.2, per cent")
+        axes.set_xlim(right=3 * max(record["samples_per_core_second"] for record in shown))  # for the labels
         axes.set_ylim(bottom=0, top=1.35 * max(1.0, axes.get_ylim()[1]))
         axes.grid(alpha=0.3)
         axes.legend(fontsize=9, title="worth: independent samples", loc="upper left")
