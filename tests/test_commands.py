@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import BENCHMARKS
+from bench.__main__ import BENCHES, parser_for
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -28,6 +28,7 @@ MODULES = {
     "v2v-top": "v2v_server.commands.top",
     "v2v-doctor": "v2v_server.commands.doctor",
     "v2v-keys": "v2v_server.commands.keys",
+    "v2v-tradeoff": "v2v_server.commands.tradeoff",
     "v2v-loadtest": "v2v_client.tools.loadtest",
     "v2v-train": "trainer.train",
     "v2v-eval": "trainer.evaluation.cli",
@@ -40,7 +41,7 @@ _LAUNCHED = {
     "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",
 }
-"""What `python` and `torchrun` start beside benchmarks."""
+"""What `python` and `torchrun` start beside benches."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
@@ -94,7 +95,7 @@ def test_command_lines_are_found_in_texts() -> None:
 
 def test_every_program_is_checked() -> None:
     named = {value.strip('"') for value in re.findall(r"^(v2v-\w+) = ", (ROOT / "pyproject.toml").read_text(), re.M)}
-    assert named - {"v2v-bench"} == set(MODULES)
+    assert named == set(MODULES)
     assert "--videos" in flags_of("v2v-serve")
     assert "--no-shuffle" in flags_of("v2v-serve")
     assert "--resume" in flags_of("v2v-train")
@@ -129,7 +130,8 @@ def block_lines(text: str) -> list[list[str]]:
     lines = re.findall(
         r"^ {4}(?:\w+\$ +)?((?:[A-Z_]+=\S+ )*(?:v2v-|uvx |torchrun |python |pip |make |pytest ).*)$", text, re.M
     )
-    lines += re.findall(r"`((?:uvx|torchrun|python -m|pip|make|pytest) [^`]+)`", text)
+    # A sentence names a bench, with some of its flags.
+    lines += re.findall(r"`((?:uvx|torchrun|python -m(?! bench)|pip|make|pytest) [^`]+)`", text)
     return [shlex.split(re.sub(r"^(?:[A-Z_]+=\S+ )+", "", line), comments=True) for line in lines]
 
 
@@ -150,9 +152,7 @@ def wrong_with(words: list[str]) -> str:
         return f"there is no {missing}" if missing else ""
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
-    if program == "v2v-bench":
-        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
-    return _refused(MODULES[program], rest) if program in MODULES else "no program"
+    return _refused(parser_of(MODULES[program]), rest) if program in MODULES else "no program"
 
 
 def _wrong_with_launched(words: list[str]) -> str:
@@ -166,14 +166,14 @@ def _wrong_with_launched(words: list[str]) -> str:
     if started == "pytest":
         return wrong_with(["pytest", *rest])
     if started == "bench":
-        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
-    module = started if started.removeprefix("bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
-    return "nothing that can be started" if module is None else _refused(module, rest)
+        return _refused(parser_for(rest[0]), rest[1:]) if rest[0] in BENCHES else "no bench"
+    module = _LAUNCHED.get(started)
+    return "nothing that can be started" if module is None else _refused(parser_of(module), rest)
 
 
-def _refused(module: str, given: list[str]) -> str:
+def _refused(parser: argparse.ArgumentParser, given: list[str]) -> str:
     try:
-        parser_of(module).parse_args(given)
+        parser.parse_args(given)
     except SystemExit as ended:
         return "" if not ended.code else f"its own parser refuses {given}"
     return ""
@@ -196,9 +196,9 @@ def test_faulty_command_lines_are_detected() -> None:
     assert wrong_with(serve) == wrong_with(train) == ""
     for line in (
         "v2v-serve --videos DIR --workers many", "v2v-serve --video DIR", "v2v-service", "make tests",
-        "v2v-bench nothing", "v2v-bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
-        "python -m bench.nothing", "python -m bench nothing", "uvx --from '.[server]' v2v-preview my.mp4",
-        "pip install '.[servers]'", "pytest tests/none.py",
+        "python -m bench nothing", "python -m bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
+        "python -m bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
+        "pytest tests/none.py",
     ):  # fmt: skip
         assert wrong_with(shlex.split(line)), line
 
@@ -212,10 +212,10 @@ OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone
 @pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
 def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-bench", "v2v-stream", "v2v-workers"}
+    assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    modules = [*MODULES.values(), *(f"bench.{module}" for module in BENCHMARKS.values())]
-    assert named <= {flag for module in modules for flag in parser_of(module)._option_string_actions}
+    parsers = [*map(parser_of, MODULES.values()), *map(parser_for, BENCHES)]
+    assert named <= {flag for parser in parsers for flag in parser._option_string_actions}
 
 
 def test_pages_with_command_lines_are_many() -> None:

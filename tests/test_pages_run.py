@@ -24,6 +24,7 @@ SMALLER = {
     "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
     "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
     "v2v-prepare": ["--workers", "1"],
+    "v2v-tradeoff": ["--clips", "1", "--places", "1", "--forms", "lossless fast", "--budget-minutes", "0.1"],
 }
 CANNOT = {
     r"^v2v-convert ": "recordings that may not be redistributed",
@@ -34,13 +35,13 @@ CANNOT = {
 }
 """Reasons why command lines cannot run in this test, by pattern."""
 _BLOCK = re.compile(r"(?:^(?: {4}.*)?\n)+", re.M)
-_COMMAND = re.compile(r"^ {4}(v2v-(?!bench)[a-z]+ .*)$", re.M)
+_COMMAND = re.compile(r"^ {4}(v2v-[a-z]+ .*)$", re.M)
 _INLINE = re.compile(r"`(v2v-[a-z]+ [^`]*--out [^`]*)`")
 
 
 def blocks(page: Path) -> list[list[str]]:
     """The command lines of each code block of a page, and those in a sentence or a table that write a file, each by
-    itself. One of `v2v-bench` is not among them: those take minutes. What `uvx` installs first is left out."""
+    itself. What `uvx` installs first is left out."""
     text = re.sub(r" *\\\n\s*", " ", page.read_text(encoding="utf-8"))
     text = re.sub(r"uvx --from '\S+' ", "", text)
     in_blocks = [found for block in _BLOCK.findall(text) if (found := _COMMAND.findall(block))]

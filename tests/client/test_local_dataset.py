@@ -14,8 +14,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from bench.chaos.fleet import abandoned_memory, shared_memory
 from tests.clips import panned_luma, write_clip
+from tests.leftovers import abandoned_memory, shared_memory
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import UsageError

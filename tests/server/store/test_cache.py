@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.leases import open_leases, whole_sample
 from tests.clips import damaged, panned_luma, write_clip
+from tests.oracles.leases import open_leases, whole_sample
 from tests.server.prepare.test_lossless_served import FOLDER, FRAMES, SOUND, require_equal
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
 from v2v_protocol.messages import Lease
