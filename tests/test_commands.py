@@ -1,5 +1,5 @@
-"""Every command line that the documentation, `deploy/` and the examples show: its flags are those of the program, and a
-line of a code block is read by the program's own parser, on whatever machine it is meant to run."""
+"""Check every command line in the documentation, `deploy/` and the examples: its flags exist, and the program's own
+parser accepts each line of a code block."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import BENCHMARKS
+from bench.__main__ import BENCHES, parser_for
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -28,6 +28,7 @@ MODULES = {
     "v2v-top": "v2v_server.commands.top",
     "v2v-doctor": "v2v_server.commands.doctor",
     "v2v-keys": "v2v_server.commands.keys",
+    "v2v-tradeoff": "v2v_server.commands.tradeoff",
     "v2v-loadtest": "v2v_client.tools.loadtest",
     "v2v-train": "trainer.train",
     "v2v-eval": "trainer.evaluation.cli",
@@ -40,7 +41,7 @@ _LAUNCHED = {
     "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",
 }
-"""What `python` and `torchrun` start beside benchmarks."""
+"""What `python` and `torchrun` start beside benches."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
@@ -59,7 +60,7 @@ class _Caught(Exception):
 
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
-    """The parser with which the ``main`` of a module reads its command line."""
+    """Return the parser with which the ``main`` of a module reads its command line."""
     found: list[argparse.ArgumentParser] = []
 
     def parse(self: argparse.ArgumentParser, *_: object) -> None:
@@ -77,31 +78,31 @@ def parser_of(module: str) -> argparse.ArgumentParser:
 
 
 def flags_of(program: str) -> frozenset[str]:
-    """All flags that the program's own parser knows."""
+    """Return all flags that the program's own parser knows."""
     return frozenset(parser_of(MODULES[program])._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
-    """(program, its flags) of each command line in a text; a backslash at the end of a line goes on with the next."""
+    """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
     return [(program, _FLAG.findall(rest)) for program, rest in _LINE.findall(joined) if program in MODULES]
 
 
-def test_the_reader_of_command_lines_sees_them() -> None:
+def test_command_lines_are_found_in_texts() -> None:
     text = "Say `v2v-serve --videos DIR --bind=x`, or\n    v2v-worker --connect A \\\n      --cache B  # --no flag\n"
     assert command_lines(text) == [("v2v-serve", ["--videos", "--bind"]), ("v2v-worker", ["--connect", "--cache"])]
 
 
-def test_every_program_is_asked() -> None:
+def test_every_program_is_checked() -> None:
     named = {value.strip('"') for value in re.findall(r"^(v2v-\w+) = ", (ROOT / "pyproject.toml").read_text(), re.M)}
-    assert named - {"v2v-bench"} == set(MODULES)
+    assert named == set(MODULES)
     assert "--videos" in flags_of("v2v-serve")
     assert "--no-shuffle" in flags_of("v2v-serve")
     assert "--resume" in flags_of("v2v-train")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_flags_that_are_shown_exist(page: Path) -> None:
+def test_shown_flags_exist(page: Path) -> None:
     wrong = [
         f"{program} {flag}"
         for program, flags in command_lines(page.read_text(encoding="utf-8"))
@@ -111,7 +112,7 @@ def test_flags_that_are_shown_exist(page: Path) -> None:
     assert wrong == []
 
 
-def test_images_start_programs_with_flags_of_theirs() -> None:
+def test_images_start_programs_with_valid_flags() -> None:
     lists = [
         *re.findall(r"^(?:ENTRYPOINT|CMD) (\[.*\])$", (ROOT / "deploy" / "Dockerfile").read_text(), re.M),
         *re.findall(r"command: (\[\"--.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M),
@@ -123,18 +124,19 @@ def test_images_start_programs_with_flags_of_theirs() -> None:
 
 
 def block_lines(text: str) -> list[list[str]]:
-    """The words of each line of the code blocks of a page: without the prompt that says on which host, and without
-    variables of the environment."""
+    """Yield the words of each line in a page's code blocks, without the prompt that names the host, and without
+    environment variables."""
     text = re.sub(r" *\\\n\s*", " ", re.sub(r"^```python.*?^```", "", text, flags=re.M | re.S))
     lines = re.findall(
         r"^ {4}(?:\w+\$ +)?((?:[A-Z_]+=\S+ )*(?:v2v-|uvx |torchrun |python |pip |make |pytest ).*)$", text, re.M
     )
-    lines += re.findall(r"`((?:uvx|torchrun|python -m|pip|make|pytest) [^`]+)`", text)
+    # A sentence names a bench, with some of its flags.
+    lines += re.findall(r"`((?:uvx|torchrun|python -m(?! bench)|pip|make|pytest) [^`]+)`", text)
     return [shlex.split(re.sub(r"^(?:[A-Z_]+=\S+ )+", "", line), comments=True) for line in lines]
 
 
 def wrong_with(words: list[str]) -> str:
-    """What is wrong with a command line, or nothing."""
+    """Return what is wrong with a command line; "" if it is valid."""
     program, *rest = words
     if program == "uvx":
         return wrong_with(rest[rest.index("--from") + 2 :])
@@ -150,13 +152,11 @@ def wrong_with(words: list[str]) -> str:
         return f"there is no {missing}" if missing else ""
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
-    if program == "v2v-bench":
-        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
-    return _refused(MODULES[program], rest) if program in MODULES else "no program"
+    return _refused(parser_of(MODULES[program]), rest) if program in MODULES else "no program"
 
 
 def _wrong_with_launched(words: list[str]) -> str:
-    """Of what comes after `python` or `torchrun`: flags of theirs, then -m MODULE or a script, then its own."""
+    """Check what follows `python` or `torchrun`: their own flags, then -m MODULE or a script, then its flags."""
     if words[:1] == ["-c"]:
         return ""
     at = words.index("-m") + 1 if "-m" in words else next(n for n, word in enumerate(words) if word.endswith(".py"))
@@ -166,14 +166,14 @@ def _wrong_with_launched(words: list[str]) -> str:
     if started == "pytest":
         return wrong_with(["pytest", *rest])
     if started == "bench":
-        return _refused(f"bench.{BENCHMARKS[rest[0]]}", rest[1:]) if rest[0] in BENCHMARKS else "no benchmark"
-    module = started if started.removeprefix("bench.") in BENCHMARKS.values() else _LAUNCHED.get(started)
-    return "nothing that can be started" if module is None else _refused(module, rest)
+        return _refused(parser_for(rest[0]), rest[1:]) if rest[0] in BENCHES else "no bench"
+    module = _LAUNCHED.get(started)
+    return "nothing that can be started" if module is None else _refused(parser_of(module), rest)
 
 
-def _refused(module: str, given: list[str]) -> str:
+def _refused(parser: argparse.ArgumentParser, given: list[str]) -> str:
     try:
-        parser_of(module).parse_args(given)
+        parser.parse_args(given)
     except SystemExit as ended:
         return "" if not ended.code else f"its own parser refuses {given}"
     return ""
@@ -185,7 +185,7 @@ def test_lines_of_code_blocks_are_read_by_their_programs(page: Path) -> None:
     assert [f"{shlex.join(words)}: {wrong}" for words in lines if (wrong := wrong_with(words))] == []
 
 
-def test_what_is_wrong_with_a_line_is_seen() -> None:
+def test_faulty_command_lines_are_detected() -> None:
     text = """
     head$  KEY=a v2v-serve --videos DIR \\
         --workers 8   # and so on
@@ -196,9 +196,9 @@ def test_what_is_wrong_with_a_line_is_seen() -> None:
     assert wrong_with(serve) == wrong_with(train) == ""
     for line in (
         "v2v-serve --videos DIR --workers many", "v2v-serve --video DIR", "v2v-service", "make tests",
-        "v2v-bench nothing", "v2v-bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
-        "python -m bench.nothing", "python -m bench nothing", "uvx --from '.[server]' v2v-preview my.mp4",
-        "pip install '.[servers]'", "pytest tests/none.py",
+        "python -m bench nothing", "python -m bench chaos --minute 1", "torchrun -m trainer.train e2vid --conect A",
+        "python -m bench.nothing", "uvx --from '.[server]' v2v-preview my.mp4", "pip install '.[servers]'",
+        "pytest tests/none.py",
     ):  # fmt: skip
         assert wrong_with(shlex.split(line)), line
 
@@ -210,12 +210,12 @@ OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
-def test_programs_and_flags_that_are_named_alone_exist(page: Path) -> None:
+def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-bench", "v2v-stream", "v2v-workers"}
+    assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    modules = [*MODULES.values(), *(f"bench.{module}" for module in BENCHMARKS.values())]
-    assert named <= {flag for module in modules for flag in parser_of(module)._option_string_actions}
+    parsers = [*map(parser_of, MODULES.values()), *map(parser_for, BENCHES)]
+    assert named <= {flag for parser in parsers for flag in parser._option_string_actions}
 
 
 def test_pages_with_command_lines_are_many() -> None:

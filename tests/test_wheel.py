@@ -1,4 +1,4 @@
-"""The wheel works where nothing of the tree is: every command, the shipped configurations, types."""
+"""Test that the wheel works without the source tree: every command, the shipped configurations, types."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ran(*command: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the programs of an environment with the wheel; its dependencies are this environment's."""
+    """Return the programs' folder of an environment with the wheel, which uses this environment's dependencies."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -57,11 +57,16 @@ def test_every_command_is_there(installed: Path, tmp_path: Path, command: str) -
 
 
 def test_packages_come_from_the_wheel_with_their_types(installed: Path, tmp_path: Path) -> None:
-    packages = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer", "bench")
+    packages = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer")
     script = f"import importlib; print(*(importlib.import_module(n).__path__[0] for n in {packages}), sep='\\n')"
     for path in ran(installed / "python", "-c", script, cwd=tmp_path).splitlines():
         assert Path(path).is_relative_to(installed.parent)
         assert (Path(path) / "py.typed").is_file(), path
+
+
+def test_benches_are_not_installed(installed: Path, tmp_path: Path) -> None:
+    script = "from importlib.util import find_spec; print(find_spec('bench'))"
+    assert ran(installed / "python", "-c", script, cwd=tmp_path) == "None\n"
 
 
 def test_configurations_are_shipped(installed: Path, tmp_path: Path) -> None:

@@ -130,7 +130,8 @@ def run_command(
     except V2VError as error:
         if arguments.debug:
             traceback.print_exc()
-        print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
+        if not error.is_reported:
+            print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
         failed = isinstance(error, failures) and not isinstance(error, UsageError)
         return FAILED if failed else WRONG_USAGE
     except KeyboardInterrupt:

@@ -34,7 +34,13 @@ class RepeatedSamplesWarning(UserWarning):
 
 
 class V2VError(Exception):
-    """Base class of every exception that the project raises on purpose."""
+    """Base class of every exception that the project raises on purpose.
+
+    Attributes:
+        is_reported: whether a command has already written it to its log, so that it is not printed again.
+    """
+
+    is_reported = False
 
 
 class UsageError(V2VError):

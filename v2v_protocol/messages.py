@@ -214,12 +214,22 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class WorkerHello:
-    """A worker offers to hold ``credit`` leases at a time. ``host`` is for display."""
+    """Offer a worker that accepts ``credit`` leases at a time.
+
+    Attributes:
+        name: of the worker; no other connected worker may have it.
+        numerics_version: of the samples that it makes.
+        credit: leases that it takes at a time.
+        host: for display.
+        secret: random bytes that own the name, at most 64. A hello with the same secret, and the same key if there are
+            keys, replaces the connection before. It is never published.
+    """
 
     name: str
     numerics_version: int
     credit: int
     host: str = ""
+    secret: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

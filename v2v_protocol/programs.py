@@ -10,7 +10,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer", "bench"})
+_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer"})
 
 Program = Callable[[], int | None]
 """A function that returns the exit status; None is success."""
@@ -66,8 +66,8 @@ catalogue = _program("v2v-catalogue", "v2v_server.commands.catalogue", "main", "
 quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
 doctor = _program("v2v-doctor", "v2v_server.commands.doctor", "main", "server")
 keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")
+tradeoff = _program("v2v-tradeoff", "v2v_server.commands.tradeoff", "main", "server")
 loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
 train = _program("v2v-train", "trainer.train", "main", "trainer")
 evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")
 convert = _program("v2v-convert", "trainer.convert.cli", "main", "convert")
-bench = _program("v2v-bench", "bench.cli", "main", "dev")

@@ -37,7 +37,7 @@ from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
-from v2v_server.broker.worker_registry import REST_SECONDS
+from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
@@ -65,6 +65,8 @@ _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
+_RECORD_SECONDS = 2.0
+"""Longest time to retry writing a quarantine entry while another process writes to the file."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
 
@@ -225,6 +227,7 @@ class Server:
         self._missing_told = -math.inf
         self._blocked_due: float | None = None
         self._give_back_at = math.inf
+        self._unrecorded: list[tuple[AddToQuarantine, float]] = []  # until when each is tried
 
     def turn(self, longest_wait_seconds: float) -> None:
         """Handle the available messages, waiting for one if there are none, and do what is due.
@@ -237,8 +240,8 @@ class Server:
         now = self._clock()
         for arrival in arrivals:
             match arrival:
-                case FromWorker(identity, frames):
-                    self._carry_out(self._dispatcher.from_worker(identity, frames, now))
+                case FromWorker(identity, frames, user):
+                    self._carry_out(self._dispatcher.from_worker(identity, frames, now, user))
                 case FromConsumer(identity, frames, user):
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now, user))
                 case ConsumerGone(identity):
@@ -248,14 +251,17 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, stalled in self._supervisor.stalled(now).items():
-                self._dispatcher.worker_stalled(identity, stalled)
+            for name, stalled in self._supervisor.stalled(now).items():
+                self._dispatcher.worker_stalled(self._route(name), stalled)
+            unrecorded, self._unrecorded = self._unrecorded, []
+            for record, until in unrecorded:
+                self._carry_out(self._record(record, until))
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
                 self._say(
                     f"worker {death.identity.decode()} {death.loss.text}; its leases go to other workers", "warning"
                 )
-                self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
+                self._carry_out(self._dispatcher.worker_lost(self._route(death.identity), death.loss, now))
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
@@ -295,7 +301,7 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
-                    if not self._transport.send(message) and not self._supervisor.watches(message.identity):
+                    if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case CutOff(identity):
                     self._transport.cut(identity)
@@ -303,7 +309,7 @@ class Server:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.quarantine_recorded(record, self._record(record), now())))
+                    todo.extendleft(reversed(self._record(record, now() + _RECORD_SECONDS)))
                 case CheckVideo() as missing:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
@@ -313,23 +319,40 @@ class Server:
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""
-        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
+        name = self._name(hopeless.identity)
+        loss = self._supervisor.give_up(name, hopeless.reason) or Loss(
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
-        name = hopeless.identity.decode(errors="replace")
-        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its leases go to other workers", "warning")
+        text = f"worker {clean_name(name.decode())} {hopeless.reason}: {loss.text}; its leases go to other workers"
+        self._say(text, "warning")
         return loss
 
-    def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
+    def _name(self, identity: bytes) -> bytes:
+        """Return the name by which the supervisor knows a worker; empty if it has not said hello."""
+        return self._dispatcher.registry.name_of(identity).encode()
+
+    def _route(self, name: bytes) -> bytes:
+        """Return the routing id of a worker of the supervisor; empty if it has not said hello."""
+        return self._dispatcher.registry.named(name.decode()) or b""
+
+    def _record(self, record: AddToQuarantine, until: float) -> list[Action]:
         """Write a quarantine entry. If that fails, the server continues and logs the consequence.
 
+        Args:
+            record: the entry.
+            until: time until which the next turns retry while another process writes.
+
         Returns:
-            the lines that the quarantine has gained.
+            what the dispatcher does about it; nothing while it is retried.
         """
-        entry = record.entry
+        entry, now = record.entry, self._clock()
+        written: list[QuarantineEntry] = []
         try:
-            written = write_entry(self._quarantine_file, entry, self._quarantine)
+            written = write_entry(self._quarantine_file, entry, self._quarantine, wait_seconds=0.0)
         except (OSError, CorpusError) as error:
+            if isinstance(error, BlockingIOError) and now < until:
+                self._unrecorded.append((record, until))
+                return []
             self._say(
                 f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
                 f"be tried again, because the quarantine cannot be written: {error}",
@@ -337,10 +360,9 @@ class Server:
                 record.request,
                 video=entry.path,
             )
-            return []
         for line in written:
             self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
-        return written
+        return self._dispatcher.quarantine_recorded(record, written, now)
 
     def _check_video(self, missing: CheckVideo) -> bool:
         """Check the file against the catalogue. If it matches, warn (rate-limited, since all workers of a host fail
@@ -356,7 +378,7 @@ class Server:
         now = time.monotonic()
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
-            name = missing.identity.decode(errors="replace")
+            name = clean_name(self._name(missing.identity).decode())
             is_local = not isinstance(self._catalogue.root, Copies)
             self._say(
                 f"worker {name} failed on {missing.video}, which "

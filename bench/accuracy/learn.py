@@ -1,34 +1,35 @@
-"""What networks make of clips they never saw: simulated samples of held-out videos, by LPIPS and correlation.
+"""Judge networks on simulated samples of held-out videos, by LPIPS and correlation.
 
-    v2v-bench learn --held-out DIR --lpips squeeze BACKBONE HEADS \\
+    python -m bench learn --held-out DIR --lpips squeeze BACKBONE HEADS \\
         --weights ours=runs/firenet/last.pt --ema-weights average=runs/firenet/last.pt \\
         --normalized-weights published=firenet.pth --json FILE
 
-Every network sees the same exact samples of 128 x 128 pixels and 20 voxel grids, once under each of two sorts of
-cameras: `ordinary` has the ranges of `tiny-cpu` (thresholds .1 to .4, little noise, no pauses), `paper` those of the
-paper (thresholds .05 to 3, noise, hot pixels, pauses). The later half of every clip counts, when a network has seen
-enough events. Beside the networks stands a constant picture, the mean grey of the very frames that are judged.
+All networks get the same samples of 128 x 128 pixels and 20 voxel grids, once under each of two sets of cameras:
+`ordinary` has the ranges of `tiny-cpu` (thresholds .1 to .4, little noise, no pauses), `paper` those of the paper
+(thresholds .05 to 3, noise, hot pixels, pauses). Only the later half of every clip counts, where a network has seen
+enough events. The baseline is a constant picture: the mean grey of the judged frames.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+import contextlib
+import itertools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bench.records import Column, Record, at_least, show, write
-from bench.tradeoff.training_trade import judge
+from bench.frame import Column, Record, Report, add_whole
+from bench.processes import endless
 from trainer.losses.lpips import LPIPS
 from trainer.models import VoxelNetwork
 from trainer.weights import load_network
-from v2v_client import Batch, V2VStreamDataset
+from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 
 SIDE_PX = 128
@@ -39,6 +40,7 @@ CAMERAS: Mapping[str, Mapping[str, Any]] = {
 }
 _SEED = 2**32
 _BATCH = 4
+_LEAST_SCALE = 1e-12
 _GREY = "constant grey"
 
 _COLUMNS: tuple[Column, ...] = (
@@ -54,11 +56,7 @@ Predict = Callable[[Tensor], Tensor]
 
 
 def held_out(videos: str, samples: int) -> dict[str, tuple[Tensor, Tensor]]:
-    """What to judge by, the same for every network.
-
-    Returns:
-        By sort of cameras: voxels int8 [N, T, bins, H, W] and frames in 0 .. 1, [N, T, 1, H, W].
-    """
+    """Return the samples to judge by, by set of cameras: voxels int8 [N, T, bins, H, W], frames [N, T, 1, H, W]."""
     recipes = {
         name: Recipe(voxels_per_clip=STEPS, crop_height_px=SIDE_PX, crop_width_px=SIDE_PX, **changes)
         for name, changes in CAMERAS.items()
@@ -70,9 +68,8 @@ def held_out(videos: str, samples: int) -> dict[str, tuple[Tensor, Tensor]]:
 
 def _samples(address: str, recipe: Recipe, samples: int) -> tuple[Tensor, Tensor]:
     dataset = V2VStreamDataset(address, batch_size=1, recipe=recipe, seed=_SEED, preset="exact")
-    found: list[Batch] = []
-    while len(found) < samples:
-        found += [batch for batch, _ in zip(dataset, range(samples - len(found)), strict=False)]
+    with contextlib.closing(endless(dataset)) as batches:
+        found = list(itertools.islice(batches, samples))
     return (
         torch.cat([batch.arrays["voxels"] for batch in found]),
         torch.cat([batch.arrays["frames"] for batch in found]) / 255.0,
@@ -81,12 +78,17 @@ def _samples(address: str, recipe: Recipe, samples: int) -> tuple[Tensor, Tensor
 
 @torch.no_grad()
 def score(predict: Predict, voxels: Tensor, frames: Tensor, lpips: LPIPS | None) -> dict[str, float]:
-    """How far pictures are from the true ones: see the module; the pictures are clamped to 0 .. 1 first."""
+    """Return how far predicted pictures, clamped to 0 .. 1, are from the true ones, over the later half of the clips.
+
+    The correlation is Pearson's, of prediction and truth within a frame, averaged over frames; 0 for constant pictures.
+    """
     prediction = torch.cat([predict(piece) for piece in torch.split(voxels, _BATCH)]).clamp(0, 1)
     later = frames.shape[1] // 2
     made, true = prediction[:, later:], frames[:, later:]
+    ours, truth = ((each - each.mean(-1, keepdim=True)) for each in (made.flatten(2), true.flatten(2)))
+    scale = (ours.norm(dim=-1) * truth.norm(dim=-1)).clamp_min(_LEAST_SCALE)
     found = {
-        "correlation": judge(prediction, frames).correlation,
+        "correlation": float(((ours * truth).sum(-1) / scale).mean()),
         "mean_absolute_error": float((made - true).abs().mean()),
     }
     if lpips is not None:
@@ -101,10 +103,10 @@ def _grey(frames: Tensor) -> Predict:
 
 
 def networks(asked: argparse.Namespace) -> dict[str, VoxelNetwork]:
-    """What is to be judged, by the name on the command line.
+    """Load the networks to judge, by their names on the command line.
 
     Raises:
-        UsageError: nothing is, a name is given twice, or a file holds no network.
+        UsageError: no network is given, a name is given twice, or a file holds no network.
     """
     found: dict[str, VoxelNetwork] = {}
     for entries, options, ema in (
@@ -117,15 +119,31 @@ def networks(asked: argparse.Namespace) -> dict[str, VoxelNetwork]:
             if not (name and equals and file):
                 raise UsageError(f"{entry!r}: write NAME=FILE")
             if name in found:
-                raise UsageError(f"two networks are called {name!r}: give each a name of its own")
+                raise UsageError(f"two networks are called {name!r}: give each its own name")
             found[name] = load_network(file, options=options, ema=ema)[0]
     if not found:
         raise UsageError("no network to judge: give --weights NAME=FILE")
     return found
 
 
-def compare(asked: argparse.Namespace) -> list[Record]:
-    """One flat record for each network and sort of cameras."""
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    parser.add_argument("--held-out", required=True, metavar="DIR", help="videos that no network was trained on")
+    for flag, what in (
+        ("--weights", "a network to judge, may be repeated"),
+        ("--ema-weights", "the same, the averaged weights of a checkpoint of v2v-train"),
+        ("--normalized-weights", "the same, a network that normalises its input, as published FireNet does"),
+    ):
+        parser.add_argument(flag, action="append", default=[], metavar="NAME=FILE", help=what)
+    parser.add_argument(
+        "--lpips", nargs=3, metavar=("NET", "BACKBONE", "HEADS"), help="alex, squeeze or vgg with its weight files"
+    )
+    add_whole(parser, "--samples", 24, "samples of each set of cameras")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Judge the networks; return one record for each network and set of cameras."""
+    torch.set_num_threads(1)
     judged = networks(asked)
     lpips = None if asked.lpips is None else LPIPS.from_files(*asked.lpips)
     records: list[Record] = []
@@ -135,39 +153,4 @@ def compare(asked: argparse.Namespace) -> list[Record]:
         for name, predict in predictors.items():
             scores = score(predict, voxels, frames, lpips)
             records.append({"network": name, "cameras": cameras, "samples": len(frames), **scores})
-    return records
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns 0, or 2 (wrong usage or input)."""
-    first, _, rest = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
-        prog="v2v-bench learn", description=first, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--held-out", required=True, metavar="DIR", help="videos that no network was trained on")
-    for flag, what in (
-        ("--weights", "to judge, repeatable"),
-        ("--ema-weights", "the same, the averaged weights of a checkpoint of v2v-train"),
-        ("--normalized-weights", "the same, of a network that normalises its input, as published FireNet does"),
-    ):
-        parser.add_argument(flag, action="append", default=[], metavar="NAME=FILE", help=what)
-    parser.add_argument(
-        "--lpips", nargs=3, metavar=("NET", "BACKBONE", "HEADS"), help="alex, squeeze or vgg with its weight files"
-    )
-    parser.add_argument("--samples", type=int, default=24, help="of each sort of cameras (default 24)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records there")
-    asked = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    try:
-        at_least(asked, samples=1)
-        records = compare(asked)
-        show(records, _COLUMNS)
-        write(records, asked.json)
-    except (V2VError, OSError) as error:
-        print(f"v2v-bench learn: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return Report(records, [(records, _COLUMNS)])

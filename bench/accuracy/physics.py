@@ -1,24 +1,22 @@
-"""Error against physics: events of V2V from few frames, beside the events that were there.
+"""Measure the error of simulating from few frames, against exact events.
 
-    v2v-bench physics --video VIDEO --recording RECORDING.aedat4 --json physics.json --plot physics.png
+    python -m bench physics --video VIDEO --recording RECORDING.aedat4 --json physics.json --plot physics.png
 
-Analytic scenes have events known from formula. Photographs moved along a known path are rendered at 1200 frames a
-second, and every frame of that is simulated event by event; so is a film of true high rate (``--video``). V2V sees
-every n-th frame. Both sides start with the same residuals and are summed into the same bins. ``--recording`` sets
-simulated beside real events where a camera took both.
+Analytic scenes have events known from a formula. Photographs moved along a known path are rendered at 1200 frames a
+second, and every frame is simulated event by event; so is a film of true high rate (``--video``). V2V gets every n-th
+frame. Both sides start with the same residuals and are summed into the same bins. ``--recording`` compares the events
+of a camera with V2V's from the camera's frames, at the threshold that fires as many.
 
-    count error   (events of V2V - events) / events, an event each, however the signs go
+    count error   (events of V2V - events) / events, whatever their sign
     voxel error   sum of |V2V - true| / sum of |true|, over the signed counts of common bins and pixels
 
-Bars: scenes that never turn are exact at every frame rate; from all frames of a film, V2V and the event-by-event
-simulation of the same frames differ in no more than 60 bins of a million.
+Bars: scenes without a turn are exact at every frame rate; from all frames, V2V and the event-by-event simulation of the
+same frames differ in at most 60 bins of a million.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,20 +24,22 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage  # type: ignore[import-untyped]
 
-from bench.accuracy.physics_report import MOTION_PX, Records, plot, tables
-from bench.accuracy.recorded import compare, read_recording
-from bench.accuracy.scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
-from bench.speed.dense import bin_events, dense_events
-from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.records import write_json
-from v2v_server.flow.methods import estimator
+from bench.accuracy.sensor import BLUR_SIGMA_PX, Recording, lamps, read_recording
+from bench.frame import Column, Record, Report
+from bench.plots import panels
+from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
+from tests.oracles.dense import bin_events, dense_events
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.noise import start_uniforms
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
+Records = list[dict[str, Any]]
 Frames = npt.NDArray[np.uint8]
 Reals = npt.NDArray[np.float64]
 
@@ -53,24 +53,33 @@ SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)
 """px per rendered frame: 6 to 600 px/s."""
 VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
 LARGEST_DIFFERENCE_PPM = 60.0
-"""Bar: bins in which V2V of all frames differs from the event-by-event simulation of the same frames."""
+_RECORDED: tuple[Column, ...] = (
+    ("part", "real events", "{}", 1),
+    ("gamma", "gamma", "{:g}", 1),
+    ("events_real", "events", "{:.0f}", 1),
+    ("threshold", "c of equal count", "{:.3f}", 1),
+    ("rising_share_real", "rising", "{:.0%}", 1),
+    ("rising_share_v2v", "V2V", "{:.0%}", 1),
+    ("active_share_real", "active pixels", "{:.1%}", 1),
+    ("active_share_v2v", "V2V", "{:.1%}", 1),
+    ("correlation_signed", "signed counts", "{:.2f}", 1),
+    ("correlation_mirrored", "counts, mirrored", "{:.2f}", 1),
+)
 
 
 def analytic(threshold: float = 0.2) -> Records:
-    """Analytic scenes at several frame rates."""
+    """Return one record for each analytic scene and frame rate."""
     edges = np.linspace(0.0, SECONDS, int(RATES_HZ[0] * SECONDS) + 1)
     records: Records = []
     for scene in analytic_scenes():
         true, events = scene.events(edges, threshold)
         for rate in RATES_HZ:
             frames = scene.level(np.arange(int(rate * SECONDS) + 1)[:, None] / rate)
+            steps = len(frames) - 1
             fine = simulate_log(
-                frames[:, None],
-                threshold_pos=threshold,
-                start_residual=START_SHARE * threshold,
-                bins=len(frames) - 1,
+                frames[:, None], threshold_pos=threshold, start_residual=START_SHARE * threshold, bins=steps,
                 dtype="float32",
-            ).voxels.reshape(len(frames) - 1, -1)
+            ).voxels.reshape(steps, -1)  # fmt: skip
             records.append(
                 {"measure": "analytic", "scene": scene.name, "monotone": scene.monotone, "threshold": threshold,
                  "frame_rate_hz": rate, **errors(fine, true, events, len(edges) - 1)}
@@ -79,7 +88,7 @@ def analytic(threshold: float = 0.2) -> Records:
 
 
 def errors(fine: npt.NDArray[Any], true: npt.NDArray[np.int64], events: int, bins: int) -> dict[str, float]:
-    """Count and voxel error of V2V's steps [steps, pixels] against the true bins [bins, pixels]."""
+    """Return count and voxel error of V2V's steps [steps, pixels] against the true bins [bins, pixels]."""
     coarse = fine.reshape(bins, -1, fine.shape[-1]).sum(axis=1, dtype=np.int64)
     made = int(np.abs(fine).sum(dtype=np.int64))
     return {
@@ -92,27 +101,25 @@ def errors(fine: npt.NDArray[Any], true: npt.NDArray[np.int64], events: int, bin
     }
 
 
-def start_residuals(threshold: float, pixels: int) -> Reals:
-    """The residuals that ``simulate`` starts with under SEED."""
-    return (2.0 * start_uniforms(noise_key_of_seed(SEED), pixels).astype(np.float64) - 1.0) * threshold
-
-
 def log_intensity(grey: npt.NDArray[Any]) -> Reals:
-    """log(eps + F^gamma) of grey levels in 0 .. 1."""
+    """Return log(eps + F^gamma) of grey levels in 0 .. 1."""
     level: Reals = np.log(LOG_EPS + grey.astype(np.float64) ** GAMMA)
     return level
 
 
 def true_bins(levels: Reals, bin_frames: int, threshold: float) -> tuple[npt.NDArray[np.int64], int]:
-    """Every event of [n, pixels] levels, one second a frame: signed bins [bins, pixels], number of events."""
-    pixels, n = levels.shape[1], len(levels)
-    start = start_residuals(threshold, pixels)
+    """Return the signed bins [bins, pixels] and the number of events of [n, pixels] levels, one second a frame.
+
+    The residuals start as those of ``simulate`` under SEED.
+    """
+    n, pixels = levels.shape
+    start = (2.0 * start_uniforms(noise_key_of_seed(SEED), pixels).astype(np.float64) - 1.0) * threshold
     events = dense_events(levels, np.arange(n, dtype=np.float64), start, threshold, threshold)
     return bin_events(events, np.arange(0.0, n, bin_frames), pixels), len(events.seconds)
 
 
 def v2v_steps(frames: Frames, threshold: float) -> npt.NDArray[Any]:
-    """V2V's signed counts of every step: [steps, pixels]."""
+    """Return V2V's signed counts of every step: [steps, pixels]."""
     steps = len(frames) - 1
     return simulate(
         frames, threshold_pos=threshold, gamma=GAMMA, log_eps=LOG_EPS, bins=steps, seed=SEED, dtype="int16"
@@ -120,7 +127,7 @@ def v2v_steps(frames: Frames, threshold: float) -> npt.NDArray[Any]:
 
 
 def moved_photographs() -> Records:
-    """Photographs in motion: means over the photographs, against rendered frames as they are (light) and in 8 bits."""
+    """Return means over the moved photographs, against rendered frames in float64 (light) and in 8 bits."""
     cells: dict[tuple[Any, ...], list[dict[str, float]]] = {}
     for name in PHOTOGRAPHS:
         for speed in SPEEDS_PX:
@@ -134,17 +141,14 @@ def moved_photographs() -> Records:
                         cells.setdefault((reference, threshold, speed, every), []).append(found)
     return [
         {"measure": "moved photographs", "reference": reference, "threshold": threshold, "every": every,
-         "frame_rate_hz": RENDERED_HZ / every, "motion_px_per_frame": speed * every, **_mean(found)}
+         "frame_rate_hz": RENDERED_HZ / every, "motion_px_per_frame": speed * every}
+        | {key: float(np.mean([each[key] for each in found])) for key in found[0]}
         for (reference, threshold, speed, every), found in cells.items()
     ]  # fmt: skip
 
 
-def _mean(found: list[dict[str, float]]) -> dict[str, float]:
-    return {name: float(np.mean([each[name] for each in found])) for name in found[0]}
-
-
 def filmed(path: Path) -> Records:
-    """A film of high frame rate, the part of its picture that moves most.
+    """Return one record for each threshold and n of a film of high rate, on the square that changes most.
 
     Raises:
         V2VError: the video cannot be read, or is too short or too small.
@@ -155,88 +159,132 @@ def filmed(path: Path) -> Records:
         raise UsageError(f"--video {path}: {facts.frames} frames; give more than {VIDEO_BIN_FRAMES}")
     frames = _liveliest(decode_luma(path, facts.index, 0, count).frames, VIDEO_SIDE_PX)
     levels = log_intensity(frames.reshape(count, -1) / 255.0)
-    bins = count // VIDEO_BIN_FRAMES
     records: Records = []
-    motions = {every: _motion(frames, every) for every in VIDEO_EVERY}
     for threshold in THRESHOLDS:
         true, events = true_bins(levels, VIDEO_BIN_FRAMES, threshold)
         for every in VIDEO_EVERY:
-            fine = v2v_steps(frames[::every], threshold)
-            record = {
-                "measure": "film", "video": path.name, "threshold": threshold, "every": every,
-                "frame_rate_hz": facts.frames_per_second / every, **errors(fine, true, events, bins),
-            }  # fmt: skip
-            coarse = fine.reshape(bins, -1, fine.shape[-1]).sum(axis=1, dtype=np.int64)
-            for low, high in itertools.pairwise(MOTION_PX):
-                chosen = (motions[every] >= low) & (motions[every] < high)
-                net = int(np.abs(true[chosen]).sum())
-                share = float(np.abs(coarse - true)[chosen].sum() / net) if net else None
-                record[f"voxel_error_of_{low:g}_to_{high:g}_px_per_frame"] = share
-                record[f"bins_of_{low:g}_to_{high:g}_px_per_frame"] = int(chosen.sum())
-            records.append(record)
+            found = errors(v2v_steps(frames[::every], threshold), true, events, count // VIDEO_BIN_FRAMES)
+            rate = facts.frames_per_second / every
+            records.append(
+                {"measure": "film", "video": path.name, "threshold": threshold, "every": every, "frame_rate_hz": rate}
+                | found
+            )
     return records
 
 
 def _liveliest(frames: Frames, side: int) -> Frames:
-    """The square of that side whose grey levels change most."""
+    """Return the square of that side whose grey levels change most."""
     if min(frames.shape[1:]) < side:
         raise UsageError(f"--video: {frames.shape[2]}x{frames.shape[1]} pixels; give at least {side}x{side}")
-    change = np.zeros(frames.shape[1:])
-    for first, second in zip(frames[:-8:8], frames[8::8], strict=True):
-        change += cv2.absdiff(first, second)
+    change = np.abs(np.diff(frames[::8].astype(np.int16), axis=0)).sum(axis=0, dtype=np.float64)
     activity = cv2.boxFilter(change, -1, (side, side), anchor=(0, 0), normalize=False)
     places = activity[: frames.shape[1] - side + 1, : frames.shape[2] - side + 1]
     top, left = (int(place) for place in np.unravel_index(np.argmax(places), places.shape))
     return np.ascontiguousarray(frames[:, top : top + side, left : left + side])
 
 
-def _motion(frames: Frames, every: int) -> Reals:
-    """Length of the flow over ``every`` frames in the middle of each bin, [bins, pixels], px; dense inverse search."""
-    estimate = estimator("dis-fast-1")
-    middle = range(VIDEO_BIN_FRAMES // 2, len(frames) - 1, VIDEO_BIN_FRAMES)
-    fields = [estimate(frames[i - every // 2], frames[i - every // 2 + every]) for i in middle]
-    return np.stack([np.linalg.norm(field, axis=-1).ravel() for field in fields]).astype(np.float64)
+def recorded(recording: Recording) -> Records:
+    """Return one record for each gamma and part of a recording, at the threshold that fires as many events."""
+    counts = recording.counts(recording.seconds[0], recording.seconds[-1])
+    bright = lamps(recording.frames)
+    records: Records = []
+    for gamma in (1.0, 2.2):
+        made = {
+            c: simulate(
+                recording.frames, threshold_pos=c, gamma=gamma, bins=len(recording.frames) - 1, dtype="int16"
+            ).voxels[0].astype(np.float64)
+            for c in np.geomspace(0.03, 1.0, 36).tolist()
+        }  # fmt: skip
+        for part, mask in (("whole picture", np.ones_like(bright)), ("without the lamps", ~bright)):
+            real = float(sum(side[mask].sum() for side in counts))
+            threshold = min(made, key=lambda c: abs(np.abs(made[c][:, mask]).sum() - real))
+            v2v = [np.maximum(sign * made[threshold], 0).sum(0) for sign in (1, -1)]
+            pairs = {
+                "signed": (counts[0] - counts[1], v2v[0] - v2v[1]),
+                "mirrored": ((counts[0] + counts[1])[:, ::-1], v2v[0] + v2v[1]),  # a control
+            }
+            records.append(
+                {"measure": "recorded", "part": part, "gamma": gamma, "events_real": real, "threshold": threshold}
+                | {f"rising_share_{name}": float(side[0][mask].sum() / max(1.0, (side[0] + side[1])[mask].sum()))
+                   for name, side in (("real", counts), ("v2v", v2v))}
+                | {f"active_share_{name}": float(((side[0] + side[1]) > 0)[mask].mean())
+                   for name, side in (("real", counts), ("v2v", v2v))}
+                | {f"correlation_{name}": float(np.corrcoef(
+                       *(ndimage.gaussian_filter(each, BLUR_SIGMA_PX)[mask] for each in pair))[0, 1])
+                   for name, pair in pairs.items()}
+            )  # fmt: skip
+    return records
 
 
-def missed_bars(records: Records) -> list[str]:
-    """What is not as the module's docstring promises."""
-    missed = []
+def missed(records: Sequence[Record]) -> list[str]:
+    """Return the bars that these records miss."""
+    texts = []
     for r in records:
         if r.get("monotone") and (r["count_error"] or r["voxel_error"]):
-            missed.append(f"{r['scene']} at {r['frame_rate_hz']} fps: voxel error {r['voxel_error']:.2e}, promised 0")
+            texts.append(f"{r['scene']} at {r['frame_rate_hz']} Hz: voxel error {r['voxel_error']:.2e}; the bar is 0")
         all_frames = r["measure"] == "film" or r.get("reference") == "8-bit frames"
         if all_frames and r["every"] == 1 and r["differing_bins_ppm"] > LARGEST_DIFFERENCE_PPM:
-            what = f"{r['measure']} at c = {r['threshold']:g}"
-            missed.append(f"{what}: {r['differing_bins_ppm']:.0f} ppm of bins differ > {LARGEST_DIFFERENCE_PPM:.0f}")
-    return missed
+            found = f"{r['differing_bins_ppm']:.0f} ppm of bins differ"
+            texts.append(f"{r['measure']} at c = {r['threshold']:g}: {found}; the bar is {LARGEST_DIFFERENCE_PPM:.0f}")
+    return texts
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns 0, 1 (a bar missed) or 2 (wrong usage or input)."""
-    parser = argparse.ArgumentParser(prog="v2v-bench physics", description=(__doc__ or "").split("\n")[0])
+def pivot(records: Sequence[Record], down: dict[str, str], across: str, unit: str) -> tuple[Records, list[Column]]:
+    """Return a table of "count error / voxel error" cells: a row for each value of ``down``, columns by ``across``."""
+    rows: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for r in records:
+        row = rows.setdefault(tuple(r[key] for key in down), {key: r[key] for key in down})
+        # Without true events in any bin there is no relative voxel error.
+        voxel_error = f"{r['voxel_error']:.1%}" if r["voxel_net_true"] else "-"
+        row[f"{r[across]:g}"] = f"{r['count_error']:.1%} / {voxel_error}"
+    columns: list[Column] = [(key, title, "{}", 1) for key, title in down.items()]
+    ends = sorted({r[across] for r in records})
+    return list(rows.values()), columns + [(f"{end:g}", f"{unit} {end:g}", "{}", 1) for end in ends]
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
     parser.add_argument("--video", type=Path, metavar="FILE", help="a film of high frame rate")
     parser.add_argument("--recording", type=Path, metavar="FILE.aedat4", help="frames and events of one camera")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png")
-    asked = parser.parse_args(arguments)
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
     cv2.setNumThreads(1)
-    try:
-        recorded = compare(read_recording(asked.recording)) if asked.recording is not None else []
-        film = filmed(asked.video) if asked.video is not None else []
-        records = [*analytic(), *moved_photographs(), *film, *recorded]
-        print("\n".join(tables(records)))
-        if asked.json is not None:
-            write_json(asked.json, records)
-        if asked.plot is not None:
-            plot(records, asked.plot)
-    except (V2VError, OSError) as error:
-        print(f"v2v-bench physics: {error}", file=sys.stderr)
-        return 2
-    missed = missed_bars(records)
-    for line in missed:
-        print(f"bar missed: {line}", file=sys.stderr)
-    return 1 if missed else 0
+    scenes, photographs = analytic(), moved_photographs()
+    film = [] if asked.video is None else filmed(asked.video)
+    tables = [
+        pivot(scenes, {"scene": "count / voxel error at c = 0.2", "events_true": "events"}, "frame_rate_hz", "Hz")
+    ]
+    for reference in ("light", "8-bit frames"):
+        chosen = [r for r in photographs if r["reference"] == reference]
+        title = f"photographs against {reference}: px a frame"
+        tables.append(pivot(chosen, {"motion_px_per_frame": title, "frame_rate_hz": "Hz"}, "threshold", "c ="))
+    if film:
+        tables.append(pivot(film, {"every": "film, every n-th frame", "frame_rate_hz": "Hz"}, "threshold", "c ="))
+    real = [] if asked.recording is None else recorded(read_recording(asked.recording))
+    records = [*scenes, *photographs, *film, *real]
+    return Report(records, [*tables, (real, _RECORDED)] if real else tables, missed=missed(records))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def plot(records: Sequence[Record], file: Path) -> None:
+    """Draw the voxel error against frame rate and motion."""
+    scenes = [r for r in records if r["measure"] == "analytic" and not r["monotone"] and r["voxel_net_true"]]
+    moved = [r for r in records if r.get("reference") == "light" and r["every"] == EVERY[-1]]
+    film = [r for r in records if r["measure"] == "film" and r["every"] > 1]
+    groups = (
+        ("formulas, c = 0.2", scenes, "scene", "frame_rate_hz", "frames a second"),
+        ("photographs at 25 frames a second", moved, "threshold", "motion_px_per_frame", "motion, px a frame"),
+        ("film", film, "threshold", "frame_rate_hz", "frames a second"),
+    )
+    with panels(file, 3, title="Voxel error of frames against an exact sensor") as axes:
+        for axis, (title, chosen, line, along, label) in zip(axes, groups, strict=True):
+            for name in dict.fromkeys(r[line] for r in chosen):
+                points = [(r[along], r["voxel_error"]) for r in chosen if r[line] == name]
+                axis.plot(
+                    *zip(*sorted(points), strict=True), "o-", ms=3, label=name if line == "scene" else f"c = {name:g}"
+                )
+            axis.set(title=title, xlabel=label, ylabel="voxel error", xscale="log", yscale="log", ylim=(1e-4, 3))
+            axis.grid(alpha=0.3)
+            if chosen:
+                axis.legend(fontsize=6)

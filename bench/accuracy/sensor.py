@@ -1,34 +1,40 @@
-"""Which log offset, and which effects, follow a real sensor: simulated beside recorded voxels of one camera.
+"""Compare simulated with recorded events of one camera, by log offset and effect.
 
-    v2v-bench sensor --recording davis346_aestream.aedat4 --json sensor.json
+    python -m bench sensor --recording davis346_aestream.aedat4 --json sensor.json
 
 The frames of a recording are simulated, one bin from each frame to the next, and compared with the events that the same
-pixels recorded in that time. At every setting the threshold is the one that fires as many events as the camera did.
+pixels recorded in that time. Each setting uses the threshold that fires as many events as the camera did.
 
     pixels     correlation of the signed counts of every pixel and bin
     blurred    the same, both blurred by 2 px: events of two cameras never coincide to the pixel
-    ceiling    that of the frames' own change of log intensity, which no threshold has cut into events
+    mirrored   the same as pixels with the simulation mirrored: a control
+    ceiling    correlation of the frames' change of log intensity, before a threshold turns it into events
 
-Lamps and what is near them are left out: their flicker is not in the frames.
+Lamps and their surroundings are left out, because frames do not show their flicker.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage  # type: ignore[import-untyped]
 
-from bench.accuracy.recorded import BLUR_SIGMA_PX, Recording, lamps, read_recording
-from v2v_protocol.errors import V2VError
-from v2v_protocol.records import write_json
+from bench.frame import Column, Report
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate
 
+BLUR_SIGMA_PX = 2.0
+"""Blur of both counts before they are correlated: single events of two cameras never coincide."""
+LAMP_LEVEL, LAMP_MARGIN_PX = 250, 12
+Image = npt.NDArray[np.float64]
 LOG_OFFSETS = (0.001, 0.003, 0.01, 0.03, 0.05, 0.1, 0.15, 0.2, 0.5)
 EFFECTS: Mapping[str, Mapping[str, float]] = {
     "none": {},
@@ -41,12 +47,83 @@ EFFECTS: Mapping[str, Mapping[str, float]] = {
     "photoreceptor_hz 30": {"photoreceptor_hz": 30.0},
 }
 _THRESHOLDS = np.geomspace(0.01, 1.0, 60)
+_COLUMNS: tuple[Column, ...] = (
+    ("gamma", "gamma", "{:.1f}", 1),
+    ("log_eps", "log_eps", "{:.3f}", 1),
+    ("first_residual", "residual", "{}", 1),
+    ("threshold", "c", "{:.3f}", 1),
+    ("correlation_pixels", "pixels", "{:.3f}", 1),
+    ("correlation_blurred", "blurred", "{:.3f}", 1),
+    ("correlation_pixels_mirrored", "mirrored", "{:.3f}", 1),
+    ("ceiling_pixels", "ceiling", "{:.3f}", 1),
+    ("effect", "effect", "{}", 1),
+)
 Counts = npt.NDArray[np.float64]
 """[bins, h, w] signed events."""
 
 
+@dataclass(frozen=True)
+class Recording:
+    """Frames and events of one camera.
+
+    Attributes:
+        frames: [n, h, w] uint8.
+        seconds: [n] middle of each exposure, from the first frame's.
+        events: [m] structured, fields ``t`` (seconds, same clock), ``x``, ``y``, ``on``.
+    """
+
+    frames: npt.NDArray[np.uint8]
+    seconds: npt.NDArray[np.float64]
+    events: npt.NDArray[Any]
+
+    def counts(self, begin: float, end: float) -> tuple[Image, Image]:
+        """Return the rising and falling events of each pixel with begin < t <= end, [h, w] each."""
+        chosen = self.events[(self.events["t"] > begin) & (self.events["t"] <= end)]
+        height, width = self.frames.shape[1:]
+        cell = chosen["y"].astype(np.int64) * width + chosen["x"]
+        rising, falling = (
+            np.bincount(cell[chosen["on"] == on], minlength=height * width).reshape(height, width).astype(np.float64)
+            for on in (True, False)
+        )
+        return rising, falling
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a recording in the AEDAT 4 format.
+
+    Raises:
+        UsageError: faery is not installed, or the file does not hold two frames and events.
+    """
+    try:
+        import faery
+    except ImportError as error:
+        raise UsageError("--recording needs faery: pip install '.[convert]' in a checkout of v2v-stream") from error
+    if not path.is_file():
+        raise UsageError(f"--recording {path}: no such file")
+    frames, times, parts = [], [], []
+    for track, packet in faery.aedat.Decoder(path):
+        if track.data_type == "frame":
+            frames.append(packet.pixels)
+            times.append((packet.exposure_start_t + packet.exposure_end_t) / 2)
+        elif track.data_type == "events":
+            parts.append(packet)
+    if len(frames) < 2 or not parts:
+        raise UsageError(f"--recording {path}: {len(frames)} frames and {len(parts)} packets of events; give both")
+    raw = np.concatenate(parts)
+    events = np.empty(len(raw), [("t", "f8"), ("x", "i8"), ("y", "i8"), ("on", "?")])
+    events["t"] = (raw["t"].astype(np.float64) - times[0]) * 1e-6
+    events["x"], events["y"], events["on"] = raw["x"], raw["y"], raw["on"]
+    return Recording(np.stack(frames), (np.array(times) - times[0]) * 1e-6, events)
+
+
+def lamps(frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    """Return a mask [h, w] of the pixels that are clipped at any time, and their surroundings."""
+    clipped = (frames.max(axis=0) >= LAMP_LEVEL).astype(np.uint8)
+    return cv2.dilate(clipped, np.ones((2 * LAMP_MARGIN_PX + 1,) * 2, np.uint8)).astype(bool)
+
+
 class Sensor:
-    """A recording, and what was recorded in it."""
+    """A recording, as the truth that simulations are compared with."""
 
     def __init__(self, recording: Recording) -> None:
         self._frames = recording.frames
@@ -58,7 +135,7 @@ class Sensor:
         self._rate = len(counts) / float(recording.seconds[-1])
 
     def record(self, gamma: float, log_eps: float, residual: float | None, **effects: float) -> dict[str, Any]:
-        """The threshold of equal count, and how alike the events are there."""
+        """Return the threshold of equal count and the correlations at it."""
         made = {c: self._simulated(c, gamma, log_eps, residual, effects) for c in map(float, _THRESHOLDS)}
         threshold = min(made, key=lambda c: abs(float(np.abs(made[c][:, self._used]).sum()) - self._events))
         change = np.diff(np.log(log_eps + (self._frames / 255.0) ** gamma), axis=0)
@@ -84,7 +161,7 @@ class Sensor:
         return counts
 
     def _alike(self, made: Counts, blur_px: float) -> float:
-        """Pearson's correlation with the recorded events over all used pixels of all bins."""
+        """Return Pearson's correlation with the recorded events over all used pixels of all bins."""
         one, other = (
             np.stack([ndimage.gaussian_filter(each, blur_px) for each in counts])[:, self._used].ravel()
             for counts in (self._recorded, made)
@@ -92,8 +169,8 @@ class Sensor:
         return float(np.corrcoef(one, other)[0, 1])
 
 
-def measure(recording: Recording) -> list[dict[str, Any]]:
-    """One record a setting: all log offsets, then the effects at the best of them."""
+def records_of(recording: Recording) -> list[dict[str, Any]]:
+    """Return one record for each setting: all log offsets, then the effects at the best of them."""
     sensor = Sensor(recording)
     offsets = [
         {"measure": "log offset", **sensor.record(gamma, log_eps, residual)}
@@ -109,36 +186,12 @@ def measure(recording: Recording) -> list[dict[str, Any]]:
     return [*offsets, *effects]
 
 
-def report(records: Sequence[Mapping[str, Any]]) -> str:
-    """The records as a table."""
-    lines = [
-        f"{'gamma':>5s}{'log_eps':>9s}{'residual':>10s}{'c':>8s}{'pixels':>9s}{'blurred':>9s}{'mirrored':>10s}{'ceiling':>9s}"
-    ]
-    for r in records:
-        lines.append(
-            f"{r['gamma']:5.1f}{r['log_eps']:9.3f}{r['first_residual']:>10s}{r['threshold']:8.3f}"
-            f"{r['correlation_pixels']:9.3f}{r['correlation_blurred']:9.3f}{r['correlation_pixels_mirrored']:10.3f}"
-            f"{r['ceiling_pixels']:9.3f}  {r.get('effect', '')}".rstrip()
-        )
-    return "\n".join(lines)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns 0 or 2 (wrong usage or input)."""
-    parser = argparse.ArgumentParser(prog="v2v-bench sensor", description=(__doc__ or "").split("\n")[0])
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
     parser.add_argument("--recording", type=Path, required=True, metavar="FILE.aedat4", help="frames and events")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    asked = parser.parse_args(arguments)
-    try:
-        records = measure(read_recording(asked.recording))
-        print(report(records))
-        if asked.json is not None:
-            write_json(asked.json, records)
-    except (V2VError, OSError) as error:
-        print(f"v2v-bench sensor: {error}", file=sys.stderr)
-        return 2
-    return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
+    records = records_of(read_recording(asked.recording))
+    return Report(records, [(records, _COLUMNS)])

@@ -1,8 +1,8 @@
-"""A consumer of the chaos test: a process that streams, logs what it got, saves its state, and may be killed anywhere.
+"""A consumer of the chaos bench: a process that streams, logs its samples, saves its state, and may be killed anywhere.
 
     python -m bench.chaos.consumer --address tcp://127.0.0.1:5555 --profile 0 --folder DIR
 
-It goes on from the state in DIR, if there is one, until SIGTERM.
+It continues from the state in DIR, if there is one, until SIGTERM.
 """
 
 from __future__ import annotations
@@ -12,44 +12,13 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from bench.chaos.log import BatchLine, LifeLine, LogWriter, sighting
+from tests.oracles.stream import Profile
+from tests.oracles.stream_log import BatchLine, LifeLine, LogWriter, sighting
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import V2VError
-from v2v_protocol.spec import StreamSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """What one consumer asks for, and how fast it is.
-
-    Attributes:
-        spec: fields of its stream's spec.
-        seed, batch_size: of its stream.
-        think_seconds: pause after each batch.
-        save_every: batches between two savings of the state, as a trainer has steps between two checkpoints.
-    """
-
-    spec: Mapping[str, Any]
-    seed: int
-    batch_size: int
-    think_seconds: float = 0.0
-    save_every: int = 1
-
-    @property
-    def stream_spec(self) -> StreamSpec:
-        """The resolved spec, which must not depend on the server's defaults."""
-        return StreamSpec.from_dict(self.spec)
-
-    @property
-    def stream(self) -> str:
-        """Names the stream: equal names must mean equal bytes."""
-        return f"{self.stream_spec.digest}:{self.seed}"
-
 
 _SMALL = {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
 PROFILES = (
@@ -67,33 +36,33 @@ PROFILES = (
         think_seconds=0.2,
         save_every=3,
     ),
-    # The stream of the first one in other batches: all samples of the two are compared with each other.
+    # The stream of the first one in other batches: the samples of the two are compared with each other.
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=5, think_seconds=0.05),
 )
 """Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings."""
 
 
 def profile(number: int) -> Profile:
-    """That of consumer ``number``; they repeat when there are more consumers than profiles."""
+    """Return the profile of consumer ``number``; profiles repeat after the last."""
     return PROFILES[number % len(PROFILES)]
 
 
 def log_path(folder: Path) -> Path:
-    """The log in a consumer's folder."""
+    """Return the path of the log in a consumer's folder."""
     return folder / "log.jsonl"
 
 
-def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, told: Callable[[], bool]) -> None:
-    """Streams until the process is told to end.
+def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, stopped: Callable[[], bool]) -> None:
+    """Stream until ``stopped`` returns True.
 
     Args:
         address, asked, folder, timeout_seconds: as on the command line.
-        told: whether it was: Python drops an exception that a signal's handler raises within a finalizer.
+        stopped: whether SIGTERM has arrived: Python drops an exception that a signal handler raises in a finalizer.
 
     Raises:
-        V2VError: what the dataset raises: nothing that the chaos test does may cause it.
+        V2VError: as the dataset raises it; no fault of the chaos bench may cause one.
     """
-    # Here, because the checker reads the profiles without PyTorch.
+    # Import lazily: the fleet reads the profiles without PyTorch.
     from v2v_client.dataset import V2VStreamDataset
 
     dataset = V2VStreamDataset(
@@ -103,7 +72,7 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
         rank=0,
         world_size=1,
         timeout_seconds=timeout_seconds,
-        shared_memory=not leaves_host(address),  # another host may be played by this one (bench/link)
+        shared_memory=not leaves_host(address),  # a network namespace may stand for another host
         **asked.spec,
     )
     state_path = folder / "state.json"
@@ -118,9 +87,9 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
     log = LogWriter(log_path(folder))
     try:
         log.append(LifeLine(lives, committed, time.monotonic()))
-        while not told():
+        while not stopped():
             for batch in dataset:
-                if told():
+                if stopped():
                     return
                 arrays = {name: tensor.numpy() for name, tensor in batch.arrays.items()}
                 samples = tuple(
@@ -137,30 +106,30 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
 
 
 def _replace(path: Path, text: str) -> None:
-    """Whoever reads the file sees the old text or the new one."""
+    """Write the file atomically: readers see the old text or the new one."""
     partial = path.with_suffix(".partial")
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+def main() -> int:
+    """Run the consumer; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.chaos.consumer", description=__doc__)
     parser.add_argument("--address", required=True)
     parser.add_argument("--profile", type=int, required=True)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--timeout-seconds", type=float, default=60.0)
-    asked = parser.parse_args(arguments)
-    told = False
+    asked = parser.parse_args()
+    stopped = False
 
     def leave(number: int, frame: object) -> None:
-        nonlocal told
-        told = True
-        sys.exit(0)  # an exception, so that the dataset and its socket are closed as at the end of any program
+        nonlocal stopped
+        stopped = True
+        sys.exit(0)  # an exception, so that the dataset and its socket are closed
 
     signal.signal(signal.SIGTERM, leave)
     try:
-        consume(asked.address, profile(asked.profile), asked.folder, asked.timeout_seconds, lambda: told)
+        consume(asked.address, profile(asked.profile), asked.folder, asked.timeout_seconds, lambda: stopped)
     except V2VError as error:
         print(f"consumer {asked.profile}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

@@ -1,21 +1,21 @@
-"""What the chaos test does to its processes: the kinds of faults, how often each comes, and who is hit.
+"""The faults of the chaos bench: their kinds, how often each occurs, and the processes that they hit.
 
-    worker-kill, -term, -segv     one of the server's own workers ends by that signal
-    worker-hang                   it is stopped for good: the server's watchdog has to end it
-    worker-pause                  it is stopped and goes on a little later
+    worker-kill, -term, -segv     one of the server's workers ends by that signal
+    worker-hang                   one is stopped for good: the server's watchdog must end it
+    worker-pause                  one is stopped and continues a little later
     further-add                   one more worker joins by `v2v-worker --connect`
-    further-kill, -term           it is removed
-    further-pause                 it is stopped, perhaps until its leases are given to others, then goes on
-    server-kill                   kill -9; it is started again on the same address
-    consumer-kill                 kill -9; it goes on from the state it saved last
-    consumer-pause                it is stopped for a few seconds: it must hold up nobody else
-    peers-parts, -headers, ...    eight hostile consumers for some seconds, see :mod:`bench.chaos.hostile`
+    further-kill, -term           a further worker ends
+    further-pause                 one is stopped, perhaps until its leases are reassigned, then continues
+    server-kill                   SIGKILL; the server restarts on the same address
+    consumer-kill                 SIGKILL; the consumer resumes from its last saved state
+    consumer-pause                one is stopped for a few seconds; it must not hold up the others
+    peers-parts, -headers, ...    eight hostile peers for some seconds, see :mod:`bench.chaos.hostile`
     peers-slow                    an honest one whose samples take long
     cache-delete                  with a cache: its folder is deleted
-    cache-flip, -cut              one byte of a piece of it is another, or its end is missing
+    cache-flip, -cut              one bit of a cached file is flipped, or its end is cut off
 
-A SEGV is blamed on the sequence in work, by design, and two of them take that video out of the corpus for good. There
-are fewer than videos, for a long clip may be a video's only sequence.
+A SIGSEGV is blamed on the sequence in work, by design, and two of them quarantine its video. They are fewer than the
+videos, because a long clip may be a video's only sequence.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ WEIGHTS = {
     "cache-flip": 2.0,
     "cache-cut": 2.0,
 }
-"""How often each kind is chosen, relative to the others."""
+"""Relative frequency of each kind."""
 _SIGNALS = {"kill": signal.SIGKILL, "term": signal.SIGTERM, "segv": signal.SIGSEGV, "hang": signal.SIGSTOP}
 _MOST_FURTHER_WORKERS = 2
 _LONGEST_TRUCE_SECONDS = 20.0
@@ -58,12 +58,12 @@ _LONGEST_SIEGE_SECONDS = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that was done to a process.
+    """A fault that was committed.
 
     Attributes:
         kind: see the module.
-        at: when, on the monotonic clock.
-        consumer: the number of the consumer it was done to, if it was one.
+        at: time on the monotonic clock.
+        consumer: number of the consumer that it hit, if any.
     """
 
     kind: str
@@ -72,20 +72,19 @@ class Fault:
 
     @property
     def is_kill(self) -> bool:
-        """Whether it ended the process, at once or by the watchdog."""
+        """Return whether it ended the process, at once or by the watchdog."""
         return self.kind.partition("-")[2] in _SIGNALS
 
 
 @dataclass(slots=True)
 class Chaos:
-    """Chooses and commits faults.
+    """Choose and commit faults.
 
     Args:
         fleet: the processes.
-        mean_seconds: between two faults; the gaps are exponentially distributed, and longer where nobody got a batch
-            since the last fault.
+        mean_seconds: between two faults; gaps are exponentially distributed, and longer until a consumer gets a batch.
         seed: of all choices.
-        most_segv: most faults of that kind.
+        most_segv: largest number of SIGSEGV faults.
         kinds: to choose from.
 
     Attributes:
@@ -109,7 +108,7 @@ class Chaos:
         self._random = random.Random(self.seed)
 
     def act(self, now: float) -> None:
-        """Does what is due. To be called often."""
+        """Do what is due; must be called often."""
         self._continue([pid for until, pid in self._paused if until <= now])
         self._paused = [(until, pid) for until, pid in self._paused if until > now]
         self._dismiss([peers for until, peers in self._peers if until <= now])
@@ -125,12 +124,14 @@ class Chaos:
             self._last, self._logged = now, self.fleet.logged_bytes()
 
     def _progressed(self, now: float) -> bool:
-        """Whether anybody got a batch since the last fault: on a busy host, workers that are killed while they still
-        start would otherwise never make a sample, and nothing would be tested."""
+        """Return whether a consumer got a batch since the last fault.
+
+        On a busy host, workers that are killed during their start would otherwise never make a sample.
+        """
         return self.fleet.logged_bytes() != self._logged or now - self._last > _LONGEST_TRUCE_SECONDS
 
     def end(self) -> None:
-        """No more faults; whoever is paused goes on, and hostile peers go."""
+        """End all faults: continue paused processes, end hostile peers."""
         self._continue([pid for _, pid in self._paused])
         self._dismiss([peers for _, peers in self._peers])
         self._paused, self._peers = [], []
@@ -142,7 +143,7 @@ class Chaos:
         if who == "worker":
             return bool(self.fleet.server_workers())
         if who == "server":
-            # One that is not up yet may be killed as well, but a corpus on a busy host would never be served.
+            # Kill only a ready server: otherwise a busy host may never serve the corpus.
             return self.fleet.server.pid is not None and self.fleet.port_file.exists()
         if who == "peers":
             return not self._peers
@@ -166,7 +167,7 @@ class Chaos:
         elif who == "worker":
             pids = self.fleet.server_workers()
             if not pids:
-                return  # the last one died since we looked
+                return  # the last one has ended meanwhile
             self._signal(self._random.choice(pids), how, now)
         else:
             crowd = self.fleet.crowd
@@ -181,7 +182,7 @@ class Chaos:
     def _spoil(self, how: str) -> None:
         folder, pieces = self.fleet.clip_cache, self.fleet.cached_pieces()
         if folder is None or not pieces:
-            return  # a worker removed the last one since we looked
+            return  # a worker removed the last one meanwhile
         if how == "delete":
             shutil.rmtree(folder, ignore_errors=True)
             return
@@ -197,17 +198,18 @@ class Chaos:
 
     def _signal(self, pid: int, how: str, now: float) -> None:
         if how == "pause":
-            longest = 2.0 * self.fleet.lease_deadline_seconds if pid in self._further() else 4.0
+            longest = (
+                2.0 * self.fleet.lease_deadline_seconds
+                if pid in {place.pid for place in self.fleet.further_workers}
+                else 4.0
+            )
             self._paused.append((now + self._random.uniform(0.2, longest), pid))
-        with contextlib.suppress(ProcessLookupError):  # it was dying already
+        with contextlib.suppress(ProcessLookupError):  # it has ended already
             os.kill(pid, _SIGNALS.get(how, signal.SIGSTOP))
-
-    def _further(self) -> set[int]:
-        return {place.pid for place in self.fleet.further_workers if place.pid is not None}
 
     def _continue(self, pids: list[int]) -> None:
         for pid in pids:
-            with contextlib.suppress(ProcessLookupError):  # somebody killed it meanwhile
+            with contextlib.suppress(ProcessLookupError):  # it was killed meanwhile
                 os.kill(pid, signal.SIGCONT)
 
     @staticmethod

@@ -1,15 +1,13 @@
-"""The processes of the chaos test: one server with its workers, further workers, consumers; started, watched, started
-again when they end, and ended.
+"""The processes of the chaos bench: a server with its workers, further workers, and consumers.
 
-Everything runs with TMPDIR in the test's folder and with one variable in its environment by which it is found again,
-whoever its parent is by then.
+The fleet starts them, restarts those that end, and stops them. Each has its TMPDIR in the run's folder, and a variable
+in its environment by which it is found after its parent has ended.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import socket
 import subprocess
@@ -24,28 +22,26 @@ import psutil
 
 from bench.chaos.consumer import log_path
 from bench.chaos.keyring import KeyRing
+from bench.processes import free_ports, last_in_line
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 
 MARK = "V2V_CHAOS_RUN"
 _STOP_SECONDS = 30.0
 _LAST_WORDS_SECONDS = 5.0
-_PORTS = range(20_000, 30_000)
-"""Below the ports that the kernel gives to outgoing connections. A consumer that reconnects to a dead server's port
-could else be given that very port for its own end, connect to itself and keep the address (TCP simultaneous open)."""
 
 
 @dataclass(slots=True)
 class Process:
-    """One place in the fleet, and the process that has it now.
+    """One place in the fleet, and its current process.
 
     Attributes:
         name: "server", "consumer 0", "worker 3".
         command: the program.
-        folder: its log goes here.
-        process: None when it is not there.
+        folder: for its log.
+        process: None before the first start.
         expected: its end was caused on purpose.
-        side: whose key it comes with, where the server takes nobody without: "consumer", "worker", "" for none.
+        side: key that it uses, if the server requires keys: "consumer", "worker", or "" for none.
     """
 
     name: str
@@ -57,21 +53,21 @@ class Process:
 
     @property
     def pid(self) -> int | None:
-        """None when it does not run."""
+        """Return the process id; None when it does not run."""
         return None if self.process is None or self.process.poll() is not None else self.process.pid
 
     def last_lines(self, most: int = 1) -> str:
-        """Of what it wrote to its standard error."""
+        """Return the last lines of its standard error."""
         file = self.folder / "stderr"
         if not file.exists():
-            return "(it was not started)"
+            return "(not started)"
         lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return "\n".join(lines[-most:]) or "(it wrote nothing)"
+        return "\n".join(lines[-most:]) or "(no output)"
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A process that ended although nobody had touched it."""
+    """A process that ended without a fault."""
 
     name: str
     status: int
@@ -80,23 +76,24 @@ class Failure:
 
 @dataclass(slots=True)
 class Fleet:
-    """
+    """A server, consumers and further workers.
+
     Args:
-        folder: for everything that is written.
+        folder: a new folder for all files.
         videos: the corpus.
-        workers: of the server's own.
-        consumers: how many.
-        lease_deadline_seconds: for the server.
-        server_module: what is run as the server.
-        server_flags: more of its flags.
-        clip_cache: folder of decoded clips, for the server's own workers; None: they keep none.
-        host: where the server listens.
-        elsewhere: what the commands of consumers and further workers begin with, to run them on another host.
-        keyed: the server takes nobody without a key, and all is encrypted.
+        workers: of the server.
+        consumers: their number.
+        lease_deadline_seconds: of the server.
+        server_module: module to run as the server.
+        server_flags: more flags of the server.
+        clip_cache: cache of decoded clips of the server's workers; None: no cache.
+        host: address of the server.
+        elsewhere: prefix of the commands of consumers and further workers, to run them on another host.
+        keyed: whether the server requires keys.
 
     Attributes:
-        failures: processes that ended unasked.
-        ready_at: when servers said they were ready, ascending.
+        failures: processes that ended without a fault.
+        ready_at: when servers became ready, ascending.
     """
 
     folder: Path
@@ -138,37 +135,37 @@ class Fleet:
 
     @property
     def port_file(self) -> Path:
-        """Written by the server when it is ready."""
+        """Return the file that the server writes when it is ready."""
         return self.folder / "port"
 
     @property
     def cache(self) -> Path:
-        """Folder of the catalogue index."""
+        """Return the folder of the catalogue index."""
         return self.folder / "cache"
 
     @property
     def tally(self) -> Path:
-        """As many bytes as hostile peers made connections by hand, or were refused a handshake."""
+        """Return the file with a byte for each raw connection, or refused handshake, of hostile peers."""
         return self.folder / "tally"
 
     @property
     def tmp(self) -> Path:
-        """TMPDIR of all processes."""
+        """Return the TMPDIR of all processes."""
         return self.folder / "tmp"
 
     @property
     def addresses(self) -> tuple[str, str]:
-        """The server's, for consumers and for workers."""
+        """Return the server's addresses, for consumers and for workers."""
         return self._address, self._worker_address
 
     @property
     def ports(self) -> list[int]:
-        """The server's two."""
+        """Return the two ports of the server."""
         return [int(address.rpartition(":")[2]) for address in self.addresses]
 
     @property
     def everyone(self) -> list[Process]:
-        """All places."""
+        """Return all places."""
         return [self.server, *self.further_workers, *self.crowd]
 
     def _server_command(self) -> list[str]:
@@ -177,7 +174,7 @@ class Fleet:
             *("--workers", str(self.workers)),
             *("--bind", self._address, "--worker-bind", self._worker_address, "--port-file", str(self.port_file)),
             *("--cache-dir", str(self.cache), "--lease-deadline-seconds", str(self.lease_deadline_seconds)),
-            # The server's own recipe only has to fit the corpus: every consumer states its own.
+            # The server's recipe only has to fit the corpus: every consumer states its own.
             *("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32"),
             *("--parent-pid", str(os.getpid())),
             *self.server_flags,
@@ -185,32 +182,35 @@ class Fleet:
             *(() if self.keys is None else ("--keys", str(self.keys.server))),
         ]
 
-    # --- living -------------------------------------------------------------------------------------------------------
-
     def start(self, start_seconds: float = 180.0) -> None:
-        """Starts the server, then the consumers, and returns when each of them has saved a state.
+        """Start the server, then the consumers; wait until each consumer has saved a state.
 
         Raises:
-            UsageError: they do not come up; the message quotes what was said.
+            UsageError: a process does not start; the message quotes its output.
         """
         deadline = time.monotonic() + start_seconds
         self._spawn(self.server)
-        self._await(lambda: bool(self.ready_at), deadline)
+        self.wait_for(lambda: bool(self.ready_at), deadline)
         for consumer in self.crowd:
             self._spawn(consumer)
-        self._await(lambda: min(self.committed()) > 0, deadline)
+        self.wait_for(lambda: min(self.committed()) > 0, deadline)
 
-    def _await(self, done: Callable[[], bool], deadline: float) -> None:
+    def wait_for(self, done: Callable[[], bool], deadline: float) -> None:
+        """Run the fleet until ``done`` returns True.
+
+        Raises:
+            UsageError: a process ended without a fault, or the deadline has passed.
+        """
         while not done():
-            self.look(time.monotonic())
+            self.restart(time.monotonic())
             if self.failures:
-                raise UsageError(f"{self.failures[0].name} does not come up: {self.failures[0].text}")
+                raise UsageError(f"{self.failures[0].name} ended: {self.failures[0].text}")
             if time.monotonic() > deadline:
-                raise UsageError(f"no batches yet, and out of patience; the server: {self.server.last_lines()}")
+                raise UsageError(f"no batches in time; the server: {self.server.last_lines()}")
             time.sleep(0.05)
 
-    def look(self, now: float) -> None:
-        """Starts again what has ended (a further worker is not, its place is gone), and notes what ended unasked."""
+    def restart(self, now: float) -> None:
+        """Restart the server and consumers that have ended, remove such further workers, note unexpected ends."""
         if self._awaited and self.port_file.exists():
             self._awaited = False
             self.ready_at.append(now)
@@ -226,7 +226,7 @@ class Fleet:
                 self._spawn(place)
 
     def add_worker(self) -> None:
-        """One more worker, as from another host."""
+        """Start one more worker, as from another host."""
         name = f"further{self._added}"
         self._added += 1
         folder = self.folder / name
@@ -238,10 +238,10 @@ class Fleet:
         self.further_workers.append(place)
 
     def peers(self, kind: str, *, last: bool = True) -> subprocess.Popen[bytes]:
-        """Hostile peers of that kind (:mod:`bench.chaos.hostile`); whoever asks ends them.
+        """Start hostile peers of that kind (:mod:`bench.chaos.hostile`); the caller ends them.
 
         Args:
-            last: they get what others leave of the processor.
+            last: they get the lowest priority.
         """
         command = [sys.executable, "-m", "bench.chaos.hostile", "--address", self._address, "--kind", kind]
         command += ["--tally", str(self.tally)]
@@ -258,11 +258,11 @@ class Fleet:
         )
 
     def cached_pieces(self) -> list[Path]:
-        """Pieces of decoded clips that are kept."""
+        """Return the files of the cache of decoded clips."""
         return [] if self.clip_cache is None else sorted(self.clip_cache.glob("??/*"))
 
     def server_workers(self) -> list[int]:
-        """Process ids of the server's own workers."""
+        """Return the process ids of the server's workers."""
         if self.server.pid is None:
             return []
         try:
@@ -272,7 +272,7 @@ class Fleet:
             return []
 
     def committed(self) -> list[int]:
-        """Batches that each consumer has committed."""
+        """Return the number of batches that each consumer has committed."""
         counts = []
         for place in self.crowd:
             state = place.folder / "state.json"
@@ -280,7 +280,7 @@ class Fleet:
         return counts
 
     def logged_bytes(self) -> int:
-        """Length of all consumers' logs: it grows whenever anybody gets a batch."""
+        """Return the length of all consumers' logs, which grows with every batch."""
         logs = [log_path(place.folder) for place in self.crowd]
         return sum(path.stat().st_size for path in logs if path.exists())
 
@@ -302,13 +302,11 @@ class Fleet:
         key = "" if self.keys is None or not side else str(getattr(self.keys, side))
         return os.environ | {MARK: self.token, "TMPDIR": str(self.tmp), KEY_VARIABLE: key}
 
-    # --- the end ------------------------------------------------------------------------------------------------------
-
     def stop(self) -> list[str]:
-        """Asks everybody to leave, consumers first.
+        """Stop all processes by SIGTERM, consumers first.
 
         Returns:
-            what was left over: processes that did not leave or left badly, and what :meth:`traces` finds.
+            leftovers: processes that did not end or ended badly, and those of :meth:`traces`.
         """
         left = []
         for place in (*self.crowd, *self.further_workers, self.server):
@@ -320,19 +318,19 @@ class Fleet:
             try:
                 status = place.process.wait(_STOP_SECONDS)
             except subprocess.TimeoutExpired:
-                place.process.send_signal(signal.SIGABRT)  # consumers say where they are
+                place.process.send_signal(signal.SIGABRT)  # consumers dump their stacks
                 with suppress(subprocess.TimeoutExpired):
                     place.process.wait(_LAST_WORDS_SECONDS)
                 place.process.kill()
                 place.process.wait()
-                left.append(f"{place.name} did not leave within {_STOP_SECONDS:g} s of SIGTERM: {place.last_lines(30)}")
+                left.append(f"{place.name} did not end within {_STOP_SECONDS:g} s of SIGTERM: {place.last_lines(30)}")
                 continue
             if status not in (0, -signal.SIGTERM):
-                left.append(f"{place.name} left with status {status}: {place.last_lines()}")
+                left.append(f"{place.name} ended with status {status}: {place.last_lines()}")
         return left + self.traces()
 
     def kill(self) -> None:
-        """Ends everything at once, whatever state it is in."""
+        """Kill all processes."""
         for place in self.everyone:
             if place.process is not None:
                 place.process.kill()
@@ -341,7 +339,7 @@ class Fleet:
             process.kill()
 
     def traces(self) -> list[str]:
-        """What processes that are gone should have taken with them: processes, listening sockets, files."""
+        """Return what the ended processes left behind: processes, listening sockets, files."""
         _, alive = psutil.wait_procs(self.marked(), timeout=5.0)
         left = [f"process {process.pid}: {_command_of(process)}" for process in alive]
         for child in psutil.Process().children():
@@ -360,69 +358,19 @@ class Fleet:
         return left
 
     def marked(self) -> list[psutil.Process]:
-        """Living processes of this run, whoever started them."""
+        """Return the living processes of this run, whatever their parent."""
         found = []
         for process in psutil.process_iter():
             try:
                 if process.pid != os.getpid() and process.environ().get(MARK) == self.token:
                     found.append(process)
             except (psutil.AccessDenied, psutil.NoSuchProcess, psutil.ZombieProcess, OSError):
-                continue  # not ours, or gone
+                continue  # another user's process, or one that has ended
         return found
-
-
-def last_in_line() -> None:
-    """Gives the calling process what others leave of the processor: to be called in a new one, before its program."""
-    os.nice(19)
-    with suppress(OSError):  # else the share of its session would not be lowered, where sessions have one
-        Path("/proc/self/autogroup").write_text("19", encoding="ascii")
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports that nobody listens on just now.
-
-    Raises:
-        UsageError: there are not so many.
-    """
-    found: list[int] = []
-    for port in random.sample(_PORTS, len(_PORTS)):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-        found.append(port)
-        if len(found) == count:
-            return found
-    raise UsageError(f"no free port from {_PORTS[0]} to {_PORTS[-1]}")
-
-
-def shared_memory() -> set[str]:
-    """Names of the shared memory of this host: files, for a folder there is somebody's place for temporary files."""
-    folder = Path("/dev/shm")
-    return {item.name for item in os.scandir(folder) if item.is_file()} if folder.is_dir() else set()
-
-
-def abandoned_memory(before: set[str]) -> list[str]:
-    """Names of the shared memory that came since and that no living process maps: what others use is theirs."""
-    found: dict[str, str] = {}
-    for name in shared_memory() - before:
-        with suppress(FileNotFoundError):  # gone by now
-            found[str(os.stat(f"/dev/shm/{name}").st_ino)] = name
-    for maps in Path("/proc").glob("[0-9]*/maps") if found else ():
-        try:
-            text = maps.read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            continue  # not ours to look at, or gone
-        for line in text.splitlines():
-            if "/dev/shm/" in line:  # by number: who made a semaphore maps it under a name that it had before
-                found.pop(line.split()[4], None)
-    return sorted(found.values())
 
 
 def _command_of(process: psutil.Process) -> str:
     try:
         return " ".join(process.cmdline())[:200]
     except psutil.NoSuchProcess:
-        return "gone by now"
+        return "(ended)"

@@ -1,37 +1,39 @@
-"""Eight hostile consumers of one kind, as a process: until SIGTERM.
+"""Eight hostile peers of one kind, as a process that runs until SIGTERM.
 
     python -m bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind parts
 
-    parts      raw peers whose messages have no end: one part after the other, each with MORE behind it
-    headers    the largest and most costly header that is let in, as fast as it is taken
-    hello      says Hello ten times a second, asks for as much as it may, and never reads
-    leave      says Hello under a new name and goes, again and again: its sessions stay behind
-    look       asks for the state of the service without a pause, and never reads
-    idle       takes connections, half of them in the middle of the handshake, and says nothing
-    flood      bytes that are no ZeroMQ's, as fast as they are taken
-    trickle    takes connections and says a handshake on each, a byte at a time, without ever ending it
-    slow       no enemy: a stream that is allowed and takes long (flow on whole pictures, long clips)
-    refused    only with keys: comes with a key that nobody knows, with a revoked one, and with a consumer's to the port
-               of the workers, and begins anew as soon as it is turned away
-    handshakes only with keys: the first message of a handshake, recorded once and sent again and again, each time over
-               a new connection: it costs its sender nothing, and the server its arithmetic
+    parts      raw peers that send a message without end: every part has the MORE flag
+    headers    the largest and most expensive header that is allowed, as fast as possible
+    hello      sends Hello ten times a second, requests as much as allowed, and never reads
+    leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
+    thief      takes the ids that the status shows for routing ids, and sends Hello and Goodbye under each of them
+    look       requests the state of the service without a pause, and never reads
+    idle       opens connections, half of them in the middle of the handshake, and sends nothing
+    flood      bytes that are not ZMTP, as fast as possible
+    trickle    opens connections and sends a handshake on each, one byte at a time, without the end
+    slow       not an attack: an allowed stream whose samples take long (flow on whole pictures)
+    refused    only with keys: connects with an unknown key, with a revoked one, and with a consumer's key to the port
+               of the workers, again and again
+    handshakes only with keys: sends the recorded first message of a handshake over new connections: cheap for the
+               sender, expensive for the server
 
-They come from 127.0.0.2 to a server at 127.0.0.1, so that what it holds against hosts strikes them and not others.
-Where `V2V_KEYS` names a consumer's key, they come with it; only `parts` speaks plainly, and some do not get so far.
-Whoever is cut off connects again. Nothing is checked here: what counts is what happens to others.
+They connect from 127.0.0.2 to a server at 127.0.0.1, so that measures against their host do not hit other peers. If
+`V2V_KEYS` names a consumer's key they use it, except for `parts`. A disconnected peer reconnects. Nothing is checked
+here: the effect on other peers counts.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import os
 import signal
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,27 +43,26 @@ import zmq
 
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import key_for, read_key
-from v2v_protocol.messages import Hello, See, Want
+from v2v_protocol.messages import Goodbye, Hello, See, Seen, Want
 from v2v_protocol.spec import SpecOptions
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
 
 PEERS = 8
 IDLE_EACH = 125
-"""Connections of each idle peer: a thousand in all."""
+"""Connections of each idle peer: a thousand of all eight."""
 _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
 _READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
-_TURNED_AWAY_MS = 2000
+_REFUSAL_MS = 2000
 _ELSEWHERE = "127.0.0.2"
 _tally: Path | None = None
-_GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with the bytes that frame them
-SLOW_RECIPE = "paper-flow"
+_GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with their framing
 SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
 
 
 def parts(address: str, number: int) -> None:
-    """One life of a peer of this kind; the others likewise."""
+    """Act as a peer of this kind until it is disconnected; likewise the functions below."""
     with _raw(address) as peer:
         while True:
             peer.sendall(_PART * 256)
@@ -72,7 +73,7 @@ def headers(address: str, number: int) -> None:
     items = LARGEST_REQUEST_BYTES - 5
     costly = b"\xdd" + items.to_bytes(4, "big") + b"\x90" * MOST_CONTAINERS + bytes(items - MOST_CONTAINERS)
     with _dealer(address, number) as peer:
-        for _ in range(64):  # the server cuts off whoever goes on like this
+        for _ in range(64):  # the server disconnects such a peer
             peer.send(costly)
 
 
@@ -90,6 +91,22 @@ def leave(address: str, number: int) -> None:
     with _dealer(address, None) as peer:
         peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
         peer.poll(1000)
+
+
+def thief(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, number) as peer:
+        peer.send_multipart(encode(See()))
+        if not peer.poll(_REFUSAL_MS):
+            return
+        seen = decode(peer.recv_multipart()[0])
+    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Seen) else []
+    for each in shown:
+        for name in (each["id"].encode(), bytes.fromhex(each["id"])):
+            with _dealer(address, name) as peer:
+                peer.send_multipart(encode(Goodbye()))
+                peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
+                peer.poll(100)
 
 
 def look(address: str, number: int) -> None:
@@ -129,7 +146,7 @@ def trickle(address: str, number: int) -> None:
             links.append(_connected(address))
         for byte in said[:-1]:
             for link in links:
-                with suppress(OSError):  # that one was cut off
+                with suppress(OSError):  # it was disconnected
                     link.send(bytes([byte]))
             time.sleep(0.1)
     finally:
@@ -139,22 +156,17 @@ def trickle(address: str, number: int) -> None:
 
 def slow(address: str, number: int) -> None:
     """See the module."""
-    from v2v_client.dataset import V2VStreamDataset  # PyTorch, which the others do not need
+    from v2v_client.dataset import V2VStreamDataset  # lazily: only this kind needs PyTorch
 
     arrays = ("voxels", "flow", "flow_valid")
-    dataset = V2VStreamDataset(address, 1, arrays, SLOW_RECIPE, seed=number, rank=0, world_size=1, **SLOW_SPEC)
+    dataset = V2VStreamDataset(address, 1, arrays, "paper-flow", seed=number, rank=0, world_size=1, **SLOW_SPEC)
     for _ in dataset:
         pass
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """See the module.
-
-    Args:
-        worker_address: the other port.
-        revoked: file of a revoked consumer's key.
-    """
+    """See the module; ``revoked`` is the file of a revoked key."""
 
     worker_address: str
     revoked: Path
@@ -170,7 +182,7 @@ class Refused:
                 peer.setsockopt(zmq.LINGER, 0)
                 key.secure(peer)
                 peer.connect(_from_elsewhere(where))
-                if monitor.poll(_TURNED_AWAY_MS):
+                if monitor.poll(_REFUSAL_MS):
                     _count()
             finally:
                 peer.disable_monitor()
@@ -179,17 +191,13 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Handshakes:
-    """See the module.
-
-    Args:
-        said: greeting and first message of somebody with a key of that server's.
-    """
+    """See the module; ``said`` is the greeting and first message of a peer with a valid key."""
 
     said: bytes
 
     @classmethod
     def recorded(cls) -> Handshakes:
-        """What a peer with the key of ``V2V_KEYS`` says to a server that only listens."""
+        """Record what a peer with the key of ``V2V_KEYS`` sends to a server that only listens."""
         with socket.create_server(("127.0.0.1", 0)) as server:
             peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
             try:
@@ -216,18 +224,18 @@ class Handshakes:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (parts, headers, hello, leave, look, idle, flood, trickle, slow)
+    each.__name__: each for each in (parts, headers, hello, leave, thief, look, idle, flood, trickle, slow)
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)
 
 
 def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn:
-    """Sets :data:`PEERS` peers on a server, again when cut off, as long as this process lives."""
+    """Run :data:`PEERS` peers, which reconnect when disconnected, until this process ends."""
 
     def live(number: int) -> NoReturn:
         while True:
-            with suppress(OSError, zmq.ZMQError):  # cut off, or the server is gone for now
+            with suppress(OSError, zmq.ZMQError):  # disconnected, or the server restarts
                 act(address, number)
             time.sleep(0.01)
 
@@ -237,13 +245,13 @@ def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn
 
 
 def _greeting(address: str) -> bytes:
-    """The 64 bytes with which a peer says how it wants to speak: as that address asks for, or else plainly."""
+    """Return the 64 bytes of a ZMTP greeting: with CURVE if there is a key for that address, else NULL."""
     return _GREETING % (b"CURVE" if address and key_for(address, "consumer", None) else b"NULL").ljust(20, b"\0")
 
 
 @contextmanager
 def _raw(address: str) -> Iterator[socket.socket]:
-    """A peer that speaks ZMTP by hand, past the handshake."""
+    """Connect a raw socket and send a ZMTP handshake."""
     with _connected(address) as peer:
         peer.sendall(_greeting("") + _READY)
         yield peer
@@ -257,23 +265,31 @@ def _connected(address: str) -> socket.socket:
 
 
 def _count() -> None:
-    """One more connection, or one more handshake that was refused."""
+    """Count a connection, or a refused handshake."""
     if _tally is not None:
         with _tally.open("ab") as file:
             file.write(b".")
 
 
 def _from_elsewhere(address: str) -> str:
-    """The same for ZeroMQ."""
+    """Return the address with 127.0.0.2 as source, for ZeroMQ."""
     return address.replace("tcp://127.0.0.1:", f"tcp://{_ELSEWHERE}:0;127.0.0.1:")
 
 
 @contextmanager
-def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
-    """A peer under a name of its own, or under a new one; it takes one message and reads none."""
+def _dealer(address: str, number: int | bytes | None) -> Iterator[zmq.Socket[bytes]]:
+    """Connect a peer that takes one message at a time.
+
+    Args:
+        address: of the server.
+        number: of the peer, which makes its routing id; or that id; None takes a new one.
+    """
     peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
     try:
-        name = b"hostile-%d-%d" % (os.getpid(), number) if number is not None else b"leaver-" + os.urandom(8)
+        if isinstance(number, bytes):
+            name = number
+        else:
+            name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
         peer.setsockopt(zmq.ROUTING_ID, name)
         peer.setsockopt(zmq.LINGER, 0)
         peer.setsockopt(zmq.RCVHWM, 1)
@@ -286,17 +302,15 @@ def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
         peer.close()
 
 
-def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """The command line."""
+def main() -> NoReturn:
+    """Run the peers."""
     parser = argparse.ArgumentParser(prog="python -m bench.chaos.hostile", description=__doc__)
     parser.add_argument("--address", required=True)
     parser.add_argument("--kind", required=True, choices=(*KINDS, *KEYED_KINDS))
-    parser.add_argument("--worker-address", help="for refused: the other port")
+    parser.add_argument("--worker-address", help="for refused: the port of the workers")
     parser.add_argument("--revoked", type=Path, help="for refused: a revoked key")
-    parser.add_argument(
-        "--tally", type=Path, help="a file that grows by a byte with every raw connection and every refused handshake"
-    )
-    asked = parser.parse_args(arguments)
+    parser.add_argument("--tally", type=Path, help="file to extend by a byte for each raw connection or refusal")
+    asked = parser.parse_args()
     global _tally
     _tally = asked.tally
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))

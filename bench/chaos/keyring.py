@@ -1,4 +1,4 @@
-"""The keys of a fleet whose server takes nobody without one."""
+"""The keys of a fleet whose server requires them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from v2v_server.keys.folder import KeyFolder
 
 @dataclass(frozen=True, slots=True)
 class KeyRing:
-    """Files of keys.
+    """Key files.
 
     Attributes:
         server: the server's folder.
-        consumer, worker: of those who may come.
-        revoked: of a consumer who may not any more.
+        consumer, worker: valid keys.
+        revoked: a revoked key of a consumer.
     """
 
     server: Path
@@ -25,7 +25,7 @@ class KeyRing:
 
     @classmethod
     def made(cls, folder: Path) -> KeyRing:
-        """New keys in a folder that is made for them."""
+        """Make new keys in a new folder."""
         folder.mkdir()
         server = KeyFolder(folder / "server")
         server.init()

@@ -1,38 +1,26 @@
-"""The named baseline: a sample made in the style of the loader released with the paper.
+"""The baseline: a loader written in the style of the one released with the paper.
 
-Written from its description, not from its code: the file is opened twice, seeks go by frame number, whole BGR frames
-are decoded and turned to grey before the crop is cut, the pixel model runs in numpy float64 with the global random
-state, voxels are float32, and torch's default collate stacks a batch.
-
-    python -m bench.speed.released --videos DIR --samples 12
-
-prints the processor time that each stage costs per sample, on one core; another load on the machine hardly shows in it.
+Written from its description, not from its code: it opens the file twice, seeks by frame number, decodes whole BGR
+frames and turns them to grey before it cuts the crop, runs the pixel model in numpy float64 with the global random
+state, and returns float32 voxels; torch's default collate stacks a batch. It is not the released code itself.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
-import statistics
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch.utils.data import Dataset, default_collate
+from torch.utils.data import Dataset
 
-from v2v_protocol.errors import CorpusError, UsageError, V2VError, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.records import write_json
 from v2v_server.video.rows import Rows
 
-BATCH_SIZE = 12
 _SUFFIXES = {".avi", ".mkv", ".mov", ".mp4", ".webm"}
 
 Sample = dict[str, torch.Tensor]
@@ -40,7 +28,7 @@ Sample = dict[str, torch.Tensor]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where one sample is cut from: path, first frame, crop, flip, and the frame that each position shows."""
+    """Where one sample comes from: path, first frame, crop, flip, and the source frame of each position."""
 
     path: Path
     start_frame: int
@@ -51,26 +39,21 @@ class View:
 
 
 class ReleasedStyleDataset(Dataset[Sample]):
-    """Samples of the paper's recipe, drawn with replacement from the global random state.
+    """Draw samples of the paper's recipe with replacement from the global random state.
 
-    Each is {"voxels": float32 [T, bins, H, W], "frames": uint8 [T, 1, H, W]}.
+    Each is {"voxels": float32 [T, bins, H, W], "frames": uint8 [T, 1, H, W]}. An index means nothing but "one more".
 
     Args:
         videos: folder of clips, searched recursively.
         rows: usable rows, as for ``v2v-serve --rows``.
-        recipe: ranges to draw from; its view is crop, flip and pauses only.
-        samples: length of the data set; an index means nothing but "one more".
 
     Raises:
-        CorpusError: no clip with enough frames.
+        CorpusError: no clip has enough frames.
     """
 
-    def __init__(
-        self, videos: Path | str, rows: str = "full", recipe: Recipe | None = None, samples: int = 1_000_000
-    ) -> None:
-        self.recipe = Recipe() if recipe is None else recipe
+    def __init__(self, videos: Path, rows: str) -> None:
+        self.recipe = Recipe()
         self.rows = Rows.parse(rows)
-        self.samples = samples
         found = sorted(path for path in Path(videos).rglob("*") if path.suffix.lower() in _SUFFIXES)
         self.clips = [path for path in found if _frame_count(path) >= self.recipe.frames_needed]
         if not self.clips:
@@ -79,14 +62,14 @@ class ReleasedStyleDataset(Dataset[Sample]):
             )
 
     def __len__(self) -> int:
-        return self.samples
+        return 1_000_000
 
     def __getitem__(self, index: int) -> Sample:
         view = self.draw_view()
         return self.simulate(self.read(view))
 
     def draw_view(self) -> View:
-        """Clip, sequence, crop, flip and pauses. The first opening of the file is here: its size is not remembered."""
+        """Draw clip, sequence, crop, flip and pauses. Open the file a first time: its size is not remembered."""
         recipe = self.recipe
         path = self.clips[np.random.randint(len(self.clips))]
         capture = cv2.VideoCapture(str(path))
@@ -112,7 +95,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
         )
 
     def read(self, view: View) -> npt.NDArray[np.uint8]:
-        """The frames of the sample, [steps + 1, H, W].
+        """Return the frames of a sample, [steps + 1, H, W].
 
         Raises:
             VideoError: the file ends early.
@@ -132,7 +115,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
         return frames[:, :, ::-1] if view.flip else frames
 
     def simulate(self, frames: npt.NDArray[np.uint8]) -> Sample:
-        """Fresh camera, voxels and target frames."""
+        """Draw a camera; return voxels and target frames."""
         recipe = self.recipe
         first = np.random.uniform(*recipe.threshold)
         second = first * np.random.uniform(*recipe.threshold_ratio)
@@ -172,7 +155,7 @@ def simulate_steps(
     gamma: float = 2.2,
     log_eps: float = 1e-3,
 ) -> npt.NDArray[np.float64]:
-    """Signed events of every step in numpy float64, frame by frame (paper, section 3).
+    """Return the signed events of every step in numpy float64, frame by frame (paper, section 3).
 
     Args:
         frames: [n, H, W] uint8.
@@ -195,57 +178,3 @@ def simulate_steps(
         residual = potential - threshold_pos * positive + threshold_neg * negative
         steps.append(positive - negative)
     return np.stack(steps)
-
-
-def stage_seconds(dataset: ReleasedStyleDataset, samples: int) -> dict[str, float]:
-    """Processor seconds per sample of each stage: medians over samples, and over batches of 12 for the collate."""
-    seconds: dict[str, list[float]] = {"read": [], "voxels": [], "collate": []}
-    batch: list[Sample] = []
-    for _ in range(samples):
-        begin = time.process_time()
-        frames = dataset.read(dataset.draw_view())
-        read = time.process_time()
-        batch.append(dataset.simulate(frames))
-        seconds["read"].append(read - begin)
-        seconds["voxels"].append(time.process_time() - read)
-        if len(batch) == BATCH_SIZE:
-            begin = time.process_time()
-            default_collate(batch)
-            seconds["collate"].append((time.process_time() - begin) / BATCH_SIZE)
-            batch = []
-    return {stage: statistics.median(values) for stage, values in seconds.items()}
-
-
-def main() -> int:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--videos", required=True, type=Path, help="clips of at least 201 frames")
-    parser.add_argument("--rows", default="top:0.54")
-    parser.add_argument("--samples", type=int, default=24, help=f"rounded up to batches of {BATCH_SIZE}")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    if hasattr(os, "sched_setaffinity"):
-        # OpenCV's decoder and torch's collate start as many threads as there are cores.
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    torch.set_num_threads(1)
-    np.random.seed(arguments.seed)
-    samples = max(1, -(-arguments.samples // BATCH_SIZE)) * BATCH_SIZE
-    try:
-        seconds = stage_seconds(ReleasedStyleDataset(arguments.videos, arguments.rows), samples)
-    except V2VError as error:
-        print(error, file=sys.stderr)
-        return 2
-    records: list[dict[str, Any]] = [
-        {"name": f"released/{stage}", "cpu_seconds_per_sample": value} for stage, value in seconds.items()
-    ]
-    for stage, value in seconds.items():
-        print(f"{stage:8s}{value * 1e3:8.1f} ms per sample")
-    print(f"{'all':8s}{sum(seconds.values()) * 1e3:8.1f} ms per sample")
-    if arguments.json is not None:
-        write_json(arguments.json, records)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,29 +1,47 @@
-"""End to end: the stream under each preset against an in-process loader in the released style, and against decoding.
+"""Compare the stream, end to end, with a loader in the style of the released one, and with decoding alone.
 
-    v2v-bench throughput --videos DIR --prepared dense=DIR --prepared fast=DIR --seconds 20 --turns 3 --json FILE
+    python -m bench throughput --videos DIR --prepared dense=DIR --prepared fast=DIR --seconds 20 --turns 3 --json FILE
 
-All contenders (`bench/speed/contenders.py`) take 12 samples of the paper's recipe a batch, with the same number of
-processes, in turn, several times over; a ratio is the median of the ratios within a turn, so that a drift of the
-machine cancels. The named baseline is the released style on the source clips; each corpus has its own decode limit,
-which a preset with several samples of a decode exceeds. Bars are on ratios, by the clock and by processor time.
+All contenders make batches of the paper's recipe with the same number of processes, in turns. A ratio is the median of
+the ratios within a turn, so that a drift of the machine cancels. Bars are on ratios, by the clock and by CPU time.
+
+    released    the baseline: a torch DataLoader written in the style of the released one (`bench/speed/released.py`),
+                on the source clips
+    decode      decodes the frames that the stream's samples need (open, seek and crop included) and nothing else: the
+                limit of every loader that decodes each sample by itself; each corpus has its own
+    a preset    the stream under one of `v2v_protocol.spec.SPEED_PRESETS`, from server to batch
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import multiprocessing
+import os
 import statistics
-import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-from bench.plots import bars, panels
-from bench.records import Column, at_least, parser_of, run, say_missed, show, write
-from bench.speed.contenders import BASELINE, LIMIT, Contender, Corpus, Measured, Setting, line_up
-from v2v_protocol.errors import UsageError
-from v2v_protocol.spec import SPEED_PRESETS
-from v2v_server.system.process import usable_cores
+import psutil
+from torch.utils.data import DataLoader
 
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
+from bench.processes import cpu_seconds, endless
+from bench.speed.released import ReleasedStyleDataset
+from tests.oracles.leases import open_leases
+from v2v_client import Batch, V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
+from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_server.system.process import usable_cores
+from v2v_server.worker.produce import decode_for
+
+BASELINE, LIMIT = "released", "decode"
 BARS = {
     "exact, source": 3.3,
     "exact, dense": 25.0,
@@ -33,8 +51,7 @@ BARS = {
     "fast, h264": 20.0,
 }
 """Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; of
-`dense-12`, every 12. `dense` and `fast` are the sizes of a lossless corpus. A name's own bar counts, else that of its
-part before the dash."""
+`dense-12`, every 12. A label without a bar of its own has that of its part before the dash."""
 LIMIT_BARS = {"exact, source": 0.9}
 """Least share of the decode limit of the same corpus, by the clock."""
 
@@ -51,123 +68,243 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-def compare(contenders: Sequence[Contender], setting: Setting, turns: int) -> list[dict[str, Any]]:
-    """Runs every contender in turn, ``turns`` times.
+@dataclass(frozen=True, slots=True)
+class Corpus:
+    """Clips of one form.
 
-    Returns:
-        One flat record a contender, medians over the turns.
+    Attributes:
+        name: "source", or how it was prepared.
+        videos: the folder.
+        rows: rows to use; "full" for a prepared folder, which holds only the rows in use.
     """
+
+    name: str
+    videos: Path
+    rows: str
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One contender in one turn.
+
+    Attributes:
+        batches, seconds, cpu_seconds: after the warm-up; the processor time is that of all processes.
+    """
+
+    batches: int
+    seconds: float
+    cpu_seconds: float
+    samples_per_decode: float = 1.0
+
+    @property
+    def batches_per_second(self) -> float:
+        """Return the rate by the clock."""
+        return self.batches / self.seconds
+
+    @property
+    def cpu_seconds_per_batch(self) -> float:
+        """Return the processor time of all processes together."""
+        return self.cpu_seconds / self.batches
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """One line of the table: released, decode or a preset, on one corpus."""
+
+    name: str
+    corpus: Corpus
+
+    @property
+    def label(self) -> str:
+        """Return the name for tables, for example ``exact, dense``."""
+        return f"{self.name}, {self.corpus.name}"
+
+    def measure(self, asked: argparse.Namespace) -> Measured:
+        """Run one turn."""
+        if self.name == BASELINE:
+            return _released(self.corpus, asked)
+        return _decode(self.corpus, asked) if self.name == LIMIT else _preset(self.name, self.corpus, asked)
+
+
+def line_up(source: Corpus, prepared: list[Corpus], presets: list[str]) -> list[Contender]:
+    """Return all contenders, the baseline first; each corpus has its own decode limit."""
+    names = [LIMIT, *(name for name in SPEED_PRESETS if name in presets)]
+    return [Contender(BASELINE, source)] + [Contender(name, corpus) for corpus in (source, *prepared) for name in names]
+
+
+def _released(corpus: Corpus, asked: argparse.Namespace) -> Measured:
+    dataset = ReleasedStyleDataset(corpus.videos, rows=corpus.rows)
+    loader = DataLoader(dataset, batch_size=asked.batch_size, num_workers=asked.workers)
+    return _measure(asked, iter(loader), _own_cpu_seconds, burst=asked.workers)
+
+
+def _preset(name: str, corpus: Corpus, asked: argparse.Namespace) -> Measured:
+    options: dict[str, Any] = {"recipe": "paper", "preset": name}
+    with LocalServer(corpus.videos, workers=asked.workers, flags=["--rows", corpus.rows]) as server:
+        made = {"samples": 0, "decodes": 0}
+
+        def batches() -> Iterator[Batch]:
+            dataset = V2VStreamDataset(server.address, asked.batch_size, **options)
+            for batch in endless(dataset):
+                made["samples"] += len(batch)
+                made["decodes"] += batch.decodes
+                yield batch
+
+        def used() -> float:
+            return sum(server.cpu_seconds().values()) + cpu_seconds(os.getpid())
+
+        views = int(SPEED_PRESETS[name]["samples_per_decode"])
+        measured = _measure(asked, batches(), used, burst=views)
+    achieved = made["samples"] / made["decodes"]
+    return Measured(measured.batches, measured.seconds, measured.cpu_seconds, achieved)
+
+
+def _decode(corpus: Corpus, asked: argparse.Namespace) -> Measured:
+    context = multiprocessing.get_context("spawn")
+    counts = [context.Value("q", 0) for _ in range(asked.workers)]
+    stop = context.Event()
+    processes = [
+        context.Process(target=_decode_jobs, args=(corpus, asked.workers, number, count, stop), daemon=True)
+        for number, count in enumerate(counts)
+    ]
+    for process in processes:
+        process.start()
+
+    def batches() -> Iterator[int]:
+        for given in itertools.count(1):
+            while sum(count.value for count in counts) < given * asked.batch_size:
+                if not all(process.is_alive() for process in processes):
+                    raise RuntimeError("a decoding process died, see above")
+                time.sleep(0.002)
+            yield given
+
+    try:
+        return _measure(asked, batches(), _own_cpu_seconds)
+    finally:
+        stop.set()
+        for process in processes:
+            process.join()
+
+
+def _decode_jobs(corpus: Corpus, workers: int, number: int, count: Any, stop: Event) -> None:
+    with open_leases(corpus.videos, corpus.rows, StreamSpec()) as (root, leases):
+        for lease in itertools.islice(leases, number, None, workers):
+            if stop.is_set():
+                return
+            decode_for(lease, lease.indices, root)
+            count.value += 1
+
+
+def _measure(
+    asked: argparse.Namespace, stream: Iterator[object], used: Callable[[], float], burst: int = 1
+) -> Measured:
+    """Count whole batches after the warm-up until the time is over.
+
+    Args:
+        burst: batches that arrive together (one of each loader process; siblings finish K batches together). Only whole
+            bursts count: a window that ends within one is off by half of it.
+    """
+    for _ in range(-(-asked.warmup_batches // burst) * burst):
+        next(stream)
+    cpu, started, taken = used(), time.perf_counter(), 0
+    while time.perf_counter() - started < asked.seconds or taken % burst:
+        next(stream)
+        taken += 1
+    return Measured(taken, time.perf_counter() - started, used() - cpu)
+
+
+def _own_cpu_seconds() -> float:
+    """Return the processor time of this process and its living children."""
+    own = psutil.Process()
+    return sum(cpu_seconds(process.pid) for process in [own, *own.children(recursive=True)])
+
+
+def compare(contenders: Sequence[Contender], asked: argparse.Namespace) -> list[dict[str, Any]]:
+    """Run all contenders in turns; return one record for each, medians over the turns."""
     found: list[dict[Contender, Measured]] = []
-    for turn in range(turns):
-        measured = {}
+    for turn in range(asked.turns):
+        found.append({})
         for contender in contenders:
-            measured[contender] = one = contender.measure(setting)
-            print(
-                f"turn {turn + 1}/{turns}  {contender.label:18s} {one.batches_per_second:7.3f} batches/s  "
-                f"{one.cpu_seconds_per_batch:6.3f} CPU s a batch",
-                file=sys.stderr,
-                flush=True,
-            )
-        found.append(measured)
+            found[-1][contender] = one = contender.measure(asked)
+            cost = f"{one.batches_per_second:.3f} batches/s, {one.cpu_seconds_per_batch:.3f} CPU s a batch"
+            progress(f"turn {turn + 1}/{asked.turns}  {contender.label}: {cost}")
     baseline = contenders[0]
     limits = {contender.corpus: contender for contender in contenders if contender.name == LIMIT}
 
     def record(of: Contender) -> dict[str, Any]:
-        def each(value: Callable[[Measured, Measured, Measured], float]) -> list[float]:
-            limit = limits[of.corpus]
-            return [value(turn[of], turn[baseline], turn[limit]) for turn in found]
+        def each(value: Callable[[Measured, Measured], float], beside: Contender = baseline) -> list[float]:
+            return [value(turn[of], turn[beside]) for turn in found]
 
-        def median(value: Callable[[Measured, Measured, Measured], float]) -> float:
-            return statistics.median(each(value))
-
-        ratios = each(lambda mine, base, limit: mine.batches_per_second / base.batches_per_second)
+        ratios = each(lambda mine, base: mine.batches_per_second / base.batches_per_second)
+        to_limit = each(lambda mine, limit: mine.batches_per_second / limit.batches_per_second, limits[of.corpus])
+        cpu_ratios = each(lambda mine, base: base.cpu_seconds_per_batch / mine.cpu_seconds_per_batch)
         return {
             "label": of.label,
-            "name": of.name,
-            "preset": of.name if of.name in SPEED_PRESETS else None,
-            "corpus": of.corpus.name,
-            "samples_per_decode": median(lambda mine, base, limit: mine.samples_per_decode),
-            "workers": setting.workers,
-            "batch_size": setting.batch_size,
-            "batches_per_second": median(lambda mine, base, limit: mine.batches_per_second),
-            "cpu_seconds_per_batch": median(lambda mine, base, limit: mine.cpu_seconds_per_batch),
+            "samples_per_decode": statistics.median(each(lambda mine, _: mine.samples_per_decode)),
+            "workers": asked.workers,
+            "batch_size": asked.batch_size,
+            "batches_per_second": statistics.median(each(lambda mine, _: mine.batches_per_second)),
+            "cpu_seconds_per_batch": statistics.median(each(lambda mine, _: mine.cpu_seconds_per_batch)),
             "ratio_to_baseline": statistics.median(ratios),
             "ratio_to_baseline_lowest": min(ratios),
             "ratio_to_baseline_highest": max(ratios),
-            "cpu_ratio_to_baseline": median(
-                lambda mine, base, limit: base.cpu_seconds_per_batch / mine.cpu_seconds_per_batch
-            ),
-            "ratio_to_decode_limit": median(
-                lambda mine, base, limit: mine.batches_per_second / limit.batches_per_second
-            ),
-            "turns": turns,
-            "seconds": setting.seconds,
-            "warmup_batches": setting.warmup_batches,
+            "cpu_ratio_to_baseline": statistics.median(cpu_ratios),
+            "ratio_to_decode_limit": statistics.median(to_limit),
+            "turns": asked.turns,
+            "seconds": asked.seconds,
         }
 
     return [record(contender) for contender in contenders]
 
 
-def missed(records: Sequence[dict[str, Any]]) -> list[str]:
-    """The bars that these records miss, in words."""
+def missed(records: Sequence[Record]) -> list[str]:
+    """Return the bars that these records miss."""
     found = []
     for record in records:
         label = record["label"]
         form = label.partition("-")[0]
+        least_ratio = BARS.get(label, BARS.get(form, 0.0))
         for key, least in (
-            ("ratio_to_baseline", BARS.get(label, BARS.get(form, 0.0))),
-            ("cpu_ratio_to_baseline", BARS.get(label, BARS.get(form, 0.0))),
+            ("ratio_to_baseline", least_ratio),
+            ("cpu_ratio_to_baseline", least_ratio),
             ("ratio_to_decode_limit", LIMIT_BARS.get(form, 0.0)),
         ):
             if record[key] < least:
-                found.append(f"{label}: {key} {record[key]:.2f}, at least {least:g} was asked")
+                found.append(f"{label}: {key} {record[key]:.2f}; the bar is {least:g}")
     return found
 
 
 def _prepared(text: str) -> Corpus:
     name, equals, folder = text.partition("=")
     if not equals or not name or not folder:
-        raise UsageError(f"--prepared {text}: write NAME=DIR, for instance h264=prepared/")
+        raise argparse.ArgumentTypeError(f"{text}: write NAME=DIR, for example h264=prepared/")
     return Corpus(name, Path(folder), "full")
 
 
-def _work(asked: argparse.Namespace) -> int:
-    at_least(asked, workers=1, batch_size=1, turns=1, warmup_batches=0)
-    unknown = set(asked.presets.split(",")) - set(SPEED_PRESETS)
-    if unknown:
-        raise UsageError(f"--presets {asked.presets}: choose of {', '.join(SPEED_PRESETS)}")
-    source = Corpus("source", asked.videos, asked.rows)
-    setting = Setting(asked.workers, asked.batch_size, asked.seconds, asked.warmup_batches)
-    contenders = line_up(source, [_prepared(text) for text in asked.prepared], asked.presets.split(","))
-    records = compare(contenders, setting, asked.turns)
-    show(records, _COLUMNS)
-    write(records, asked.json)
-    if asked.plot is not None:
-        with panels(asked.plot, 2, title="Speed and cost of batches", height_inches=1.4 + 0.3 * len(records)) as (
-            speed,
-            cost,
-        ):
-            ratios = {record["label"]: record["ratio_to_baseline"] for record in records}
-            bars(speed, ratios, f"batches/s, multiple of {BASELINE}")
-            bars(cost, {record["label"]: record["cpu_seconds_per_batch"] for record in records}, "CPU seconds a batch")
-    return say_missed(missed(records))
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
-    parser = parser_of(__doc__, "throughput", seconds=20.0, what="each contender in each turn")
-    parser.add_argument("--videos", required=True, type=Path, help="clips of at least 201 frames (bench.corpus)")
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    add_videos(parser, "clips of at least 201 frames (python -m bench corpus)", rows="top:0.54")
     parser.add_argument(
-        "--prepared", action="append", default=[], metavar="NAME=DIR", help="the same, prepared; several times"
-    )
-    parser.add_argument("--presets", default=",".join(SPEED_PRESETS), metavar="A,B", help="default: all")
-    parser.add_argument("--rows", default="top:0.54", help="of --videos")
-    parser.add_argument("--workers", type=int, default=min(2, usable_cores()))
-    parser.add_argument("--batch-size", type=int, default=12)
-    parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--warmup-batches", type=int, default=4)
-    return run(parser, _work, arguments)
+        "--prepared", action="append", default=[], type=_prepared, metavar="NAME=DIR",
+        help="the same clips, prepared; may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--presets", default=",".join(SPEED_PRESETS), metavar="A,B", help="speed presets (default all)")
+    add_positive(parser, "--seconds", 20.0, "of each contender in each turn")
+    add_whole(parser, "--workers", min(2, usable_cores()), "processes of each contender")
+    add_whole(parser, "--batch-size", 12, "samples of a batch")
+    add_whole(parser, "--turns", 3, "turns of each contender")
+    add_whole(parser, "--warmup-batches", 4, "batches that are not timed", least=0)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench.
+
+    Raises:
+        UsageError: an unknown preset.
+    """
+    presets = asked.presets.split(",")
+    if set(presets) - set(SPEED_PRESETS):
+        raise UsageError(f"--presets {asked.presets}: choose of {', '.join(SPEED_PRESETS)}")
+    contenders = line_up(Corpus("source", asked.videos, asked.rows), asked.prepared, presets)
+    records = compare(contenders, asked)
+    return Report(records, [(records, _COLUMNS)], missed=missed(records))

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from bench.usage import peak_rss_bytes
+from bench.processes import peak_rss_bytes
 from tests.clips import panned_luma, write_clip
 from tests.server.video.test_hostile import PLAYLISTS
 from tests.waiting import until

@@ -47,7 +47,7 @@ def test_every_program_says_its_version_and_takes_no_flag_that_it_does_not_know(
     assert program() == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert name == "v2v-bench" or "unknown flag --vresion (did you mean '--version'?)" in said
+    assert "unknown flag --vresion (did you mean '--version'?)" in said
 
 
 @pytest.mark.parametrize(("package", "said"), [("h5py", "h5py"), ("torch.utils.tensorboard", "torch")])

@@ -29,7 +29,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
     cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
     cameras.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
-    cameras.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the first camera (default 0)")
+    cameras.add_argument(
+        "--seed", type=int, metavar="S",
+        help="seed of the first camera; the others count on (default: seeds whose crops show motion)",
+    )  # fmt: skip
     cameras.add_argument(
         "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
     )
@@ -51,17 +54,18 @@ def _run(arguments: argparse.Namespace) -> None:
     for flag, value in (("--seeds", arguments.seeds), ("--moments", arguments.moments)):
         if not 1 <= value <= _MOST_CAMERAS:
             raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
+    first = arguments.seed or 0
     if arguments.compare:
         if arguments.recipe is not None:
             raise UsageError("--compare names the recipes: leave --recipe out")
-        looks = [
-            Shot(Path(name).stem, recipe_setting(name, arguments.set), arguments.seed) for name in arguments.compare
-        ]
+        looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
         what = "the same clip under " + ", ".join(look.title for look in looks)
     else:
         recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
-        looks = [Shot(f"seed {seed}", recipe, seed) for seed in range(arguments.seed, arguments.seed + arguments.seeds)]
+        looks = [Shot("", recipe, seed) for seed in range(first, first + arguments.seeds)]
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
+    if arguments.seed is None:
+        what += ", chosen where something moves"
     preview(
         arguments.source,
         Path(arguments.out),
@@ -69,6 +73,7 @@ def _run(arguments: argparse.Namespace) -> None:
         # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
         {"shuffle": False} if arguments.compare else {},
         title=f"{Path(arguments.source).name}: {what}",
+        find_motion=arguments.seed is None,
         list_file=arguments.list,
         rows=arguments.rows,
         with_flow=not arguments.no_flow,

@@ -11,7 +11,7 @@ from v2v_protocol.errors import V2VError
 from v2v_server.commands.spec_flags import add_spec
 from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
 from v2v_server.serve import serve
-from v2v_server.system.log import Log
+from v2v_server.system.log import report_errors
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,13 +37,10 @@ def _run(arguments: argparse.Namespace) -> None:
     settings = arguments.set if arguments.recipe is None else []
     if arguments.recipe is not None:
         flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
-    config = ServeConfig.load(arguments.config, flags, settings)
-    try:
+    with report_errors(lambda: arguments.log_format):
+        config = ServeConfig.load(arguments.config, flags, settings)
+        arguments.log_format = config.log_format  # the file may ask for JSON
         serve(config)
-    except V2VError as error:
-        if config.log_format == "json":  # in addition to the last line, which every command prints for people
-            Log(is_json=True).say(str(error), "error")
-        raise
 
 
 if __name__ == "__main__":

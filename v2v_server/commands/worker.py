@@ -12,7 +12,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.catalogue.files import corpus_root
 from v2v_server.cloud.copies import COPIES_GIB, copies_of
 from v2v_server.store.cache import GIB, Cache, make_cache
-from v2v_server.system.log import LOG_FORMATS, Log
+from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.worker.process import run_worker, unshared_name
 
 
@@ -55,6 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    with report_errors(lambda: arguments.log_format):
+        _work(arguments)
+
+
+def _work(arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     copies = copies_of(arguments.videos, arguments.copies, arguments.copies_gib)

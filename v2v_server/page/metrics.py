@@ -44,8 +44,8 @@ _GAUGES = {
     "v2v_unusable_videos": ("unusable_count", "Files that cannot be used."),
     "v2v_quarantined_sequences": ("quarantined", "Quarantine entries in force."),
 }
-_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover")
-PARTS = ("nobody", "start", "workers", "consumers", "decode", "simulate", "handover", "broker", "way", "even")
+_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover", "queued")
+PARTS = ("nobody", "start", "workers", "consumers", "cores", "decode", "simulate", "handover", "broker", "way", "even")
 _WORKER_STATES = ("working", "idle", "resting", "lost")
 _CONSUMER_STATES = ("stalled", "taking", "idle", "gone")
 _OF_CONSUMERS = {

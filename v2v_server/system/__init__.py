@@ -4,6 +4,7 @@ process         memory that stays, cores, long time slices, children that die wi
 isolate         a function applied to many items in processes of their own, so that a crash costs one item
 sandbox         restrictions of a process that decodes: programs, networks, writing
 compile_cache   where numba stores compiled kernels
+private         files that other users of the host cannot open
 turn_away       has the kernel drop newcomers from some addresses
 log             log lines, as text or JSON
 clock           a clock that stands still while its process is stopped

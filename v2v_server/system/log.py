@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
+
+from v2v_protocol.errors import V2VError
 
 LOG_FORMATS = ("text", "json")
 Level = Literal["info", "warning", "error"]
@@ -46,6 +48,22 @@ class Log:
         if self.is_json:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
         write(sys.stderr, text + "\n")
+
+
+@contextmanager
+def report_errors(log_format: Callable[[], str | None]) -> Iterator[None]:
+    """Write an error that ends a command as a JSON line, instead of the plain text for people.
+
+    Args:
+        log_format: returns the format, once it is known.
+    """
+    try:
+        yield
+    except V2VError as error:
+        if log_format() == "json":
+            Log(is_json=True).say(" ".join(str(error).split()), "error")
+            error.is_reported = True
+        raise
 
 
 def _utc_now() -> str:

@@ -90,7 +90,7 @@ def sample_message(
 
 def pack(raw: Buffer) -> bytes:
     """Compress an array's bytes to one zstd frame that states their number."""
-    # Level 1 leaves a twelfth of the bytes; higher levels take longer and save little more (v2v-bench tradeoff).
+    # Level 1 leaves a twelfth of the bytes; higher levels take longer and save little more (v2v-tradeoff).
     return zstandard.ZstdCompressor(level=1, write_checksum=False).compress(raw)
 
 

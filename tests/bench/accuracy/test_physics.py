@@ -1,9 +1,8 @@
-"""The references of ``v2v-bench physics`` against what can be worked out by hand, and the command itself."""
+"""The oracles of the physics bench against results worked out by hand, and its error measures."""
 
 from __future__ import annotations
 
 import math
-import re
 import sys
 import types
 from pathlib import Path
@@ -12,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import cli
 from bench.accuracy import physics
-from bench.accuracy.recorded import Recording, compare, correlation, read_recording, simulated
-from bench.accuracy.scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
-from bench.speed.dense import bin_events, dense_events
+from bench.accuracy.sensor import Recording, read_recording
 from tests.clips import panned_luma, write_clip
+from tests.oracles.analytic_scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
+from tests.oracles.dense import bin_events, dense_events
 from tests.server.simulation import oracle
 from v2v_protocol.errors import UsageError
+from v2v_server.simulation import simulate
 
 SHARED = Path(__file__).parents[4] / "shared" / "data"
 
@@ -123,7 +122,7 @@ def test_signed_sums_of_few_frames_are_off_by_one_at_most() -> None:
 
 def test_analytic_records_hold_their_bar() -> None:
     records = physics.analytic()
-    assert physics.missed_bars(records) == []
+    assert physics.missed(records) == []
     lamp = [r for r in records if r["scene"].startswith("lamp") and r["frame_rate_hz"] <= 200]
     assert all(r["count_error"] == -1.0 for r in lamp)
     # Not every scene is easy: 25 frames a second of 12 Hz lose a third of the events.
@@ -132,17 +131,17 @@ def test_analytic_records_hold_their_bar() -> None:
 
 def test_bars_can_be_missed() -> None:
     monotone = {"measure": "analytic", "monotone": True, "scene": "ramp", "frame_rate_hz": 25, "count_error": 0.0}
-    assert len(physics.missed_bars([monotone | {"voxel_error": 0.1}])) == 1
+    assert len(physics.missed([monotone | {"voxel_error": 0.1}])) == 1
     film = {"measure": "film", "every": 1, "threshold": 0.1}
-    assert len(physics.missed_bars([film | {"differing_bins_ppm": 61.0}])) == 1
-    assert physics.missed_bars([film | {"differing_bins_ppm": 60.0}, monotone | {"voxel_error": 0.0}]) == []
+    assert len(physics.missed([film | {"differing_bins_ppm": 61.0}])) == 1
+    assert physics.missed([film | {"differing_bins_ppm": 60.0}, monotone | {"voxel_error": 0.0}]) == []
 
 
 def made_recording(threshold: float = 0.15) -> Recording:
     """A camera whose events are exactly those of V2V at that threshold."""
     frames = panned_luma(3, 60, 80)
     frames = np.minimum(frames, 240)
-    voxels = simulated(Recording(frames, np.arange(3.0), np.empty(0)), threshold, 1.0)
+    voxels = simulate(frames, threshold_pos=threshold, gamma=1.0, bins=2, dtype="int16").voxels[0]
     listed = []
     for step, row, column in zip(*np.nonzero(voxels), strict=True):
         count = int(voxels[step, row, column])
@@ -152,23 +151,14 @@ def made_recording(threshold: float = 0.15) -> Recording:
 
 def test_a_recording_that_is_a_simulation_is_recognised() -> None:
     recording = made_recording()
-    found = next(r for r in compare(recording) if r["gamma"] == 1.0 and r["part"] == "whole picture")
-    assert found["threshold_of_equal_count"] == pytest.approx(0.15, rel=0.1)
-    assert found["correlation_of_counts"] > 0.97
-    assert found["correlation_of_signed_counts"] > 0.97
-    assert abs(found["correlation_control_mirrored"]) < 0.5
-    assert found["rising_share_v2v"] == pytest.approx(found["rising_share_real"], abs=0.03)
+    found = next(r for r in physics.recorded(recording) if r["gamma"] == 1.0 and r["part"] == "whole picture")
+    assert found["threshold"] == pytest.approx(0.15, rel=0.1)
+    assert found["correlation_signed"] > 0.97
+    assert abs(found["correlation_mirrored"]) < 0.5
+    for key in ("rising_share", "active_share"):
+        assert found[f"{key}_v2v"] == pytest.approx(found[f"{key}_real"], abs=0.03)
     rising, falling = recording.counts(0.0, 1.0)
     assert rising.sum() + falling.sum() == np.count_nonzero(recording.events["t"] < 1)
-
-
-def test_correlation_is_that_of_the_mask() -> None:
-    one, mask = np.random.default_rng(0).random((40, 40)), np.zeros((40, 40), bool)
-    mask[:20] = True
-    other = one.copy()
-    other[28:] = 0.0
-    assert correlation(one, other, mask) == pytest.approx(1.0)
-    assert correlation(one, -one, ~mask) == pytest.approx(-1.0)
 
 
 def test_recordings_that_cannot_be_read_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
@@ -202,50 +192,3 @@ def test_a_film_that_is_too_short_or_small_is_refused(tmp_path: Path) -> None:
     small = write_clip(tmp_path / "small.mp4", panned_luma(20))
     with pytest.raises(UsageError, match="64x48 pixels; give at least 320x320"):
         physics.filmed(small)
-    assert physics.main(["--video", str(tmp_path / "missing.mp4")]) == 2
-    assert physics.main(["--recording", str(tmp_path / "missing.aedat4")]) == 2
-
-
-@pytest.mark.slow
-def test_the_command(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(physics, "PHOTOGRAPHS", ("camera",))
-    monkeypatch.setattr(physics, "SPEEDS_PX", (0.1,))
-    film = write_clip(tmp_path / "film.mp4", panned_luma(33, 320, 320), rate=240)
-    arguments = ["--video", str(film), "--json", str(tmp_path / "p.json"), "--plot", str(tmp_path / "p.png")]
-    assert physics.main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert "film.mp4 from every n-th frame" in printed
-    assert (tmp_path / "p.png").stat().st_size > 1000
-
-
-def test_the_entry_knows_every_benchmark_that_the_documents_name() -> None:
-    root = Path(cli.__file__).parent.parent
-    texts = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "bench").rglob("*.py")]
-    named = {
-        name
-        for path in texts
-        for name in re.findall(r"(?:v2v-bench|python -m bench) ([a-z][a-z_]*)", path.read_text("utf-8"))
-    }
-    assert {"training_trade", "gpu_feed", "throughput"} <= set(cli.names())
-    assert len(named) > 5
-    assert named <= set(cli.names())
-
-
-def test_the_entry_dispatches_by_name(capsys: Any, monkeypatch: Any) -> None:
-    assert {"extremes", "physics", "flow", "kernel", "throughput"} <= set(cli.names())
-    assert not {"cli", "chaos_consumer", "null_worker", "route_process"} & set(cli.names())
-    assert cli.main([]) == 0
-    assert "physics" in capsys.readouterr().out
-    assert cli.main(["nonsense"]) == 2
-    assert "no benchmark 'nonsense'" in capsys.readouterr().err
-    seen: list[list[str]] = []
-
-    def fake() -> int:
-        seen.append(sys.argv)
-        return 1
-
-    monkeypatch.setattr(physics, "main", fake)
-    before = sys.argv
-    assert cli.main(["physics", "--json", "x"]) == 1
-    assert seen == [["v2v-bench physics", "--json", "x"]]
-    assert sys.argv is before

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.accuracy import sensor
-from bench.accuracy.recorded import Recording
+from bench.accuracy.sensor import Recording
 from tests.server.simulation.test_pixel import moving_frames
 from v2v_server.simulation import simulate
 
@@ -40,9 +40,8 @@ def test_the_setting_that_made_the_events_is_found(recording: Recording) -> None
     assert abs(right["correlation_pixels_mirrored"]) < 0.5
 
 
-def test_the_table_has_a_line_for_each_setting(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_a_record_for_each_setting(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensor, "LOG_OFFSETS", (0.1,))
     monkeypatch.setattr(sensor, "EFFECTS", {"none": {}})
-    records = sensor.measure(recording)
+    records = sensor.records_of(recording)
     assert [record["measure"] for record in records] == ["log offset"] * 4 + ["effect"]
-    assert len(sensor.report(records).splitlines()) == 6

@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
-import os
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import pytest
 
+from bench.__main__ import main
 from bench.chaos import chaos
 from bench.chaos.consumer import PROFILES, profile
 from bench.chaos.faults import WEIGHTS, Fault
-from bench.chaos.fleet import Fleet, abandoned_memory, free_ports, shared_memory
+from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KINDS
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
+from tests.leftovers import abandoned_memory, shared_memory
 
 DEMANDED = (
     "kills",
@@ -71,21 +73,6 @@ def test_what_is_left_over_is_found(tmp_path: Path) -> None:
     assert fleet.traces() == ["file tmp/forgotten", "file index.sqlite-wal", "the port file"]
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--minutes", "0"],
-        ["--workers", "0"],
-        ["--remakes", "0"],
-        ["--faults", "worker-kill,typo"],
-    ],
-)
-def test_wrong_usage_is_status_2(tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert chaos.main(["--videos", str(tmp_path), *arguments]) == 2
-    assert capsys.readouterr().err.startswith("chaos: ")
-    assert not [name for name in os.listdir(tmp_path) if name.startswith("v2v-chaos")]
-
-
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="this host has no /dev/shm")
 def test_shared_memory_is_left_over_once_nobody_maps_it() -> None:
     """Another test's, say, that runs at the same time."""
@@ -111,7 +98,7 @@ def test_a_short_run_keeps_the_promise(tmp_path: Path) -> None:
         write_clip(clips / f"{number}.mp4", panned_luma(201, 128, 160, step=(1, 1 + number)), gop=12)
     out = tmp_path / "chaos.json"
     flags = ["--minutes", "0.5", "--every", "1.5", "--remakes", "60", "--seed", "3"]
-    status = chaos.main(["--videos", str(clips), *flags, "--keep", str(tmp_path / "run"), "--json", str(out)])
+    status = main(["chaos", "--videos", str(clips), *flags, "--keep", str(tmp_path / "run"), "--json", str(out)])
     (record,) = json.loads(out.read_text(encoding="utf-8"))
     assert set(DEMANDED) <= set(record)
     assert {key: record[key] for key in chaos.FAILING} == dict.fromkeys(chaos.FAILING, 0)

@@ -11,7 +11,7 @@ import pytest
 
 from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KINDS, REFUSED
-from bench.chaos.siege import CREDIT_MIB, PEERS, besiege, missed, spell
+from bench.chaos.siege import CREDIT_FLAGS, CREDIT_MIB, PEERS, besiege, missed, stretch
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 
@@ -28,13 +28,13 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_every_kind_is_survived_and_the_memory_comes_back(tmp_path: Path, corpus: Path) -> None:
-    fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0, server_flags=("--max-credit-bytes", str(CREDIT_MIB << 20)))
+    fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0, server_flags=CREDIT_FLAGS)
     del fleet.crowd[0]
     try:
         fleet.start()
         records = besiege(fleet, tuple(KINDS), turns=1, seconds=3.0)
         assert fleet.server.pid is not None
-        assert spell(fleet, 3.0).rate > 0
+        assert stretch(fleet, 3.0).rate > 0
     finally:
         fleet.kill()
     # How fast the others are meanwhile is for the bench: here they only go on.
@@ -77,7 +77,7 @@ def test_wrong_keys_are_turned_away_while_a_right_one_streams(tmp_path: Path, co
         finally:
             peers.kill()
             peers.wait()
-        fleet.look(time.monotonic())
+        fleet.restart(time.monotonic())
         assert not fleet.failures
     finally:
         fleet.kill()

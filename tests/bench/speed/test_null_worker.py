@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.speed.null_service import null_service
-from bench.speed.null_worker import answer
-from bench.usage import consume, peak_rss_bytes
+from bench.processes import consume, peak_rss_bytes
+from bench.speed.null_workers import answer, null_service
 from tests.bench.small import FLAGS, RECIPE
 from tests.server.corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset

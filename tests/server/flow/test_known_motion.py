@@ -1,16 +1,13 @@
-"""The truth of the flow benchmark is true, and its records are what its bars are read from."""
+"""The truth of the flow bench is true, and so are its error measures."""
 
 from __future__ import annotations
-
-import json
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from bench.accuracy import flow as benchmark
-from bench.accuracy.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
+from tests.oracles.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
 from v2v_server.flow.clip import consistent
 
 TEXTURES = {name: photograph(name) for name in ("coffee", "camera", "chelsea")}
@@ -57,26 +54,15 @@ def test_no_motion_exceeds_what_was_drawn(made: list[Scene]) -> None:
         assert 0 < length.max() < 16.5
 
 
-def test_the_benchmark_runs_and_its_bars_can_be_missed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "flow.json"
-    assert benchmark.main(["--methods", "zero,auto", "--every", "23", "--json", str(out)]) == 0
-    assert "margin 64" in capsys.readouterr().out
-    records = json.loads(out.read_text())
+def test_errors_are_those_of_the_methods_and_bars_can_be_missed(made: list[Scene]) -> None:
+    pairs = scenes(TEXTURES, benchmark.HEIGHT_PX, benchmark.WIDTH_PX, every=12)
+    records = [record for name in ("zero", "auto") for record in benchmark.accuracy(name, pairs)]
     error = {(item["method"], item["context"], item["picture"]): item["error_mean_px"] for item in records}
-    assert len(records) == 10
+    assert len(error) == len(records) == 10
     assert error["auto", "whole", "180x596"] < 0.5 * error["zero", "whole", "180x596"]
-    bad = [{**item, "pan_zoom_error_median_px": 0.25} for item in records]
-    assert len(benchmark.missed_bars(bad, 0.0)) == 1
-    assert len(benchmark.missed_bars(records, 0.5)) == 1
-    parts = {"decode the crop": 0.1, "decode the crop and its margin": 0.12, "view and simulation": 0.1}
-    costs = [{"measure": "cost", "part": part, "cpu_seconds_per_sample": value} for part, value in parts.items()]
-    costs.append({"measure": "cost", "part": "flow 20 auto", "cpu_seconds_per_sample": 0.18})
-    assert benchmark.cost_ratio(costs, 20, "auto") == pytest.approx(2.0)
-    assert len(benchmark.missed_bars(costs, 0.0)) == 1
-
-
-def test_wrong_arguments(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert benchmark.main(["--methods", "dis"]) == 2
-    assert benchmark.main(["--every", "0"]) == 2
-    assert benchmark.main(["--videos", str(tmp_path / "none")]) == 2
-    assert "no such folder" in capsys.readouterr().err
+    length = np.concatenate([np.linalg.norm(pair.forward, axis=-1).ravel() for pair in pairs])
+    assert error["zero", "whole", "180x596"] == pytest.approx(length.mean(), rel=1e-5)
+    assert benchmark.largest_flow_of_a_still_clip_px() == 0.0
+    assert benchmark.missed(records, 0.0) == []
+    assert len(benchmark.missed([{**item, "pan_zoom_error_median_px": 0.25} for item in records], 0.0)) == 1
+    assert len(benchmark.missed(records, 0.5)) == 1

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.leases import open_leases, whole_sample
 from tests.clips import panned_luma, write_clip
+from tests.oracles.leases import open_leases, whole_sample
 from tests.server.prepare.test_prepare import run
 from tests.server.video.test_real_videos import FOLDER, FRAMES, SOUND
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError

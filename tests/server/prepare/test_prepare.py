@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
@@ -386,10 +388,28 @@ def test_a_manifest_that_makes_no_sense(prepared: tuple[Path, Report], tmp_path:
         (f"{header}\n{json.dumps(video | {'id': '../x.mp4'})}\n", "line 2.*leads out"),
         (f"{header}\n{json.dumps(video | {'frames': 0})}\n", "0 frames"),
         (f"{header}\n{json.dumps(video | {'colour': 1})}\n", "unknown fields colour"),
+        (f"{header}\n{json.dumps({'id': 'a.mp4'})}\n", "line 2: field 'source_fingerprint' is missing"),
+        (f"{header}\n{json.dumps(video | {'fingerprint': 5})}\n", "line 2: fingerprint = 5: expected str"),
+        (f"{header}\n{json.dumps(video | {'psnr_db': 'x'})}\n", r"psnr_db = 'x': expected float \| None"),
+        (f"{header}\n{json.dumps(video | {'frames_per_second': float('nan')})}\n", "frames_per_second = nan"),
+        (f"{json.dumps(json.loads(header) | {'rows': [1]})}\n", r"line 1: rows = \[1\]: expected str"),
     ):
         (tmp_path / MANIFEST_NAME).write_text(text)
         with pytest.raises(CorpusError, match=complaint):
             read_manifest(tmp_path)
+    fields = st.sampled_from([*json.loads(header), *video])
+    values = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.integers()) | st.just({})
+
+    @given(st.integers(1, 2), fields, values)
+    @settings(max_examples=300, suppress_health_check=[HealthCheck.differing_executors])
+    def any_value_is_taken_or_refused_in_words(line: int, field: str, value: object) -> None:
+        written = [json.loads(header), dict(video)]
+        written[line - 1][field] = value
+        (tmp_path / MANIFEST_NAME).write_text("".join(json.dumps(each) + "\n" for each in written))
+        with suppress(CorpusError):
+            read_manifest(tmp_path)
+
+    any_value_is_taken_or_refused_in_words()
     (tmp_path / MANIFEST_NAME).write_text(f"{header}\n{lines[0]}\n{lines[1][:20]}")
     assert list(read_manifest(tmp_path).videos) == [video["id"]]
 

@@ -1,7 +1,8 @@
-"""The edges of what may be asked for: every row of ``v2v-bench extremes``, and the same for cameras drawn at random."""
+"""The edges of what a recipe may ask for: every row of the extremes bench, and cameras drawn at random."""
 
 from __future__ import annotations
 
+import argparse
 import math
 from typing import Any
 
@@ -11,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.accuracy import extremes
-from bench.accuracy.extreme_rows import Finding, Row, refused, rows, texture
-from bench.speed.balance import Camera, arithmetic, balance, imbalance, trace_of
+from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
+from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
 from tests.server.simulation import oracle, reference
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
@@ -26,14 +27,14 @@ from v2v_server.simulation.voxel import rounding_tolerance
 
 @pytest.mark.parametrize("row", [row for row in rows() if not row.slow], ids=lambda row: row.name)
 def test_row(row: Row) -> None:
-    (record,) = extremes.measure([row])
+    record = record_of(row)
     assert record["passed"], record
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [row for row in rows() if row.slow], ids=lambda row: row.name)
 def test_slow_row(row: Row) -> None:
-    (record,) = extremes.measure([row])
+    record = record_of(row)
     assert record["passed"], record
 
 
@@ -178,15 +179,7 @@ def test_float32_asked_for_by_name_is_kept_to_its_limit() -> None:
         simulate(frames, threshold_pos=1e-4, bins=60, precision="float32")
 
 
-def test_the_command_reports_and_fails_by_its_status(tmp_path: Any, capsys: Any, monkeypatch: Any) -> None:
-    assert (
-        extremes.main(["--rows", "black", "--json", str(tmp_path / "e.json"), "--plot", str(tmp_path / "e.png")]) == 0
-    )
-    assert "black and white in turns" in (tmp_path / "e.json").read_text()
-    assert (tmp_path / "e.png").stat().st_size > 1000
-    assert extremes.main(["--rows", "no such row"]) == 2
-    assert "no row" in capsys.readouterr().err
-    bad = Row("bad", "counted", "things", lambda: Finding(2.0, 1.0))
+def test_a_row_beyond_its_bound_is_a_missed_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = Row("bad", "counted", "things", lambda: Finding(2.0, 1.0, note="too many"))
     monkeypatch.setattr(extremes, "rows", lambda: [bad])
-    assert extremes.main([]) == 1
-    assert "1 rows fail: bad" in capsys.readouterr().err
+    assert extremes.measure(argparse.Namespace(rows="")).missed == ["bad: too many"]

@@ -1,4 +1,4 @@
-"""The benchmark's corpus: clips of the promised form."""
+"""The corpus of the benches: clips of the promised form."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.corpus import main, webvid_like
+from bench.__main__ import main
+from bench.corpus import webvid_like
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_server.video.decode import decode_luma
@@ -17,12 +18,13 @@ from v2v_server.video.probe import probe
 def test_form_and_ping_pong(tmp_path: Path) -> None:
     source = write_clip(tmp_path / "source.mp4", panned_luma(8, 240, 320, step=(0, 6)))
     (clip,) = webvid_like([source], tmp_path / "out", gop=12, frames=30, clips=1)
-    facts = probe(clip.path)
+    path = Path(clip["path"])
+    facts = probe(path)
     assert (facts.frames, facts.width_px, facts.height_px) == (30, 596, 336)
     assert (facts.codec, facts.pixel_format) == ("h264", "yuv420p")
     assert len(facts.index.keyframes) >= 3
-    assert clip.bits_per_second == pytest.approx(Path(clip.path).stat().st_size * 8 / (30 * 1001 / 30000))
-    shown = decode_luma(clip.path, facts.index, 0, 30).frames.astype(int)
+    assert clip["bits_per_second"] == pytest.approx(path.stat().st_size * 8 / (30 * 1001 / 30000))
+    shown = decode_luma(path, facts.index, 0, 30).frames.astype(int)
     # 0 1 .. 7 6 .. 1 0: frame 14 shows the first picture again, frame 7 is farthest from it.
     distance = np.abs(shown - shown[0]).mean(axis=(1, 2))
     assert np.argmax(distance[:15]) == 7
@@ -31,9 +33,9 @@ def test_form_and_ping_pong(tmp_path: Path) -> None:
 
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = write_clip(tmp_path / "source.mp4", panned_luma(4, 240, 320))
-    assert main(["--out", str(tmp_path / "out"), "--clips", "2", "--frames", "3", str(source)]) == 0
-    assert capsys.readouterr().out.count("kb/s") == 2
-    assert main(["--out", str(tmp_path / "out"), str(tmp_path / "missing.mp4")]) == 2
+    assert main(["corpus", "--out", str(tmp_path / "out"), "--clips", "2", "--frames", "3", str(source)]) == 0
+    assert capsys.readouterr().out.count(".mp4") == 4
+    assert main(["corpus", "--out", str(tmp_path / "out"), str(tmp_path / "missing.mp4")]) == 2
     assert "cannot be opened" in capsys.readouterr().err
 
 

@@ -178,6 +178,7 @@ function show(state) {
     ["workers decode", shares.decode],
     ["workers simulate", shares.simulate],
     ["workers hand over", shares.handover],
+    ["workers wait for a core", shares.queued],
     ["server's loop busy", shares.broker],
   ], true);
   list("tiles", tiles(state), false);

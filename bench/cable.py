@@ -1,0 +1,261 @@
+"""A second host on this machine: a network namespace, and a cable to it with a rate, a delay, losses and a switch.
+
+The cable is a process in the far namespace that forwards packets between two TUN devices. The kernels' own TCP handles
+the losses, as on a network; namespaces and /dev/net/tun suffice, without traffic-shaping modules. The process ends with
+its standard input, on which it reads "cut", "heal", and "count"; it answers the last with the packets passed and lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import fcntl
+import os
+import random
+import select
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from v2v_protocol.errors import UsageError
+from v2v_server.system.process import die_with_parent
+
+NEAR, FAR = "10.77.0.1", "10.77.0.2"
+_INSIDE = "V2V_BENCH_NETWORK"
+_NETWORK = 0x40000000  # CLONE_NEWNET
+_SET_DEVICE, _PACKETS_ONLY = 0x400454CA, 0x1001  # TUNSETIFF; IFF_TUN | IFF_NO_PI
+_LONGEST_QUEUE_SECONDS = 0.05
+_AT_ONCE = 64
+_PIECE_BYTES = 1 << 18
+
+
+def in_own_network(work: Callable[[argparse.Namespace], int], command: Sequence[str], asked: argparse.Namespace) -> int:
+    """Do the work of a bench if this process has its own network, else run its command line again in one.
+
+    Args:
+        work: of the bench, on its parsed flags ``asked``.
+        command: name and flags of the bench.
+
+    Raises:
+        UsageError: this machine does not allow network namespaces.
+    """
+    if os.environ.get(_INSIDE):
+        return work(asked)
+    user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    unshare = ["unshare", *user, "--net"]
+    try:
+        subprocess.run([*unshare, "true"], check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        reason = str(getattr(error, "stderr", "") or error).strip()
+        raise UsageError(f"no network namespace: {reason}; run the bench where unshare --net is allowed") from error
+    with subprocess.Popen(
+        [*unshare, sys.executable, "-m", "bench", *command], env=os.environ | {_INSIDE: "1"}
+    ) as process:
+        try:
+            return process.wait()
+        except BaseException:
+            process.terminate()
+            raise
+
+
+class Cable:
+    """A far host and the cable to it, inside ``with``, for a process in its own network (:func:`in_own_network`).
+
+    Args:
+        mbit: Mbit/s in each direction; the excess is queued for 50 ms, then dropped.
+        delay_ms: of each direction.
+        loss: share of packets that are lost.
+        mtu: bytes of the largest packet.
+
+    Attributes:
+        pid: of the cable's process.
+        far: prefix of a command that runs on the far host.
+
+    Entering raises UsageError without a TUN device or without `ip`.
+    """
+
+    def __init__(self, mbit: float, delay_ms: float = 0.0, loss: float = 0.0, mtu: int = 1500) -> None:
+        self._command = [sys.executable, "-m", "bench.cable"]
+        self._command += [str(each) for each in (mbit, delay_ms, loss, mtu, os.getpid())]
+
+    def __enter__(self) -> Cable:
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(self._command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        self.pid = self._process.pid
+        self.far = ("nsenter", "--target", str(self.pid), "--net")
+        if self._answer() != "ready":
+            _, said = self._process.communicate()
+            raise UsageError(f"no second network: {said.strip()[-300:]}; a TUN device and `ip` are needed")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def cut(self) -> None:
+        """Drop all packets from now on."""
+        self._send("cut")
+
+    def heal(self) -> None:
+        """Forward packets again."""
+        self._send("heal")
+
+    def count(self) -> tuple[int, int]:
+        """Return the packets that passed, and those lost to chance or to a cut, so far."""
+        self._send("count")
+        passed, lost = map(int, self._answer().split())
+        return passed, lost
+
+    def _send(self, word: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(word + "\n")
+        self._process.stdin.flush()
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    @contextmanager
+    def on_far_host(self) -> Iterator[None]:
+        """Create sockets, threads and processes of this thread on the far host, inside ``with``."""
+        own = os.open(f"/proc/self/task/{threading.get_native_id()}/ns/net", os.O_RDONLY)
+        far = os.open(f"/proc/{self.pid}/ns/net", os.O_RDONLY)
+        try:
+            _system("setns", far, _NETWORK)
+            yield
+        finally:
+            _system("setns", own, _NETWORK)
+            os.close(own)
+            os.close(far)
+
+    def bytes_received(self) -> int:
+        """Return the bytes that the far host has received, headers included."""
+        lines = Path(f"/proc/{self.pid}/net/dev").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.strip().startswith("far:")).split()[1])
+
+    def measured_bytes_per_second(self, seconds: float = 1.0) -> float:
+        """Return the rate of a plain TCP connection from the near host to the far one, after a warm-up."""
+        with socket.create_server((NEAR, 0)) as listener:
+            with self.on_far_host():
+                receiver = socket.create_connection(listener.getsockname())
+            sender, _ = listener.accept()
+
+        def send() -> None:
+            with suppress(OSError):  # the receiver closed the connection
+                while True:
+                    sender.sendall(bytes(_PIECE_BYTES))
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        with sender, receiver:
+            counts_from, nbytes = time.monotonic() + seconds / 4, 0
+            while (now := time.monotonic()) < counts_from + seconds:
+                got = len(receiver.recv(_PIECE_BYTES))
+                nbytes += got if now >= counts_from else 0
+            receiver.shutdown(socket.SHUT_RDWR)
+            receiver.close()
+            thread.join()
+        return nbytes / seconds
+
+
+def _system(name: str, *arguments: int) -> None:
+    """Call setns or unshare, which the os module has only from Python 3.12 on."""
+    if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments):
+        raise OSError(ctypes.get_errno(), f"{name}: {os.strerror(ctypes.get_errno())}")
+
+
+@dataclass(slots=True)
+class _Way:
+    """One direction of the cable."""
+
+    source: int
+    sink: int
+    queue: deque[tuple[float, bytes]] = field(default_factory=deque)
+    free_at: float = 0.0
+
+
+def _device(name: str, own: str, other: str, mtu: int) -> int:
+    """Create a TUN device in this namespace and bring it up; return its file descriptor."""
+    device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+    fcntl.ioctl(device, _SET_DEVICE, struct.pack("16sH22x", name.encode(), _PACKETS_ONLY))
+    for words in ("link set lo up", f"addr add {own} peer {other} dev {name}", f"link set {name} mtu {mtu} up"):
+        subprocess.run(["ip", *words.split()], check=True)
+    return device
+
+
+class _Forwarder:
+    """The cable's process."""
+
+    def __init__(self, near: int, far: int, bytes_per_second: float, delay_seconds: float, loss: float) -> None:
+        self._ways = (_Way(near, far), _Way(far, near))
+        self._rate, self._delay, self._loss = bytes_per_second, delay_seconds, loss
+        self._is_cut, self.passed, self.lost = False, 0, 0
+
+    def run(self) -> None:
+        """Forward packets until standard input ends."""
+        sources = [way.source for way in self._ways]
+        while True:
+            due = min((way.queue[0][0] for way in self._ways if way.queue), default=None)
+            wait = None if due is None else max(0.0, due - time.monotonic())
+            ready, _, _ = select.select([*sources, 0], [], [], wait)
+            if 0 in ready and not self._obey(os.read(0, 4096)):
+                return
+            for way in self._ways:
+                if way.source in ready:
+                    self._take(way)
+                self._pass_on(way)
+
+    def _obey(self, said: bytes) -> bool:
+        for word in said.split():
+            if word == b"count":
+                print(self.passed, self.lost, flush=True)
+            else:
+                self._is_cut = word == b"cut"
+        return bool(said)
+
+    def _take(self, way: _Way) -> None:
+        for _ in range(_AT_ONCE):
+            try:
+                packet = os.read(way.source, 65536)
+            except OSError:  # no more packets
+                return
+            now = time.monotonic()
+            way.free_at = max(now, way.free_at)
+            is_full = way.free_at - now > _LONGEST_QUEUE_SECONDS
+            if self._is_cut or is_full or random.random() < self._loss:
+                self.lost += not is_full
+                continue
+            way.free_at += len(packet) / self._rate
+            way.queue.append((way.free_at + self._delay, packet))
+
+    def _pass_on(self, way: _Way) -> None:
+        now = time.monotonic()
+        while way.queue and way.queue[0][0] <= now:
+            with suppress(OSError):  # the device is full: the packet is lost
+                os.write(way.sink, way.queue.popleft()[1])
+                self.passed += 1
+
+
+def main() -> int:
+    """Run the cable's process: ``mbit delay_ms loss mtu parent_pid``."""
+    mbit, delay_ms, loss = map(float, sys.argv[1:4])
+    mtu, parent_pid = map(int, sys.argv[4:])
+    die_with_parent(parent_pid)
+    near = _device("near", NEAR, FAR, mtu)
+    _system("unshare", _NETWORK)
+    far = _device("far", FAR, NEAR, mtu)
+    print("ready", flush=True)
+    _Forwarder(near, far, mbit * 125e3, delay_ms * 1e-3, loss).run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

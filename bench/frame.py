@@ -1,0 +1,170 @@
+"""The frame of every bench: its parser, its tables, its records on disk, its exit status."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from v2v_client.tools import loadtest
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.records import write_json
+from v2v_protocol.spec import StreamSpec
+
+Record = Mapping[str, Any]
+"""Flat: keys with SI units -> text, number, bool or None."""
+Column = tuple[str, str, str, float]
+"""Key of a record, title, format, and the factor from SI units to what is shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a bench measured.
+
+    Attributes:
+        records: what ``--json`` writes and ``--plot`` draws.
+        tables: printed one after the other, each as records and columns.
+        lines: printed below the tables.
+        missed: stated bars that were missed; any makes the exit status 1.
+    """
+
+    records: Sequence[Record]
+    tables: Sequence[tuple[Sequence[Record], Sequence[Column]]]
+    lines: Sequence[str] = ()
+    missed: Sequence[str] = ()
+
+
+def parser_of(name: str, bench: ModuleType) -> Parser:
+    """Return the parser of a bench: its docstring as help, its own flags, and ``--json``, ``--plot``, ``--debug``."""
+    first, _, rest = (bench.__doc__ or "").partition("\n\n")
+    parser = Parser(f"python -m bench {name}", "[flags]", first, [])
+    parser.epilog = rest
+    bench.add_flags(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records to this file")
+    if hasattr(bench, "plot"):
+        parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the records")
+    return parser
+
+
+def report(bench: ModuleType, asked: argparse.Namespace) -> int:
+    """Measure, print the tables, write the files; return the exit status, 1 where a bar was missed.
+
+    Raises:
+        UsageError: wrong input, or a file that cannot be written.
+    """
+    try:
+        found: Report = bench.measure(asked)
+        for records, columns in found.tables:
+            show(records, columns)
+        print(*found.lines, sep="\n", end="\n" if found.lines else "")
+        if asked.json is not None:
+            write_json(asked.json, found.records)
+        if getattr(asked, "plot", None) is not None:
+            bench.plot(found.records, asked.plot)
+    except OSError as error:
+        raise UsageError(str(error)) from error
+    for text in found.missed:
+        print(f"bar missed: {text}", file=sys.stderr)
+    return 1 if found.missed else 0
+
+
+def show(records: Sequence[Record], columns: Sequence[Column]) -> None:
+    """Print a table; a value that is missing or None is a dash; a column without values is left out."""
+    shown = [column for column in columns if any(record.get(column[0]) is not None for record in records)]
+    table = Table(box=None, pad_edge=False)
+    for number, (_, title, _, _) in enumerate(shown):
+        table.add_column(title, justify="right" if number else "left", no_wrap=True)
+    for record in records:
+        table.add_row(*(_cell(record.get(key), form, factor) for key, _, form, factor in shown))
+    Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
+
+
+def key_values(record: Record) -> tuple[list[Record], list[Column]]:
+    """Return a table with one line for each key of a record."""
+    lines: list[Record] = [
+        {"key": key, "value": f"{value:.4g}" if isinstance(value, float) else str(value)}
+        for key, value in record.items()
+    ]
+    return lines, [("key", "", "{}", 1), ("value", "", "{}", 1)]
+
+
+def _cell(value: Any, form: str, factor: float) -> str:
+    if value is None:
+        return "-"
+    return form.format(value if isinstance(value, str) else value * factor)
+
+
+def progress(text: str) -> None:
+    """Print a line about a bench that still runs to stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """Return an argparse type: whole numbers from ``least`` on."""
+
+    def read(text: str) -> int:
+        if int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text}: give {least} or more")
+        return int(text)
+
+    return read
+
+
+def positive(text: str) -> float:
+    """Read a finite number above 0: an argparse type."""
+    if not 0 < float(text) < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: give a finite number above 0")
+    return float(text)
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """Read whole numbers from 1 on, separated by commas: an argparse type."""
+    return tuple(map(whole(1), text.split(",")))
+
+
+def add_whole(parser: Parser, flag: str, default: int, what: str, least: int = 1) -> None:
+    """Add a flag for a whole number."""
+    parser.add_argument(flag, type=whole(least), default=default, metavar="N", help=f"{what} (default {default})")
+
+
+def add_positive(parser: Parser, flag: str, default: float, what: str) -> None:
+    """Add a flag for a number above 0."""
+    parser.add_argument(flag, type=positive, default=default, metavar="X", help=f"{what} (default {default:g})")
+
+
+def add_videos(parser: Parser, what: str = "corpus to serve", rows: str | None = None) -> None:
+    """Add ``--videos``, and ``--rows`` with this default where it is given."""
+    parser.add_argument("--videos", required=True, type=Path, metavar="DIR", help=what)
+    if rows is not None:
+        parser.add_argument("--rows", default=rows, help=f"rows of --videos to use (default {rows})")
+
+
+def add_changes(parser: Parser) -> None:
+    """Add ``--set``."""
+    parser.add_argument(
+        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field"
+    )
+
+
+def recipe_of(changes: Sequence[str]) -> Recipe:
+    """Return the paper's recipe with the changes of ``--set``.
+
+    Raises:
+        RecipeError, UsageError: a change is not valid.
+    """
+    return StreamSpec.from_dict({"recipe": loadtest.recipe_of("paper", changes)}).recipe
+
+
+def server_flags(changes: Sequence[str]) -> list[str]:
+    """Return the changes of ``--set`` as flags of ``v2v-serve``."""
+    return [flag for change in changes for flag in ("--set", change)]

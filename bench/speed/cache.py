@@ -1,0 +1,121 @@
+"""Measure what filling the cache of decoded clips costs, and what reading it saves.
+
+    python -m bench cache --videos DIR --turns 3
+
+The samples of one epoch of the paper's recipe, one after the other in this process: decoded without a cache
+(``source``), decoded and written to an empty cache (``fill``), read from it (``hits``). Processor time; a ratio is the
+median of the ratios within a turn.
+
+    of source      multiple of the time without a cache; bar: at most 1.2 for ``fill``
+    read           share of getting the clip: decode, or read and unpack; for ``fill`` also compress and write
+    view           share of crop, resize and flip
+    kernel         share of the pixel kernel
+    MiB            size of the cache
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.frame import Column, Record, Report, add_videos, add_whole
+from tests.oracles.leases import open_leases
+from v2v_protocol.command import Parser
+from v2v_protocol.messages import Lease
+from v2v_protocol.spec import StreamSpec
+from v2v_server.simulation.view import apply_view
+from v2v_server.store.cache import Cache, make_cache
+from v2v_server.worker.produce import decode_for, make_sample
+
+FILL_BAR = 1.2
+WAYS = ("source", "fill", "hits")
+_PARTS = ("read", "view", "kernel")
+_COLUMNS: tuple[Column, ...] = (
+    ("way", "", "{}", 1.0),
+    ("cpu_seconds_per_sample", "CPU ms a sample", "{:.1f}", 1e3),
+    ("ratio_to_source", "of source", "{:.2f}", 1.0),
+    ("ratio_to_source_lowest", "lowest", "{:.2f}", 1.0),
+    ("ratio_to_source_highest", "highest", "{:.2f}", 1.0),
+    *((f"{part}_share", part, "{:.0%}", 1.0) for part in _PARTS),
+    ("cache_bytes", "MiB", "{:.0f}", 2.0**-20),
+)
+
+
+def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> list[float]:
+    """Make every sample once; return the processor seconds of read, view and kernel."""
+    spent = np.zeros(3)
+    for lease in leases:
+        clock = [time.process_time()]
+        decoded = decode_for(lease, lease.indices, root, cache)[0]
+        clock.append(time.process_time())
+        make_sample(lease, decoded)
+        clock.append(time.process_time())
+        # make_sample contains the view: time it once more by itself.
+        apply_view(decoded.clip.frames, decoded.plan.params, decoded.plan.spec.recipe)
+        clock.append(time.process_time())
+        read, made, view = np.diff(clock)
+        spent += read, view, made - view
+    return [float(part) for part in spent]
+
+
+def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, Any]]:
+    """Run the three ways in turns, each turn with an empty cache; return one record for each way."""
+    epoch(leases, root, None)  # warms files and kernels
+    found: dict[str, list[list[float]]] = {way: [] for way in WAYS}
+    cache_bytes = 0
+    for _ in range(turns):
+        with tempfile.TemporaryDirectory(prefix="v2v-cache-") as folder:
+            make_cache(Path(folder))
+            cache = Cache(Path(folder), 1 << 40, least_free_bytes=0)
+            for way, where in zip(WAYS, (None, cache, cache), strict=True):
+                found[way].append(epoch(leases, root, where))
+            cache_bytes = cache.used_bytes
+    records = []
+    for way, epochs in found.items():
+        ratios = [sum(mine) / sum(source) for mine, source in zip(epochs, found["source"], strict=True)]
+        records.append(
+            {
+                "way": way,
+                "cpu_seconds_per_sample": statistics.median(map(sum, epochs)) / len(leases),
+                "ratio_to_source": statistics.median(ratios),
+                "ratio_to_source_lowest": min(ratios),
+                "ratio_to_source_highest": max(ratios),
+                **{
+                    f"{part}_share": statistics.median(each[number] / sum(each) for each in epochs)
+                    for number, part in enumerate(_PARTS)
+                },
+                "cache_bytes": 0 if way == "source" else cache_bytes,
+                "samples": len(leases),
+                "turns": turns,
+            }
+        )
+    return records
+
+
+def missed(records: Sequence[Record]) -> list[str]:
+    """Return the bar that these records miss."""
+    ratio = next(record["ratio_to_source"] for record in records if record["way"] == "fill")
+    return [f"fill: {ratio:.2f} times source; the bar is {FILL_BAR}"] if ratio > FILL_BAR else []
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    add_videos(parser, "clips of at least 201 frames (python -m bench corpus)", rows="top:0.54")
+    add_whole(parser, "--samples", 200, "most samples, of the first epoch")
+    add_whole(parser, "--turns", 3, "turns of each way")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
+    with open_leases(asked.videos, asked.rows, StreamSpec()) as (root, endless):
+        leases = list(itertools.takewhile(lambda lease: lease.epoch == 0, itertools.islice(endless, asked.samples)))
+        records = compare(leases, root, asked.turns)
+    return Report(records, [(records, _COLUMNS)], missed=missed(records))

@@ -1,0 +1,170 @@
+"""Measure time and memory of a catalogue of a million videos, and the time to the first batch.
+
+    python -m bench catalogue --clip FILE.mp4 --videos 1000000
+
+The corpus is synthetic: one clip under many names (hard links to a few copies), a thousand names a folder, and a
+complete index, as a second start finds it. Files and index are below --folder and are removed at the end. A fresh
+process opens the catalogue, twice: the first finds no column cache and writes one. Then a server with two workers
+starts on it.
+
+    open           seconds to open the catalogue, and processor time of all its processes
+    first          the same without the column cache
+    table          seconds to build the sequence table of the paper's recipe
+    resident       memory that both added to the process, and the peak
+    first batch    seconds from the start of v2v-serve to the first batch of 12
+    server         memory of the v2v-serve process then
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import multiprocessing
+import os
+import resource
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.frame import Column, Report, add_whole
+from v2v_client.dataset import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
+from v2v_protocol.spec import StreamSpec
+from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.catalogue.index.file import IndexRow, Store
+from v2v_server.catalogue.refresh import index_path
+from v2v_server.catalogue.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
+from v2v_server.catalogue.scenes import Looking
+from v2v_server.catalogue.survey import examine
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.system.process import resident_bytes, usable_cores
+from v2v_server.video.rows import Rows
+
+_PER_FOLDER = 1000
+_LINKS = 50_000
+"""Hard links to one file; ext4 allows at most 65,000."""
+_COLUMNS: tuple[Column, ...] = (
+    ("videos", "videos", "{}", 1),
+    ("open_seconds", "open s", "{:.2f}", 1.0),
+    ("open_cpu_seconds", "CPU s", "{:.2f}", 1.0),
+    ("open_seconds_without_cache", "first s", "{:.2f}", 1.0),
+    ("open_cpu_seconds_without_cache", "CPU s", "{:.2f}", 1.0),
+    ("table_seconds", "table s", "{:.2f}", 1.0),
+    ("resident_bytes", "resident MiB", "{:.0f}", 2.0**-20),
+    ("peak_bytes", "peak MiB", "{:.0f}", 2.0**-20),
+    ("first_batch_seconds", "first batch s", "{:.2f}", 1.0),
+    ("server_bytes", "server MiB", "{:.0f}", 2.0**-20),
+)
+
+
+def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = False) -> None:
+    """Make ``videos`` names below ``folder`` and their index in ``cache``.
+
+    With ``scene`` the index has scene data too: every third video has a shot boundary in the middle.
+
+    Raises:
+        UsageError: the clip cannot be served.
+    """
+    copies = folder.with_name("copies")
+    copies.mkdir()
+    ids = []
+    for number in range(videos):
+        if number % _LINKS == 0:
+            copy = copies / f"{number}{clip.suffix}"
+            shutil.copy(clip, copy)
+        id = f"{number // _PER_FOLDER:06d}/{1_000_000_000 + number}{clip.suffix}"
+        if number % _PER_FOLDER == 0:
+            (folder / id).parent.mkdir(parents=True)
+        (folder / id).hardlink_to(copy)
+        ids.append(id)
+    known = examine(folder, ids[0])
+    if known.problem is not None:
+        raise UsageError(f"--clip {clip}: {known.problem}")
+    store = Store(index_path(folder.resolve(), cache))
+
+    def rows() -> Iterator[IndexRow]:
+        for number, id in enumerate(ids):
+            if number % _LINKS == 0:  # a hard link changes the ctime of its file: read it after the last link
+                status = (folder / id).stat()
+            yield dataclasses.replace(known, id=id, mtime_ns=status.st_mtime_ns, ctime_ns=status.st_ctime_ns)
+
+    def scenes() -> Iterator[tuple[str, str, str, bytes]]:
+        end = min(known.frames, MOST_FRAMES)
+        values = np.random.default_rng(0).uniform(1.0, 10.0, (-(-end // SEGMENT_FRAMES), COLUMNS))
+        whole, cut = (Scene.of(end, cuts, values).to_bytes() for cuts in ((), (end // 2,)))
+        for number, id in enumerate(ids):
+            yield id, known.fingerprint, Looking(Rows(), None).key, whole if number % 3 else cut
+
+    try:
+        store.put(rows())
+        if scene:
+            store.not_looked_at("")  # makes the table
+            store.put_scenes(scenes())
+    finally:
+        store.close()
+
+
+def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
+    """Open the catalogue in this process, which must be a fresh one; return the record."""
+    before = resident_bytes()
+    began, cpu = time.perf_counter(), sum(os.times()[:4])  # with ended children
+    catalogue = open_catalogue(folder, cache_dir=cache, processes=usable_cores(), scene=scene)
+    record: dict[str, Any] = {
+        "open_seconds": time.perf_counter() - began,
+        "open_cpu_seconds": sum(os.times()[:4]) - cpu,
+    }
+    began = time.perf_counter()
+    table = SequenceTable(catalogue.videos, catalogue.rows, StreamSpec())
+    record |= {"table_seconds": time.perf_counter() - began, "videos": len(catalogue.videos), "sequences": table.count}
+    record |= {
+        "resident_bytes": resident_bytes() - before,
+        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before,
+    }
+    catalogue.close()
+    return record
+
+
+def _in_a_fresh_process(folder: Path, cache: Path, scene: bool) -> dict[str, Any]:
+    # The processes of a Pool must not have children.
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
+        return fresh.submit(opened, folder, cache, scene).result()
+
+
+def first_batch(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
+    """Return the seconds from the start of a server to its first batch, and the memory of its process."""
+    began = time.perf_counter()
+    with LocalServer(
+        folder, workers=2, flags=["--cache-dir", str(cache), "--scene", "auto" if scene else "off"]
+    ) as server:
+        batches = iter(V2VStreamDataset(server.address, rank=0, world_size=1, keys=""))
+        next(batches)
+        seconds, resident = time.perf_counter() - began, server.rss_bytes()[server.pid]
+        batches.close()  # type: ignore[attr-defined]
+    return {"first_batch_seconds": seconds, "server_bytes": resident}
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    parser.add_argument("--clip", required=True, type=Path, help="a short video of at least 201 frames")
+    add_whole(parser, "--videos", 1_000_000, "names to make")
+    parser.add_argument("--scene", action="store_true", help="with scene data, as v2v-serve --scene auto")
+    parser.add_argument("--folder", type=Path, help="where to make the names (default: that of temporary files)")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
+    with tempfile.TemporaryDirectory(prefix="v2v-catalogue-", dir=asked.folder) as place:
+        folder, cache = Path(place, "videos"), Path(place, "cache")
+        make_up(asked.clip, folder, cache, asked.videos, asked.scene)
+        without_cache, record = (_in_a_fresh_process(folder, cache, asked.scene) for _ in range(2))
+        record |= {f"{name}_without_cache": without_cache[name] for name in ("open_seconds", "open_cpu_seconds")}
+        record |= first_batch(folder, cache, asked.scene)
+    return Report([record], [([record], _COLUMNS)])

@@ -1,0 +1,297 @@
+"""A server with null workers: workers that answer every lease at once with constant arrays, or with samples made ahead.
+
+    python -m bench.speed.null_workers --connect ADDRESS --workers 64 --parent-pid PID
+
+They connect to ``v2v-serve --worker-bind`` and speak the workers' protocol, so that such a server does the work of the
+broker and nothing else. All of them are sockets of one process, because 64 interpreters would compete for the cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+import zmq
+from av.video.frame import VideoFrame
+
+from bench.processes import Roles
+from v2v_client.local_server import LocalServer
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import RemoteError, ServerLost
+from v2v_protocol.messages import (
+    Begun,
+    Denied,
+    Goodbye,
+    Lease,
+    Message,
+    Ping,
+    Pong,
+    Result,
+    Stop,
+    WorkerHello,
+)
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Provenance, SampleId, SampleParams
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, encode_sample
+from v2v_server.system.process import die_with_parent, keep_freed_memory
+from v2v_server.worker.output_buffer import open_output_buffer, pack, sample_message
+from v2v_server.worker.produce import sample_layout
+
+Ready = Mapping[str, npt.NDArray[Any]]
+"""Samples made ahead: [samples, ...] of each array."""
+
+CREDIT = 2
+"""Leases that each holds at a time, as a real worker does."""
+_PING_SECONDS = 5.0
+_FRAMES_PER_SECOND = 30
+_SEQUENCES_PER_VIDEO = 2
+
+CAMERA = SampleParams(
+    threshold_pos=0.25,
+    threshold_neg=0.25,
+    noise_sigma=0.0,
+    hot_pixel_count=0,
+    hot_pixel_sigma=0.0,
+    pauses=(),
+    scale=1.0,
+    crop_top_px=0,
+    crop_left_px=0,
+    flip=False,
+    contrast=0.0,
+    noise_key=(0, 0, 0, 0),
+)
+"""The camera in the provenance of every sample."""
+
+
+class NullWorkers:
+    """``count`` null workers in one thread; ``samples`` as for :func:`answer`."""
+
+    def __init__(self, address: str, count: int, samples: Ready | None = None) -> None:
+        self._samples = samples
+        self._context = zmq.Context()
+        self._poller = zmq.Poller()
+        self._names: dict[zmq.Socket[bytes], str] = {}
+        self._joining: set[zmq.Socket[bytes]] = set()
+        self._leases: dict[zmq.Socket[bytes], deque[Lease]] = defaultdict(deque)
+        self._begun: dict[zmq.Socket[bytes], int] = {}
+        for number in range(count):
+            link = self._context.socket(zmq.DEALER)
+            name = f"null-{os.getpid()}-{number}"
+            link.setsockopt(zmq.ROUTING_ID, name.encode())
+            link.setsockopt(zmq.LINGER, 0)
+            link.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
+            link.setsockopt(zmq.SNDHWM, 0)
+            link.setsockopt(zmq.RCVHWM, 0)
+            link.connect(address)
+            self._names[link] = name
+            self._poller.register(link, zmq.POLLIN)
+            link.send_multipart(encode(WorkerHello(name, NUMERICS_VERSION, CREDIT)))
+            # The server does not answer a hello; it answers the ping after it.
+            self._joining.add(link)
+            link.send_multipart(encode(Ping()))
+
+    def run(self) -> None:
+        """Answer leases until the server stops all workers; print "joined" once it knows all of them.
+
+        Raises:
+            RemoteError: the server refuses a worker.
+        """
+        next_ping = time.monotonic() + _PING_SECONDS
+        try:
+            while self._names:
+                waiting = not any(self._leases.values())
+                for link, _ in self._poller.poll(int(_PING_SECONDS * 1000) if waiting else 0):
+                    self._handle(link, decode(link.recv_multipart()[0]))
+                for link, leases in self._leases.items():
+                    if leases:
+                        self._answer(link, leases)
+                if time.monotonic() >= next_ping:
+                    next_ping = time.monotonic() + _PING_SECONDS
+                    for link in self._names:
+                        link.send_multipart(encode(Ping()))
+        finally:
+            self._context.destroy(linger=0)
+
+    def _handle(self, link: zmq.Socket[bytes], message: Message) -> None:
+        match message:
+            case Lease():
+                self._leases[link].append(message)
+            case Pong() if link in self._joining:
+                self._joining.remove(link)
+                if not self._joining:
+                    print("joined", flush=True)
+            case Stop():
+                link.send_multipart(encode(Goodbye()))
+                self._poller.unregister(link)
+                del self._names[link]
+                self._leases.pop(link, None)
+            case Denied(code, text):
+                raise RemoteError(code, text)
+            case _:
+                pass
+
+    def _answer(self, link: zmq.Socket[bytes], leases: deque[Lease]) -> None:
+        """Answer the oldest lease with the messages of a worker that already holds the next one."""
+        lease = leases.popleft()
+        if self._begun.get(link) != lease.lease:
+            link.send_multipart(encode(Begun(lease.lease)))
+        begins = self._begun[link] = leases[0].lease if leases else 0
+        frames = answer(lease, self._names[link], self._samples)
+        link.send_multipart([*encode(Result(lease.lease, begins)), *frames], copy=False)
+
+
+def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:
+    """Return the frames of a sample message that fits the lease.
+
+    Args:
+        lease: to answer.
+        name: of the worker.
+        samples: arrays to send, in turn; None sends ones.
+    """
+    index = lease.indices[0]
+    provenance = Provenance(
+        id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
+        video=lease.video,
+        fingerprint=lease.fingerprint,
+        start_frame=lease.start_frame,
+        candidate=lease.candidate,
+        refusals=(),
+        params=CAMERA,
+        saturated_bins=0,
+        irregular_timestamps=0,
+        decoder="none",
+        quarantine=lease.quarantine,
+    )
+    if samples is not None:
+        return _ready_message(lease, name, provenance, samples)
+    buffer = open_output_buffer(lease, sample_layout(lease))
+    # Untouched memory is one shared page of zeros, which is nearly free to send.
+    for array in buffer.arrays.values():
+        array.fill(1)
+    return sample_message(lease, buffer, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0)
+
+
+_packed: dict[int, list[bytes]] = {}
+
+
+def _ready_message(lease: Lease, name: str, provenance: Provenance, samples: Ready) -> list[Any]:
+    """Return the message of a sample made ahead; each is compressed once."""
+    index = lease.indices[0]
+    number = index % len(samples[lease.arrays[0]])
+    arrays = {each: samples[each][number] for each in lease.arrays}
+    if lease.packed and number not in _packed:
+        _packed[number] = [pack(array.reshape(-1).view("uint8").data) for array in arrays.values()]
+    ready = iter(_packed.get(number, ()))
+    return encode_sample(
+        epoch=lease.epoch, index=index, arrays=arrays, provenance=provenance.to_dict(), worker=name, cpu_seconds=0.0,
+        decoded=True, cache="", slot=lease.slot, in_slot=False, quarantine=lease.quarantine,
+        pack=(lambda raw: next(ready)) if lease.packed else None,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class NullService:
+    """A running server: the broker's process, and the process of all null workers."""
+
+    server: LocalServer
+    workers_pid: int
+
+    @property
+    def roles(self) -> Roles:
+        """Return the processes of the null workers, the broker, and the client (this process)."""
+        return {"workers": [self.workers_pid], "broker": [self.server.pid], "client": [os.getpid()]}
+
+
+@contextmanager
+def null_service(
+    recipe: Recipe, *, workers: int, sequences: int = 240, flags: Sequence[str] = (), samples: Path | None = None
+) -> Iterator[NullService]:
+    """Start a server with null workers on small videos; stop it at the end of the block.
+
+    Args:
+        recipe: of the server.
+        workers: null workers.
+        sequences: least number in an epoch; the end of an epoch costs a consumer a new session.
+        flags: of ``v2v-serve``; they must give that recipe.
+        samples: folder of the samples to send, ``NAME.npy`` of each array; None sends ones.
+
+    Raises:
+        ServerLost, UsageError: the server, or the null workers, do not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="v2v-null-") as folder:
+        corpus, address = Path(folder, "corpus"), f"ipc://{folder}/workers"
+        corpus.mkdir()
+        # As long as usual clips, because a lease carries part of the index of all frames.
+        frames = (_SEQUENCES_PER_VIDEO - 1) * recipe.frames_per_sequence + recipe.frames_needed
+        first = corpus / "0.mp4"
+        still_video(first, frames, recipe.crop_height_px, recipe.crop_width_px)
+        for number in range(1, -(-sequences // _SEQUENCES_PER_VIDEO)):
+            (corpus / f"{number}.mp4").hardlink_to(first)
+        own = ["--worker-bind", address, "--cache-dir", folder]
+        with LocalServer(corpus, workers=0, flags=[*flags, *own]) as server:
+            command = [
+                sys.executable,
+                "-m",
+                "bench.speed.null_workers",
+                "--connect",
+                address,
+                "--workers",
+                str(workers),
+            ]
+            command += ["--parent-pid", str(os.getpid()), *([] if samples is None else ["--samples", str(samples)])]
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+            try:
+                # A consumer that connects earlier gets the credit of a server without workers.
+                if process.stdout is None or process.stdout.readline() != "joined\n":
+                    raise ServerLost("the null workers ended before they joined the server")
+                yield NullService(server, process.pid)
+            finally:
+                process.terminate()
+                process.communicate()
+
+
+def still_video(path: Path, frames: int, height_px: int, width_px: int) -> None:
+    """Write a video of a constant grey picture; odd sides are rounded up."""
+    height, width = height_px + height_px % 2, width_px + width_px % 2
+    picture = VideoFrame.from_ndarray(np.full((height * 3 // 2, width), 128, np.uint8), format="yuv420p")
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("mpeg4", rate=_FRAMES_PER_SECOND)
+        stream.width, stream.height, stream.pix_fmt, stream.gop_size = width, height, "yuv420p", 600
+        stream.thread_count = 1
+        for number in range(frames):
+            picture.pts = number
+            output.mux(stream.encode(picture))
+        output.mux(stream.encode(None))
+
+
+def main() -> None:
+    """Run the null workers."""
+    parser = argparse.ArgumentParser(prog="python -m bench.speed.null_workers", description=__doc__)
+    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="the server's --worker-bind")
+    parser.add_argument("--workers", type=int, required=True, metavar="N", help="number of null workers")
+    parser.add_argument("--samples", type=Path, metavar="DIR", help="samples to send: NAME.npy of each array")
+    parser.add_argument("--parent-pid", type=int, required=True, metavar="PID", help="end when this process ends")
+    asked = parser.parse_args()
+    die_with_parent(asked.parent_pid)
+    keep_freed_memory()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    samples = None if asked.samples is None else {file.stem: np.load(file) for file in asked.samples.glob("*.npy")}
+    NullWorkers(asked.connect, asked.workers, samples).run()
+
+
+if __name__ == "__main__":
+    main()
