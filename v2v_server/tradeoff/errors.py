@@ -66,7 +66,7 @@ class Tally:
 
 
 def compare(voxels: Voxels, reference: Voxels) -> Tally:
-    """The tally of two arrays of the same shape, signed event counts.
+    """Return the tally of two arrays of the same shape, signed event counts.
 
     Raises:
         UsageError: their shapes differ.
