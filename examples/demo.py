@@ -28,7 +28,7 @@ _BATCH_SIZE = 4
 _WARMUP_BATCHES = 2
 _SHOWN = 4
 _VOXELS_PER_CLIP = 10
-_CONFIGURATION = "tiny-cpu"
+_CONFIGURATION = "finetune-cpu"
 _HELD_OUT = "bikes.mp4"
 """A clip that the shipped network was not trained on."""
 

@@ -1,4 +1,4 @@
-"""Compare the demo's trained network with the best grey picture, and draw its reconstructions."""
+"""Compare the demo's trained network with its first weights and the best grey picture, and draw its pictures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from trainer.config_file import load_config
-from trainer.models import NETWORKS
+from trainer.models import NETWORKS, VoxelNetwork
 from trainer.pictures import add_header, write_png
 from trainer.run.checkpoint import LAST
 from trainer.tasks import Reconstruction
@@ -24,7 +24,7 @@ _FIRST_SHOWN = 4
 
 
 def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
-    """Compare the trained network with a constant, on virtual cameras that it was not trained on.
+    """Compare the trained network with its first weights and a constant, on cameras that it was not trained on.
 
     The constant is the mean of the frames it is compared with, which a real predictor could not know. Both errors are
     mean absolute differences, the training loss.
@@ -41,21 +41,22 @@ def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
     config = load_config(configuration)
     torch.set_num_threads(config.compute.threads)
     recipe = config.stream.resolved_recipe.replace(crop_height_px=_SIDE_PX, crop_width_px=_SIDE_PX)
-    network = NETWORKS[config.network.name](bins=recipe.bins, **config.network.options)
-    load_into(network, run / LAST, ema=True)
     dataset = V2VStreamDataset(address, batch_size=2, recipe=recipe, seed=_SEED)
     batches: list[Batch] = []
     while len(batches) * 2 < _SAMPLES:
         batches += dataset
     target = torch.cat([batch.arrays["frames"] for batch in batches]) / 255.0
     voxels = torch.cat([batch.arrays["voxels"] for batch in batches])
-    with torch.no_grad():
-        prediction = torch.cat([network.forward_sequence(piece) for piece in torch.split(voxels, 2)])
-    loss = float((prediction - target).abs().mean())
+
+    network = NETWORKS[config.network.name](bins=recipe.bins, **config.network.options)
+    load_into(network, config.network.weights)
+    before = _error(network, voxels, target)
+    load_into(network, run / LAST, ema=True)
+    loss = _error(network, voxels, target)
     constant = float((target.mean() - target).abs().mean())
     print(
-        f"trained network: mean absolute error {loss:.4f}; constant-mean predictor: {constant:.4f} "
-        f"({loss / constant:.0%} of it) on {len(target)} new samples of {_SIDE_PX} x {_SIDE_PX}"
+        f"mean absolute error on {len(target)} new samples of {_SIDE_PX} x {_SIDE_PX}: {before:.4f} with the shipped "
+        f"weights, {loss:.4f} after the training; constant-mean predictor: {constant:.4f} ({loss / constant:.0%} of it)"
     )
     task = Reconstruction(config.loss, network, torch.device("cpu"), bfloat16=False)
     shown = [film for batch in batches[:_COLUMNS] for film in task.judge(network, batch, _COLUMNS)[1]][:_COLUMNS]
@@ -64,3 +65,10 @@ def judge(address: str, configuration: str, run: Path, picture: Path) -> bool:
     write_png(picture, add_header(sheet, task.panels * len(shown), "After a minute of training", time_runs_down=True))
     print(f"picture: {picture} (events, target, reconstruction; time runs down)")
     return loss < constant
+
+
+def _error(network: VoxelNetwork, voxels: torch.Tensor, target: torch.Tensor) -> float:
+    """Return the mean absolute error of the network's pictures."""
+    with torch.no_grad():
+        prediction = torch.cat([network.forward_sequence(piece) for piece in torch.split(voxels, 2)])
+    return float((prediction - target).abs().mean())

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     training, held_out = curves(asked.runs, asked.of)
     if not training:
-        raise SystemExit(f"no reading of {asked.of!r} in {', '.join(map(str, asked.runs))}")
+        raise SystemExit(f"no reading of {asked.of!r} in {', '.join(map(str, asked.runs))}: give another --of")
     draw(training, held_out, asked.picture, "loss" if asked.of == "total" else asked.of)
     print(f"{len(training)} readings up to step {max(training)}: {asked.picture}")
     return 0

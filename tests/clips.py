@@ -1,4 +1,4 @@
-"""Small video files for tests: a photograph panned by whole pixels, in any codec and container that PyAV can write."""
+"""Write small video files for tests: a photograph panned by whole pixels, in any codec and container of PyAV."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _photograph() -> npt.NDArray[np.uint8]:
 def panned_luma(
     frames: int, height: int = 48, width: int = 64, step: tuple[int, int] = (1, 2), full_range: bool = True
 ) -> npt.NDArray[np.uint8]:
-    """A window gliding over a photograph by ``step`` = (down, right) whole pixels a frame, wrapping around.
+    """Pan a window over a photograph by ``step`` = (down, right) whole pixels per frame, wrapping around.
 
     Returns:
         [frames, height, width] uint8; spans 16 .. 235 unless ``full_range``.
@@ -79,7 +79,7 @@ def write_clip(
         full_range: the range to state; None states none.
         rotation_degrees, hflip: display matrix to write.
         pts: time stamps in units of TIME_BASE, one a frame.
-        container: FFmpeg's name of the container, where the suffix does not tell.
+        container: FFmpeg's name of the container, if the suffix does not determine it.
         audio: add a tone.
     """
     n, height, width = luma.shape
@@ -135,14 +135,14 @@ def _tone(samples: int) -> av.AudioFrame:
 
 
 def truncated(source: Path, target: Path, share: float) -> Path:
-    """The first ``share`` of a file's bytes."""
+    """Keep the first ``share`` of a file's bytes."""
     content = source.read_bytes()
     target.write_bytes(content[: int(len(content) * share)])
     return target
 
 
 def damaged(source: Path, target: Path, packet: int) -> Path:
-    """The file with the video packet of that number (stored order) overwritten by noise, apart from its first bytes."""
+    """Overwrite the video packet of that number (stored order) by noise, apart from its first bytes."""
     with av.open(str(source)) as container:
         wanted = [(p.pos, p.size) for p in container.demux(video=0) if p.size][packet]
     if wanted[0] is None or wanted[0] < 0:

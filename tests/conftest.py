@@ -1,4 +1,4 @@
-"""What holds for every test."""
+"""Define fixtures for all tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ settings.load_profile("ci" if os.environ.get("CI") else "v2v")
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Catalogue indexes and quarantine files of the tests stay out of the user's cache."""
+    """Keep catalogue indexes and quarantine files of the tests out of the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("V2V_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         yield

@@ -1,6 +1,6 @@
-"""H.264 whose pictures are stored as two fields each, as AVCHD cameras do and no encoder that tests can install does.
+"""Write H.264 whose pictures are stored as two fields, as AVCHD cameras do; no encoder available to tests does.
 
-Every macroblock is stored as it is (I_PCM), so that decoding gives the very pictures that went in. Clauses are those of
+Every macroblock is stored uncompressed (I_PCM), so that decoding gives exactly the input pictures. Clauses are those of
 ITU-T H.264. Display order I b P b P ...; every third picture is stored as a whole frame, because streams mix both.
 """
 

@@ -1,5 +1,5 @@
-"""Every command line that the documentation, `deploy/` and the examples show: its flags are those of the program, and a
-line of a code block is read by the program's own parser, on whatever machine it is meant to run."""
+"""Check every command line in the documentation, `deploy/` and the examples: its flags exist, and the program's own
+parser accepts each line of a code block."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class _Caught(Exception):
 
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
-    """The parser with which the ``main`` of a module reads its command line."""
+    """Return the parser with which the ``main`` of a module reads its command line."""
     found: list[argparse.ArgumentParser] = []
 
     def parse(self: argparse.ArgumentParser, *_: object) -> None:
@@ -78,22 +78,22 @@ def parser_of(module: str) -> argparse.ArgumentParser:
 
 
 def flags_of(program: str) -> frozenset[str]:
-    """All flags that the program's own parser knows."""
+    """Return all flags that the program's own parser knows."""
     return frozenset(parser_of(MODULES[program])._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
-    """(program, its flags) of each command line in a text; a backslash at the end of a line goes on with the next."""
+    """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
     return [(program, _FLAG.findall(rest)) for program, rest in _LINE.findall(joined) if program in MODULES]
 
 
-def test_the_reader_of_command_lines_sees_them() -> None:
+def test_command_lines_are_found_in_texts() -> None:
     text = "Say `v2v-serve --videos DIR --bind=x`, or\n    v2v-worker --connect A \\\n      --cache B  # --no flag\n"
     assert command_lines(text) == [("v2v-serve", ["--videos", "--bind"]), ("v2v-worker", ["--connect", "--cache"])]
 
 
-def test_every_program_is_asked() -> None:
+def test_every_program_is_checked() -> None:
     named = {value.strip('"') for value in re.findall(r"^(v2v-\w+) = ", (ROOT / "pyproject.toml").read_text(), re.M)}
     assert named == set(MODULES)
     assert "--videos" in flags_of("v2v-serve")
@@ -102,7 +102,7 @@ def test_every_program_is_asked() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_flags_that_are_shown_exist(page: Path) -> None:
+def test_shown_flags_exist(page: Path) -> None:
     wrong = [
         f"{program} {flag}"
         for program, flags in command_lines(page.read_text(encoding="utf-8"))
@@ -112,7 +112,7 @@ def test_flags_that_are_shown_exist(page: Path) -> None:
     assert wrong == []
 
 
-def test_images_start_programs_with_flags_of_theirs() -> None:
+def test_images_start_programs_with_valid_flags() -> None:
     lists = [
         *re.findall(r"^(?:ENTRYPOINT|CMD) (\[.*\])$", (ROOT / "deploy" / "Dockerfile").read_text(), re.M),
         *re.findall(r"command: (\[\"--.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M),
@@ -124,8 +124,8 @@ def test_images_start_programs_with_flags_of_theirs() -> None:
 
 
 def block_lines(text: str) -> list[list[str]]:
-    """The words of each line of the code blocks of a page: without the prompt that says on which host, and without
-    variables of the environment."""
+    """Yield the words of each line in a page's code blocks, without the prompt that names the host, and without
+    environment variables."""
     text = re.sub(r" *\\\n\s*", " ", re.sub(r"^```python.*?^```", "", text, flags=re.M | re.S))
     lines = re.findall(
         r"^ {4}(?:\w+\$ +)?((?:[A-Z_]+=\S+ )*(?:v2v-|uvx |torchrun |python |pip |make |pytest ).*)$", text, re.M
@@ -136,7 +136,7 @@ def block_lines(text: str) -> list[list[str]]:
 
 
 def wrong_with(words: list[str]) -> str:
-    """What is wrong with a command line, or nothing."""
+    """Return what is wrong with a command line; "" if it is valid."""
     program, *rest = words
     if program == "uvx":
         return wrong_with(rest[rest.index("--from") + 2 :])
@@ -156,7 +156,7 @@ def wrong_with(words: list[str]) -> str:
 
 
 def _wrong_with_launched(words: list[str]) -> str:
-    """Of what comes after `python` or `torchrun`: flags of theirs, then -m MODULE or a script, then its own."""
+    """Check what follows `python` or `torchrun`: their own flags, then -m MODULE or a script, then its flags."""
     if words[:1] == ["-c"]:
         return ""
     at = words.index("-m") + 1 if "-m" in words else next(n for n, word in enumerate(words) if word.endswith(".py"))
@@ -185,7 +185,7 @@ def test_lines_of_code_blocks_are_read_by_their_programs(page: Path) -> None:
     assert [f"{shlex.join(words)}: {wrong}" for words in lines if (wrong := wrong_with(words))] == []
 
 
-def test_what_is_wrong_with_a_line_is_seen() -> None:
+def test_faulty_command_lines_are_detected() -> None:
     text = """
     head$  KEY=a v2v-serve --videos DIR \\
         --workers 8   # and so on
@@ -210,7 +210,7 @@ OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
-def test_programs_and_flags_that_are_named_alone_exist(page: Path) -> None:
+def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)

@@ -1,4 +1,4 @@
-"""What `deploy/` says of the commands holds of the commands."""
+"""Check that `deploy/` agrees with the commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def service(unit: RawConfigParser) -> dict[str, str]:
     return dict(unit["Service"])
 
 
-def test_the_unit_does_not_start_again_over_a_mistyped_key(
+def test_the_unit_does_not_restart_after_a_mistyped_key(
     service: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "serve.yaml").write_text("video: /data/webvid\n")
@@ -56,30 +56,30 @@ def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dic
     assert ServeConfig.load(None, yaml.safe_load("\n".join(written))).workers == (8, 8)
 
 
-def test_the_unit_waits_for_the_address_that_it_may_be_told_to_bind(unit: RawConfigParser) -> None:
-    # 192.0.2.0/24 is nobody's, like an address that the host does not have yet.
+def test_the_unit_waits_for_its_bind_address(unit: RawConfigParser) -> None:
+    # No host has an address in 192.0.2.0/24, so it acts like one that this host does not have yet.
     with pytest.raises(UsageError, match=r"--bind tcp://192\.0\.2\.1:5555"):
         Sockets("tcp://192.0.2.1:5555", "ipc://@v2v-test-deploy")
     assert "network-online.target" in unit["Unit"]["After"].split()
     assert unit["Unit"]["Wants"] == "network-online.target"
 
 
-def test_a_container_hears_a_stop_before_the_server_has_handlers() -> None:
+def test_a_container_stops_before_the_server_has_signal_handlers() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     assert [service["init"] for service in services.values()] == [True, True, True]
     for file in ("Dockerfile", "trainer.Dockerfile"):
         assert "#   docker run --rm --init " in (DEPLOY / file).read_text()
 
 
-def test_a_mistyped_folder_of_videos_is_not_made() -> None:
+def test_a_mistyped_folder_of_videos_is_not_created() -> None:
     service = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["v2v-server"]
     (videos,) = [volume for volume in service["volumes"] if "VIDEOS" in str(volume)]
     assert (videos["type"], videos["target"], videos["read_only"]) == ("bind", "/videos", True)
     assert videos["bind"] == {"create_host_path": False}
 
 
-def test_a_container_has_no_rights_that_it_needs_not() -> None:
-    """Root's neither: both images name a user."""
+def test_a_container_has_minimal_rights() -> None:
+    """It does not run as root either: both images set a user."""
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     for service in services.values():
         assert service["cap_drop"] == ["ALL"]

@@ -47,7 +47,7 @@ def container(deployment: str) -> dict[str, Any]:
 # --- Kubernetes -------------------------------------------------------------------------------------------------------
 
 
-def test_every_file_is_named_and_every_document_is_what_its_schema_asks() -> None:
+def test_every_manifest_is_listed_and_matches_its_schema() -> None:
     validate = pytest.importorskip("kubernetes_validate")
     assert {path.name for path in KUBERNETES.glob("*.yaml")} == {
         "kustomization.yaml", *yaml.safe_load((KUBERNETES / "kustomization.yaml").read_text())["resources"],
@@ -75,7 +75,7 @@ def test_the_kustomization_builds(component: list[str], tmp_path: Path) -> None:
     assert images == {"registry.example/v2v-server:1"}
 
 
-def test_whoever_selects_pods_selects_some() -> None:
+def test_every_pod_selector_matches_pods() -> None:
     pods = []
     for each in documents():
         if each["kind"] == "Deployment":
@@ -100,7 +100,7 @@ def serving() -> ServeConfig:
     return asked[0]
 
 
-def test_the_broker_listens_where_workers_trainers_probes_and_policies_look() -> None:
+def test_ports_of_the_broker_match_workers_trainers_probes_and_policies() -> None:
     pod, config = container("v2v-broker"), serving()
     assert pod["command"] == ["v2v-serve"]
     ports = {port["name"]: port["port"] for port in named("Service", "v2v-broker")["spec"]["ports"]}
@@ -130,7 +130,7 @@ def test_workers_connect_to_the_broker_and_have_its_videos(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
-def test_what_is_mounted_is_there_and_the_root_is_not_written(deployment: str) -> None:
+def test_mounted_volumes_exist_and_the_root_is_read_only(deployment: str) -> None:
     spec = named("Deployment", deployment)["spec"]["template"]["spec"]
     mounts = {mount["name"]: mount["mountPath"] for mount in container(deployment)["volumeMounts"]}
     assert set(mounts) == {volume["name"] for volume in spec["volumes"]}
@@ -140,7 +140,7 @@ def test_what_is_mounted_is_there_and_the_root_is_not_written(deployment: str) -
     assert f"--uid {spec['securityContext']['runAsUser']} " in (DEPLOY / "Dockerfile").read_text()
 
 
-def test_the_scaler_asks_for_what_the_server_tells() -> None:
+def test_the_scaler_queries_existing_metrics() -> None:
     query = yaml.safe_load((KUBERNETES / "autoscale" / "scaled-object.yaml").read_text())["spec"]["triggers"][0]
     assert "v2v_waiting_share{" in query["metadata"]["query"]
     assert "v2v_waiting_share" in told()
@@ -150,7 +150,7 @@ def test_the_scaler_asks_for_what_the_server_tells() -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
-def test_systemd_takes_the_units(tmp_path: Path) -> None:
+def test_systemd_accepts_the_units(tmp_path: Path) -> None:
     for unit in (DEPLOY / "systemd").glob("*.service"):
         text = "".join(
             f"ExecStart={sys.executable}\n" if line.startswith("ExecStart=") else line
@@ -164,7 +164,7 @@ def test_systemd_takes_the_units(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not here")
 @pytest.mark.parametrize("unit", ["v2v-serve.service", "v2v-worker@.service"])
-def test_systemd_finds_little_that_a_unit_exposes(unit: str) -> None:
+def test_systemd_rates_the_units_exposure_as_low(unit: str) -> None:
     """Of 100 points; a unit without any of these settings has 92 to 96."""
     command = ["systemd-analyze", "security", "--offline=yes", "--threshold=20", str(DEPLOY / "systemd" / unit)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -174,7 +174,7 @@ def test_systemd_finds_little_that_a_unit_exposes(unit: str) -> None:
 
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
-def test_a_pod_has_no_rights_that_it_needs_not(deployment: str) -> None:
+def test_a_pod_has_minimal_rights(deployment: str) -> None:
     pod = named("Deployment", deployment)["spec"]["template"]["spec"]
     assert pod["automountServiceAccountToken"] is False
     assert pod["securityContext"]["runAsNonRoot"] is True
@@ -184,7 +184,7 @@ def test_a_pod_has_no_rights_that_it_needs_not(deployment: str) -> None:
     }  # fmt: skip
 
 
-def test_the_unit_of_a_worker_is_a_command_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_workers_unit_runs_a_valid_command(monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = [
         line.removeprefix("ExecStart=")
         for line in (DEPLOY / "systemd" / "v2v-worker@.service").read_text().splitlines()

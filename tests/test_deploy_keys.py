@@ -1,4 +1,4 @@
-"""The component of keys: what kustomize makes of it, and that a server and a worker take what its pods find."""
+"""Test the component "keys": the output of kustomize, and that a server and a worker accept the files in its pods."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ NOTES = [line.removeprefix("#").strip() for line in (COMPONENT / "kustomization.
 
 
 def patch_of(name: str) -> dict[str, Any]:
-    """The pod that a patch of the component describes."""
+    """Return the pod that a patch of the component describes."""
     spec: dict[str, Any] = yaml.safe_load((COMPONENT / name).read_text())["spec"]["template"]["spec"]
     return spec
 
 
 def secrets() -> dict[str, str]:
-    """Files that the secrets of the notes are made from, by their names."""
+    """Return the files from which the documented secrets are created, by name."""
     lines = [re.fullmatch(r"kubectl -n v2v create secret generic (\S+) --from-file=(\S+)", line) for line in NOTES]
     return {found[1]: found[2] for found in lines if found}
 
 
 @pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not here")
 @pytest.mark.parametrize("components", [["keys"], ["keys", "autoscale"]])
-def test_with_keys_the_manifests_build_and_the_broker_asks_for_them(
+def test_with_keys_the_manifests_build_and_the_broker_requires_them(
     components: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     validate = pytest.importorskip("kubernetes_validate")
@@ -73,7 +73,7 @@ def test_with_keys_the_manifests_build_and_the_broker_asks_for_them(
 
 
 def mounted(folder: Path, files: dict[str, bytes]) -> Path:
-    """A folder as Kubernetes mounts a secret for the group of a pod: links to links, which the group may read."""
+    """Create a folder as Kubernetes mounts a secret for the group of a pod: links to links, readable by the group."""
     data = folder / "..2026_11_24"
     data.mkdir(parents=True)
     for name, content in files.items():
@@ -84,9 +84,7 @@ def mounted(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
-def test_a_server_and_a_worker_take_the_keys_that_their_pods_find(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_and_a_worker_use_the_keys_in_their_pods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in NOTES:
         if line.startswith("v2v-keys "):
@@ -105,7 +103,7 @@ def test_a_server_and_a_worker_take_the_keys_that_their_pods_find(
                 mounted(where, found[by_volume[mount["name"]]])
             else:
                 where.mkdir(parents=True, exist_ok=True)
-        with pytest.raises(KeyRefused, match="others may have it"):  # why there is a copy
+        with pytest.raises(KeyRefused, match="other users may have read it"):  # why there is a copy
             read_key(place / "secret" / key)
         here = [str(place / part.removeprefix("/")) if part.startswith("/") else part for part in init["command"]]
         subprocess.run(here, check=True)

@@ -1,4 +1,4 @@
-"""What `deploy/` asks of a server's metrics, the server tells."""
+"""Check that the server exports every metric that `deploy/` uses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def queries() -> list[str]:
     return [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
 
 
-def test_every_query_of_the_dashboard_asks_for_metrics_that_are_told() -> None:
+def test_every_dashboard_query_uses_existing_metrics() -> None:
     names = told()
     assert queries()
     for query in [*queries(), *(each["query"] for each in DASHBOARD["templating"]["list"] if each["type"] == "query")]:
@@ -31,21 +31,21 @@ def test_every_query_of_the_dashboard_asks_for_metrics_that_are_told() -> None:
         assert set(_NAME.findall(query)) <= names, query
 
 
-def test_rates_are_of_what_only_grows() -> None:
+def test_rates_are_of_counters() -> None:
     for query in queries():
         rates = re.findall(r"(?:rate|increase)\((v2v_\w+)", query)
         assert all(name.endswith("_total") for name in rates), query
         assert set(rates) == {name for name in _NAME.findall(query) if name.endswith("_total")} or "faults" in query
 
 
-def test_the_dashboard_can_be_read_with_any_prometheus() -> None:
+def test_the_dashboard_works_with_any_prometheus() -> None:
     variables = {each["name"] for each in DASHBOARD["templating"]["list"]}
     assert set(re.findall(r"\$\{?(\w+)", json.dumps(DASHBOARD["panels"]))) <= variables
     assert all(panel["datasource"]["uid"] == "${source}" for panel in DASHBOARD["panels"])
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
 
 
-def test_panels_do_not_lie_upon_each_other() -> None:
+def test_panels_do_not_overlap() -> None:
     taken: set[tuple[int, int]] = set()
     for panel in DASHBOARD["panels"]:
         at = panel["gridPos"]
@@ -55,7 +55,7 @@ def test_panels_do_not_lie_upon_each_other() -> None:
         taken |= cells
 
 
-def test_prometheus_asks_the_server_by_a_name_that_the_page_answers_to(monkeypatch: Any) -> None:
+def test_prometheus_uses_a_host_name_that_the_page_accepts(monkeypatch: Any) -> None:
     asked: list[ServeConfig] = []
     monkeypatch.setattr(serve_command, "serve", asked.append)
     server = COMPOSE["services"]["v2v-server"]

@@ -1,4 +1,4 @@
-"""The drawn curve: what was logged, with the steps of several runs counted on."""
+"""Test the drawn curve: the logged values, with consecutive steps over several runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def logged(folder: Path, losses: list[float]) -> Path:
     return folder
 
 
-def test_steps_go_on_and_the_loss_is_smoothed(tmp_path: Path) -> None:
+def test_steps_continue_over_runs_and_the_loss_is_smoothed(tmp_path: Path) -> None:
     training, held_out = draw_curve.curves([logged(tmp_path / "a", [1.0, 2.0]), logged(tmp_path / "b", [2.0])])
     assert list(training) == [1, 2, 3]
     assert training[1] == 1.0
@@ -37,6 +37,6 @@ def test_a_picture_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "3 readings up to step 3" in capsys.readouterr().out
 
 
-def test_a_part_of_the_loss_that_nothing_logged_is_said(tmp_path: Path) -> None:
+def test_a_part_of_the_loss_without_readings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="no reading of 'lpips'"):
         draw_curve.main([str(logged(tmp_path / "a", [1.0])), str(tmp_path / "curve.png"), "--of", "lpips"])

@@ -1,4 +1,4 @@
-"""Who may import whom. Read from the source, so that an import inside a function counts as well."""
+"""Check which package may import which, by reading the source, so that imports inside functions count as well."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLOORS = (
 
 
 def imported_modules(source: str) -> set[str]:
-    """Full names of everything a module imports, wherever in it: statements, and import_module("...") calls."""
+    """Return the full names of all imports anywhere in a module: statements, and import_module("...") calls."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -45,7 +45,7 @@ def imported_modules(source: str) -> set[str]:
 
 
 def imported(source: str) -> set[str]:
-    """The top-level names of these."""
+    """Return the top-level names of a module's imports."""
     return {name.split(".")[0] for name in imported_modules(source)}
 
 
@@ -53,7 +53,7 @@ def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def test_the_reader_of_imports_sees_them_all() -> None:
+def test_all_kinds_of_imports_are_found() -> None:
     source = """
 import a.b, c as d
 from e.f import g
@@ -69,24 +69,24 @@ from . import o
 
 
 @pytest.mark.parametrize("package", ["v2v_protocol", *FORBIDDEN])
-def test_there_is_something_to_read(package: str) -> None:
+def test_the_packages_have_modules_to_check(package: str) -> None:
     assert modules(package)
 
 
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
-def test_the_protocol_needs_next_to_nothing(path: Path) -> None:
+def test_the_protocol_needs_only_light_packages(path: Path) -> None:
     may = PROTOCOL_MAY | {"yaml"} if path.name == "safe_yaml.py" else PROTOCOL_MAY
     assert imported(path.read_text(encoding="utf-8")) - may == set()
 
 
 def test_yaml_is_read_in_one_place() -> None:
-    """Its own loaders expand aliases without a bound."""
+    """YAML's own loaders expand aliases without a bound."""
     users = [path for package in PACKAGES for path in modules(package) if "yaml" in imported(path.read_text("utf-8"))]
     assert users == [ROOT / "v2v_protocol" / "safe_yaml.py"]
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_packages_keep_apart(package: str) -> None:
+def test_packages_import_only_allowed_packages(package: str) -> None:
     for path in modules(package):
         crossed = imported(path.read_text(encoding="utf-8")) & FORBIDDEN[package]
         if path.name == "in_process.py":
@@ -94,7 +94,7 @@ def test_packages_keep_apart(package: str) -> None:
         assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
 
 
-def test_no_import_of_the_server_runs_back_up() -> None:
+def test_server_folders_import_only_lower_folders() -> None:
     upward: set[tuple[str, str]] = set()
     for path in modules("v2v_server"):
         room = path.relative_to(ROOT / "v2v_server").parts[0].removesuffix(".py")
@@ -108,7 +108,7 @@ def test_no_import_of_the_server_runs_back_up() -> None:
     assert upward == set()
 
 
-def test_the_server_is_a_house_of_small_rooms() -> None:
+def test_server_folders_are_small() -> None:
     server = ROOT / "v2v_server"
     assert len(list(server.glob("*.py"))) <= 6
     for folder in server.rglob("*/"):
@@ -118,7 +118,7 @@ def test_the_server_is_a_house_of_small_rooms() -> None:
 @pytest.mark.parametrize(
     "room", ["catalogue/index", *sorted(set(FLOORS) - {"config", "serve", "simulation", "flow", "offline"})]
 )
-def test_a_room_has_a_map_of_its_files(room: str) -> None:
+def test_every_folder_documents_its_files(room: str) -> None:
     folder = ROOT / "v2v_server" / room
     on_the_map = {line.split()[0] for line in (folder / "__init__.py").read_text(encoding="utf-8").splitlines()[2:-1]}
     rooms = {path.parent.name for path in folder.glob("*/__init__.py")}
@@ -140,7 +140,7 @@ def test_imports_are_absolute() -> None:
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:
-    """What others import on their own account counts too."""
+    """Indirect imports count too."""
     program = f"import sys, {module}\nprint(*sorted({set(without)!r} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False, timeout=120

@@ -1,4 +1,4 @@
-"""The notebook runs from its first cell to its last, and shows what it says that it shows."""
+"""Test that the notebook runs from its first cell to its last, and shows what its text describes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 
 
 def shown_by(source: str, names: dict[str, Any]) -> Any:
-    """Runs a cell as a notebook does; returns the value of an expression at its end."""
+    """Run a cell as a notebook does, and return the value of an expression at its end."""
     tree = ast.parse(source)
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, str(NOTEBOOK), "exec"), names)
     return None if last is None else eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
 
 
-def test_it_is_kept_without_outputs() -> None:
+def test_the_notebook_is_stored_without_outputs() -> None:
     code = [cell for cell in CELLS if cell["cell_type"] == "code"]
     assert len(code) > 5
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
 
 
-def test_pages_that_it_names_are_there() -> None:
+def test_linked_pages_exist() -> None:
     text = "".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "markdown")
     pages = [part.split(")")[0] for part in text.split("](")[1:]]
     assert pages

@@ -27,13 +27,13 @@ SMALLER = {
     "v2v-tradeoff": ["--clips", "1", "--places", "1", "--forms", "lossless fast", "--budget-minutes", "0.1"],
 }
 CANNOT = {
-    r"^v2v-convert ": "recordings that nobody may hand on",
-    r"^v2v-eval ": "weights and recordings that nobody may hand on; tests of the trainer run v2v-eval on made ones",
+    r"^v2v-convert ": "recordings that may not be redistributed",
+    r"^v2v-eval ": "weights and recordings that may not be redistributed; the trainer's tests use synthetic ones",
     r"^v2v-train (e2vid|firenet-cpu|my\.yaml|scenes\.yaml) ": "weights of LPIPS, or the reader's own configuration",
-    r"^v2v-serve .*--page": "a port that somebody may have; tests of the page start it on a free one",
-    r"^v2v-serve .*s3://": "a bucket of somebody's; tests/stream/test_object_storage.py starts it on one of its own",
+    r"^v2v-serve .*--page": "a port that may be in use; tests of the page start it on a free one",
+    r"^v2v-serve .*s3://": "another owner's bucket; tests/stream/test_object_storage.py starts it on its own",
 }
-"""What cannot run here, and why."""
+"""Reasons why command lines cannot run in this test, by pattern."""
 _BLOCK = re.compile(r"(?:^(?: {4}.*)?\n)+", re.M)
 _COMMAND = re.compile(r"^ {4}(v2v-[a-z]+ .*)$", re.M)
 _INLINE = re.compile(r"`(v2v-[a-z]+ [^`]*--out [^`]*)`")
@@ -80,7 +80,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lines", RUN)
-def test_commands_run_as_they_stand(
+def test_documented_commands_run(
     lines: list[str], clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

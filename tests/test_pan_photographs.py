@@ -1,4 +1,4 @@
-"""Clips from photographs: smooth, of a fixed size, the same frames for the same seed."""
+"""Test clips from photographs: smooth, of a fixed size, with equal frames for equal seeds."""
 
 import sys
 
@@ -11,7 +11,7 @@ from skimage import data
 from examples import pan_photographs
 
 
-def test_a_camera_without_speed_stands_still():
+def test_a_camera_without_speed_does_not_move():
     steps = pan_photographs.motion(np.random.default_rng(0), 0.0)
     np.testing.assert_allclose(steps, np.broadcast_to(np.eye(3), steps.shape), atol=1e-12)
 
@@ -27,7 +27,7 @@ def test_motion_begins_at_rest_position_and_never_jumps():
 
 
 def test_the_same_seed_gives_the_same_frames(monkeypatch):
-    """Of the files that cannot be said: x264 does not always give the same bytes for the same frames."""
+    """The files may differ: x264 does not always give the same bytes for the same frames."""
     monkeypatch.setattr(pan_photographs, "FRAMES", 5)
     one, two, other = (
         pan_photographs.clip([data.chelsea()], [], np.random.default_rng(seed)) for seed in ((3, 0), (3, 0), (3, 1))
@@ -58,7 +58,7 @@ def test_an_object_cut_out_moves_over_a_photograph(monkeypatch):
     assert 0.001 < max(shares) < 0.6
 
 
-def test_a_picture_that_is_transparent_in_part_is_no_background(tmp_path, monkeypatch):
+def test_a_partly_transparent_picture_is_not_a_background(tmp_path, monkeypatch):
     cut_out = np.zeros((50, 50, 4), np.uint8)
     cut_out[10:40, 10:40] = 255
     cv2.imwrite(str(tmp_path / "thing.png"), cut_out)
@@ -67,7 +67,7 @@ def test_a_picture_that_is_transparent_in_part_is_no_background(tmp_path, monkey
         pan_photographs.main()
 
 
-def test_a_folder_without_photographs_is_said(tmp_path, monkeypatch):
+def test_a_folder_without_photographs_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["pan", str(tmp_path), str(tmp_path / "out")])
     with pytest.raises(SystemExit, match="no photograph"):
         pan_photographs.main()

@@ -1,4 +1,4 @@
-"""The reference page of all keys, and the flags that the documentation names."""
+"""Check the reference page of all keys, and the flags that the documentation names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 SCRIPTS = tomllib.loads((FOLDER.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
 
 
-def test_the_page_of_keys_is_what_the_source_says() -> None:
+def test_the_page_of_keys_matches_the_source() -> None:
     page = runpy.run_path(str(FOLDER / "make_keys.py"))["page"]()
     assert (FOLDER / "keys.md").read_text("utf-8") == page, "run: python docs/reference/make_keys.py"
 

@@ -158,11 +158,11 @@ def test_a_toy_array_reaches_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
             np.testing.assert_array_equal(batch.arrays["depth"][row], expected("depth", 5, 0, index))
 
 
-def test_every_array_that_may_be_asked_for_is_made() -> None:
+def test_every_array_that_can_be_requested_is_made() -> None:
     assert arrays.ARRAY_BUILDERS.keys() == sample.ARRAYS.keys()
 
 
-def test_the_toys_themselves_are_what_they_say() -> None:
+def test_the_toys_only_add_the_stated_lines() -> None:
     """Their own file besides, nothing but added lines: two for each."""
     for lines in (EFFECT_LINES, ARRAY_LINES):
         assert len(lines) == 2

@@ -1,4 +1,4 @@
-"""What would run what a stranger sent is nowhere, or in the few places that are named here."""
+"""Check that code which could execute received data is absent, or only in the few places named here."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ def calls() -> list[tuple[str, ast.Call]]:
     return found
 
 
-def test_nothing_that_was_sent_is_run() -> None:
+def test_received_data_is_never_executed() -> None:
     found = {path for path, call in calls() if ast.unparse(call.func) in CALLS}
     assert found == {"v2v_client/position/shared.py"}
 
 
-def test_no_command_goes_through_a_shell() -> None:
+def test_commands_never_use_a_shell() -> None:
     assert [path for path, call in calls() if any(word.arg == "shell" for word in call.keywords)] == []
 
 
-def test_yaml_is_the_safe_kind() -> None:
+def test_yaml_is_loaded_safely() -> None:
     loads = [(path, call) for path, call in calls() if ast.unparse(call.func) in ("yaml.load", "yaml.full_load")]
     assert {(path, ast.unparse(call.args[1])) for path, call in loads} == {("v2v_protocol/safe_yaml.py", "_Loader")}
     assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_protocol/safe_yaml.py").read_text(encoding="utf-8")
 
 
-def test_weights_and_arrays_are_loaded_as_such() -> None:
+def test_weights_and_arrays_are_loaded_without_pickle() -> None:
     """``weights_only=False`` is there once, with an unpickler of a closed list instead of pickle."""
     unsafe = [
         (path, word.arg)
@@ -60,7 +60,7 @@ def test_opencv_opens_no_file() -> None:
     assert [path for path, call in calls() if ast.unparse(call.func).endswith(readers)] == []
 
 
-def test_pickle_is_known_in_two_places() -> None:
+def test_pickle_is_used_in_two_places() -> None:
     found = set()
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

@@ -1,4 +1,4 @@
-"""The wheel works where nothing of the tree is: every command, the shipped configurations, types."""
+"""Test that the wheel works without the source tree: every command, the shipped configurations, types."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ran(*command: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the programs of an environment with the wheel; its dependencies are this environment's."""
+    """Return the programs' folder of an environment with the wheel, which uses this environment's dependencies."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Waiting for what another process does, in tests that cannot be told of it."""
+"""Wait for another process, in tests that get no notification from it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 
 def until(condition: Callable[[], object]) -> None:
-    """Returns as soon as a condition holds; a minute is long enough for anything here.
+    """Return as soon as a condition holds; the default of one minute is enough for all tests.
 
     Raises:
-        TimeoutError: it does not.
+        TimeoutError: the condition does not hold in time.
     """
     deadline = time.monotonic() + 60.0
     pause = threading.Event()

@@ -1,9 +1,9 @@
-"""One step's gradients as a CUDA graph: thousands of kernels are queued by one call instead of one by one.
+"""One step's gradients as a CUDA graph: one call queues thousands of kernels.
 
-A graph is a list of kernels with the addresses that they read and write. So a batch is copied to the place of the one
-that the graph was recorded with, the graph is replayed, and losses and gradients lie where they lay then. What depends
-on numbers of the host is not in it: the optimiser, whose rate changes, and the average of the weights. Flow that the
-loss needs is estimated before, and not in it either.
+A graph is a list of kernels with the addresses that they read and write. So each batch is copied to the memory of the
+batch with which the graph was recorded, the graph is replayed, and losses and gradients are at the same addresses. The
+optimiser and the average of the weights depend on numbers of the host, so they are not in the graph. Flow for the loss
+is estimated before it.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from torch import Tensor
 from trainer.tasks import Work
 
 WARM_UP_STEPS = 3
-"""Steps of a new shape that run as without a graph: libraries choose their kernels and take their memory then."""
+"""Steps of a new shape that run without a graph, in which libraries choose kernels and allocate memory."""
 
 
 class Graph(Protocol):
-    """Records what a block queues, without doing it, and does it again and again."""
+    """Records the work that a block queues, without running it, and replays it."""
 
     def warming_up(self) -> contextlib.AbstractContextManager[object]:
-        """A block that does its work, as a preparation for recording it."""
+        """Return a context whose work runs, as a preparation for recording it."""
 
     def recording(self) -> contextlib.AbstractContextManager[object]:
-        """A block whose work is recorded."""
+        """Return a context whose work is recorded."""
 
     def replay(self) -> None:
-        """Queues it."""
+        """Queue the recorded work."""
 
 
 class CudaGraph:
@@ -44,7 +44,7 @@ class CudaGraph:
 
     @contextlib.contextmanager
     def warming_up(self) -> Iterator[None]:
-        """On a stream of its own, as recording does: the default one cannot be recorded."""
+        """Use the stream of the recording: the default stream cannot be recorded."""
         compute = torch.cuda.current_stream()
         self._stream.wait_stream(compute)
         with torch.cuda.stream(self._stream):
@@ -52,7 +52,7 @@ class CudaGraph:
         compute.wait_stream(self._stream)
 
     def recording(self) -> contextlib.AbstractContextManager[object]:
-        """Other threads, such as one that takes page-locked memory for batches, may go on."""
+        """Record this thread alone: others, such as one that page-locks batches, continue."""
         return torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local")
 
     def replay(self) -> None:
@@ -60,12 +60,12 @@ class CudaGraph:
 
 
 class CapturedGradients:
-    """Losses of a batch, and gradients in the parameters, from a graph.
+    """Computes the losses of a batch, and gradients in the parameters, with a graph.
 
     Args:
-        compute: from a batch to its losses, all on the device, with gradients beside them; begins with parameters
-            without gradients. It reads nothing of the device, and no random numbers but PyTorch's.
-        new_graph: makes an empty one.
+        compute: returns the losses of a batch, on the device, and sets the gradients of parameters that have none. It
+            copies nothing to the host, and takes random numbers from PyTorch only.
+        new_graph: makes an empty graph.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class CapturedGradients:
         self._losses: Mapping[str, Tensor] = {}
 
     def __call__(self, work: Work) -> dict[str, Tensor]:
-        """As ``compute``, and the random numbers are those that it would have drawn."""
+        """Return what ``compute`` returns, with the same random numbers."""
         if self._graph is None or _signature(work) != self._signature:
             self._graph, self._signature, self._seen, self._work = self._new_graph(), _signature(work), 0, None
         self._seen += 1
@@ -104,7 +104,7 @@ def _tensors(work: Work) -> list[Tensor]:
 
 
 def _signature(work: Work) -> object:
-    """What a graph holds fast: shapes, kinds, and the numbers of the host."""
+    """Return what a graph keeps constant: shapes, dtypes, and the numbers of the host."""
     share = None if work.guide is None else work.guide.share
     return share, tuple(work.truth), [(tensor.shape, tensor.dtype) for tensor in _tensors(work)]
 

@@ -1,4 +1,4 @@
-"""What a training run can be told: six sections of small frozen dataclasses.
+"""The configuration of a training run: six sections of small frozen dataclasses.
 
 Section ``loss`` is that of the network's task: see :mod:`trainer.tasks`.
 
@@ -27,12 +27,12 @@ from v2v_protocol.spec import StreamSpec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkConfig:
-    """What is trained.
+    """The network.
 
     Attributes:
         name: see :data:`trainer.models.NETWORKS`.
         options: arguments of its constructor; ``bins`` comes from the recipe.
-        weights: checkpoint to take the first weights from; empty: random.
+        weights: checkpoint to start from; ``shipped``: the network that comes with this package; empty: random weights.
     """
 
     name: str = chosen("e2vid", NETWORKS)
@@ -45,13 +45,13 @@ class StreamConfig:
     """Where batches come from.
 
     Attributes:
-        address: of a running server, or of several with commas between them; empty: one is started here, on ``videos``.
+        address: of a running server, or of several, separated by commas; empty: start one here, on ``videos``.
         videos, list, rows, workers: for that server, see ``v2v-serve --help``.
         batch_size: samples of one rank's batch.
         recipe: preset name, or recipe fields (with ``preset`` to start from); never the server's default.
         seed: of all draws and of the order.
-        spec: other fields of :class:`v2v_protocol.spec.StreamSpec`; what is missing is the server's default.
-        loader_workers: processes that receive for each rank; 0: the training process does.
+        spec: other fields of :class:`v2v_protocol.spec.StreamSpec`; missing ones have the server's default.
+        loader_workers: processes of each rank that receive batches; 0: the training process receives them.
         timeout_seconds: silence after which the server counts as lost.
     """
 
@@ -72,7 +72,7 @@ class StreamConfig:
         """The recipe with all its fields.
 
         Raises:
-            RecipeError: it is none.
+            RecipeError: an unknown preset or field, or a value outside its limits.
         """
         named = self.recipe if isinstance(self.recipe, Mapping) else {"preset": self.recipe}
         return Recipe.from_dict(named)
@@ -80,16 +80,16 @@ class StreamConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimizerConfig:
-    """How it is minimised.
+    """How the loss is minimised.
 
     Attributes:
         name: "adam" or "adamw".
         learning_rate, weight_decay, amsgrad: PyTorch's.
         learning_rate_decay: factor at the end of each epoch; 1 keeps the rate.
-        warmup_steps: in which the rate rises from 0.
+        warmup_steps: steps in which the rate rises from 0.
         schedule: "cosine" lets the rate fall to 0 at the end of the run (``run.steps``, else ``run.epochs``).
-        clip_gradient_norm: gradients longer than this are shortened to it; 0: never.
-        ema_decay: of the averaged network (see :class:`trainer.learner.AveragedNetwork`); 0: none.
+        clip_gradient_norm: norm to which longer gradients are clipped; 0: no clipping.
+        ema_decay: decay of the averaged network (see :class:`trainer.learner.AveragedNetwork`); 0: no average.
     """
 
     name: Literal["adam", "adamw"] = "adam"
@@ -105,7 +105,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputeConfig:
-    """On what.
+    """Where and how the run computes.
 
     Attributes:
         device: "auto" takes a GPU if there is one.
@@ -113,13 +113,13 @@ class ComputeConfig:
             PyTorch's default, and keeps matrix products IEEE; "bfloat16" runs convolutions under autocast, while
             weights, sums of gradients, losses and pictures stay float32. Scores are IEEE float32 with all three.
         cudnn_benchmark: let cuDNN time its convolution algorithms and use the fastest; shapes are constant in a run.
-        pieces: a batch is computed in so many pieces whose gradients are added up: less memory, the same step.
-        channels_last: memory format of the network.
-        compile: through ``torch.compile``: "step" one turn of each loop over time or over updates, which takes seconds;
-            "clip" the network over the whole clip, unrolled, which takes minutes.
-        cuda_graph: forward and backward of a step as one CUDA graph, see :mod:`trainer.captured`.
-        threads: of PyTorch on the CPU; 0: its own choice. Leave cores to the server's workers.
-        seed: of the first weights.
+        pieces: parts of a batch that are computed one after another; their gradients are added, which saves memory.
+        channels_last: use that memory format for the network.
+        compile: what ``torch.compile`` compiles: "step" one iteration of each loop over time or over updates, in
+            seconds, with PyTorch 2.7 or later; "clip" the network over the whole clip, unrolled, in minutes.
+        cuda_graph: run forward and backward of a step as one CUDA graph, see :mod:`trainer.captured`.
+        threads: threads of PyTorch on the CPU; 0: its own choice. Leave cores to the server's workers.
+        seed: of the initial weights.
         group_timeout_seconds: time that a rank waits for the others in one exchange before the run fails.
     """
 
@@ -137,20 +137,20 @@ class ComputeConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunConfig:
-    """How long, and what is kept.
+    """How long the run is, and what it keeps.
 
     Attributes:
         out: folder for checkpoints, TensorBoard files and previews.
         epochs: passes over the stream.
-        steps, seconds: end earlier, after so many optimiser steps or so much time of this process; 0: no such limit.
+        steps, seconds: end earlier, after this number of optimiser steps or this time of the process; 0: no limit.
         log_every: steps between two readings of the losses (the only regular wait for the device).
-        save_every: steps between two checkpoints; there is always one at the end.
-        keep_epochs: also keep checkpoints of the ends of the last so many epochs.
-        judge_every: steps between two looks at a held-out batch of the stream; 0: none.
-        judge_samples: samples of it, if an epoch has so many.
-        judge_videos: folder of the videos of the held-out batch; empty: those that are trained on.
+        save_every: steps between two checkpoints; one is always written at the end.
+        keep_epochs: number of latest epochs whose last step is also kept as a checkpoint of its own.
+        judge_every: steps between two evaluations of the losses on a held-out batch of the stream; 0: none.
+        judge_samples: samples of that batch, or fewer if an epoch has fewer.
+        judge_videos: folder of the videos of the held-out batch; empty: the videos of the training.
         preview_every: steps between films of that batch; 0: none.
-        preview_samples: how many of its samples they show.
+        preview_samples: number of its samples that are shown.
         validate: recordings (as ``v2v-eval --data``) that are scored at the ends of epochs; the best network so far is
             kept as best.pt. Empty: none.
         validate_config: YAML file of ``v2v-eval``, or the name of a shipped one, that says which data sets and cuts
@@ -222,13 +222,13 @@ class TrainConfig:
         task.check(self.loss, self.stream.resolved_recipe)
 
     def with_network_options(self, options: Mapping[str, Any], **changes: Any) -> TrainConfig:
-        """This configuration with more options of the network, behind those that it has, and other changes of it."""
+        """Return this configuration with defaults for options of the network, and other changes of that section."""
         merged = {**options, **self.network.options}
         return dataclasses.replace(self, network=dataclasses.replace(self.network, options=merged, **changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """From nested plain values; what is missing keeps its default."""
+        """Build a configuration from nested plain values; missing keys have their default."""
         sections = {item.name: typing.get_type_hints(cls)[item.name] for item in dataclasses.fields(cls)}
         network = values.get("network")
         name = network.get("name", "e2vid") if isinstance(network, Mapping) else "e2vid"
@@ -241,12 +241,12 @@ class TrainConfig:
         return cls(**built)
 
     def to_dict(self) -> dict[str, Any]:
-        """All keys as nested plain values."""
+        """Return all keys as nested plain values."""
         return dataclasses.asdict(self)
 
 
 def keys() -> str:
-    """All keys, for people: section by section, ``loss`` for each task."""
+    """Return a line with all keys, section by section, ``loss`` for each task."""
     hints = typing.get_type_hints(TrainConfig)
     kinds = {name: kind for name, kind in hints.items() if name != "loss"}
     kinds |= {f"loss ({name})": task.Settings for name, task in TASKS.items()}
@@ -256,7 +256,7 @@ def keys() -> str:
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Keys (with their section) in which two configurations in plain values differ, and both values."""
+    """Return the keys, with their section, whose values differ between two configurations, and both values."""
     left, right = _flat(ours), _flat(theirs)
     keys = sorted(left.keys() | right.keys())
     return {key: (left.get(key), right.get(key)) for key in keys if left.get(key) != right.get(key)}
@@ -279,10 +279,10 @@ def _section(kind: Any, name: str, content: Any) -> Any:
 
 
 def setting_of(key: str, hint: Any, value: Any, stated: Setting | None = None) -> Any:
-    """``value`` in the kind, within the limits, and of the words, that are stated for its key or follow from its type.
+    """Check a value against the setting of its key, or against its type, and return it in that type.
 
     Raises:
-        UsageError: it is of another kind, or outside; the message names the key.
+        UsageError: it has another type or is outside the limits; the message names the key.
     """
     setting = stated or of_type(hint)
     if setting is not None:

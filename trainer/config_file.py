@@ -15,21 +15,21 @@ EXTENDS = "extends"
 
 
 def shipped() -> list[str]:
-    """Names of the configurations that come with the package."""
+    """Return the names of the configurations that come with the package."""
     folder = resources.files("trainer") / "configs"
     return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
 def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
-    """The configuration in a file.
+    """Read a configuration.
 
     Args:
         file: YAML, or the name of a shipped configuration. ``extends: other.yaml`` (beside the file, or the name of a
             shipped one) starts from that one, so that the file holds only what differs.
-        settings: "key=value" texts, the keys with their section, the values in YAML; they win.
+        settings: "key=value" texts, keys with their section, values in YAML; they override the file.
 
     Raises:
-        UsageError: a file cannot be read, a setting is none, or see :class:`trainer.config.TrainConfig`.
+        UsageError: a file cannot be read, a setting is malformed, or see :class:`trainer.config.TrainConfig`.
     """
     values = _read(file)
     for setting in settings:
@@ -38,7 +38,7 @@ def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
 
 
 def show_config(config: TrainConfig) -> str:
-    """All keys of a configuration as YAML, which ``v2v-train`` takes again."""
+    """Format all keys of a configuration as YAML, which ``v2v-train`` reads."""
     return format_yaml(config.to_dict())
 
 

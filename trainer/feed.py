@@ -1,7 +1,7 @@
-"""From the stream to the device: batches in order, moved while the device still works on the one before.
+"""From the stream to the device: batches in order, copied while the device still computes the one before.
 
-On a GPU the copy runs on a stream of its own, from page-locked memory. Nothing has to be fetched ahead for that: the
-training loop only queues work, so it is here, with the next batch in its hands, long before the GPU is done.
+On a GPU the copy runs on its own CUDA stream, from page-locked memory. No batch is prefetched for that: the training
+loop only queues work, so it asks for the next batch long before the GPU is done.
 """
 
 from __future__ import annotations
@@ -25,20 +25,17 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
 
 HELD_OUT_SEED = 1 << 32
-"""Added to the seed: a run is judged by the same virtual cameras throughout, and others than it trains on."""
+"""Added to the seed: the held-out batch has the same virtual cameras throughout, none of which is trained on."""
 
 
 def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V2VStreamDataset:
-    """What the run trains on.
+    """Return the dataset that the run trains on.
 
     Args:
-        config: of the run.
-        asked: by its task.
-        address: of the server.
-        changes: arguments of the dataset that differ from the configuration.
+        changes: arguments of the dataset that override the configuration.
 
     Raises:
-        UsageError: a setting that no server could meet.
+        UsageError: a setting outside its limits.
     """
     settings = config.stream
     arguments: dict[str, Any] = {
@@ -56,10 +53,9 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
 
 
 def server_flags(settings: StreamConfig, recipe: Recipe) -> list[str]:
-    """What a server on ``settings.videos`` is told at its start.
+    """Return the flags of a server on ``settings.videos``.
 
-    It looks at its own recipe to say which videos are long enough, so it is given ours; and it looks at what the videos
-    show only if it is told so.
+    The server's recipe decides which videos are long enough, so it gets ours; it analyses scenes only if asked.
     """
     asked = {"--list": settings.list, "--scene": settings.spec.get("scene")}
     flags = [part for flag, value in asked.items() if value for part in (flag, value)]
@@ -67,10 +63,10 @@ def server_flags(settings: StreamConfig, recipe: Recipe) -> list[str]:
 
 
 def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:
-    """Yields the batch that the run is judged by, on the CPU: the same one whenever the run is started again.
+    """Yield the held-out batch, on the CPU; it is the same at each start of the run.
 
-    It has ``run.judge_samples`` samples, or as many as an epoch has. They are of ``run.judge_videos``, from a server
-    that runs for as long as this takes, where there are such videos.
+    It has ``run.judge_samples`` samples, or fewer if an epoch has fewer. With ``run.judge_videos``, they come from a
+    server on those videos, which is stopped afterwards.
     """
     if not config.run.judge_videos:
         yield from _held_out(config, asked, address)
@@ -106,14 +102,13 @@ class Feed:
     """Batches of a dataset on a device, epoch after epoch.
 
     Args:
-        dataset: its epoch is set here; a state that was loaded into it counts.
-        device: where the tensors go.
+        dataset: its epoch is set here; a loaded state is kept.
         loader_workers: processes that receive; 0: this one.
 
     Attributes:
         wait_seconds: time spent waiting for batches so far.
-        transfer_seconds: time spent bringing them to a GPU so far: page-locking them, where no loader worker's thread
-            has done it, and queueing the copies. The copies themselves are not waited for.
+        transfer_seconds: time spent so far page-locking batches, unless a thread of the DataLoader does it, and
+            queueing copies to a GPU. It excludes the copies themselves.
     """
 
     def __init__(self, dataset: V2VStreamDataset, device: torch.device, loader_workers: int = 0) -> None:
@@ -126,14 +121,14 @@ class Feed:
                 num_workers=loader_workers,
                 persistent_workers=True,
                 pin_memory=device.type == "cuda",  # in a thread of its own
-                multiprocessing_context="spawn",  # a fork would take the threads' locks of this process with it
+                multiprocessing_context="spawn",  # a fork would copy locks that other threads hold
                 worker_init_fn=_leave_signals_to_the_trainer,
             )
         self._copies = torch.cuda.Stream(device) if device.type == "cuda" else None  # type: ignore[no-untyped-call]
         self.wait_seconds = self.transfer_seconds = 0.0
 
     def epochs(self, first: int, end: int) -> Iterator[Batch]:
-        """The batches of epochs ``first`` .. ``end - 1``."""
+        """Yield the batches of epochs ``first`` .. ``end - 1``."""
         for epoch in range(first, end):
             self._dataset.set_epoch(epoch)
             batches = _begun(self._source)
@@ -157,38 +152,38 @@ class Feed:
 
 
 def _begun(source: Iterable[Batch]) -> Iterator[Batch]:
-    """An iteration, with the handler of SIGCHLD that was there before.
+    """Start an iteration and restore the handler of SIGCHLD.
 
-    A DataLoader installs one in which the death of a loader worker becomes an error wherever this process is. A SIGTERM
-    to the whole process group would so end the run in the middle of a step. Without it the death is noticed where the
-    batches of that worker are waited for.
+    The handler of a DataLoader raises an error at any point of this process when a loader worker dies. A SIGTERM to the
+    whole process group would end the run in the middle of a step. Without the handler, the wait for the next batch of
+    that worker raises the error.
     """
     before = signal.getsignal(signal.SIGCHLD)
     try:
         return iter(source)
     finally:
-        if signal.getsignal(signal.SIGCHLD) is not before:  # so this is the main thread: others cannot install any
+        if signal.getsignal(signal.SIGCHLD) is not before:  # only the main thread can install one
             signal.signal(signal.SIGCHLD, before or signal.SIG_DFL)
 
 
 def _moved(batch: Batch, copies: torch.cuda.Stream) -> Batch:
-    """The batch on the GPU; the copy is only queued, and whoever computes with it is made to wait for it there."""
+    """Return the batch on the GPU; the copy is queued, and work queued after it waits for it."""
     with torch.cuda.stream(copies):
         moved = batch.pin_memory().to(copies.device, non_blocking=True)
     compute = torch.cuda.current_stream(copies.device)
     compute.wait_stream(copies)
     for tensor in moved.arrays.values():
-        # Its memory belongs to the copying stream; without this the allocator could give it away while it is read.
+        # The memory belongs to the copying stream; without this the allocator could reuse it while it is read.
         tensor.record_stream(compute)
     return moved
 
 
 def _without_trace(error: V2VError) -> V2VError:
-    """An error of a loader worker with its message alone: PyTorch puts the worker's trace, of many lines, before it."""
+    """Return the error of a loader worker without the trace that PyTorch puts before its message."""
     name = f"{type(error).__module__}.{type(error).__qualname__}"
     return type(error)(str(error).rpartition(f"\n{name}: ")[2].rstrip("\n"))
 
 
 def _leave_signals_to_the_trainer(_worker: int) -> None:
-    """Ctrl-C reaches every process of a terminal; the training process decides what it means."""
+    """Ignore SIGINT: Ctrl-C reaches every process of a terminal, and the training process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

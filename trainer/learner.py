@@ -1,4 +1,4 @@
-"""What a configuration trains: the network, its task, what improves it, and how all of that is saved."""
+"""The parts of a training run: network, task, optimiser and average, one step with them, and their checkpoint."""
 
 from __future__ import annotations
 
@@ -34,14 +34,10 @@ class Learner:
 
     Attributes:
         network: holds the weights.
-        model: the same, wrapped for several ranks and compiled as asked: call it in the training step.
-        task: what it is trained for.
-        optimizer: of the network's parameters.
+        model: the network, wrapped for several ranks and compiled as configured; call it in the training step.
         average: the averaged network, or None.
-        config: of the run.
-        device: where all of this computes.
         rank: of this process; dropout differs between ranks.
-        captured: what computes :meth:`gradients` from a CUDA graph, or None.
+        captured: computes :meth:`gradients` with a CUDA graph, or None.
     """
 
     network: VoxelNetwork
@@ -56,14 +52,13 @@ class Learner:
 
     @property
     def trained(self) -> VoxelNetwork:
-        """The network to look at: the averaged one where there is one."""
+        """The network to evaluate: the averaged one if there is one."""
         return self.network if self.average is None else self.average.network
 
     def step(self, work: Work, step: int, epoch: int) -> dict[str, Tensor]:
-        """Forward, backward, update. Work for the device is queued, and nothing here waits for it.
+        """Compute gradients and update the weights. Work for the device is queued; this does not wait for it.
 
         Args:
-            work: of the task, for one batch.
             step: optimiser steps before this one.
             epoch: of the batch.
 
@@ -81,7 +76,7 @@ class Learner:
         return found
 
     def gradients(self, work: Work) -> dict[str, Tensor]:
-        """Forward and backward: the losses and the norm of the gradient; gradients of this batch alone are left."""
+        """Run forward and backward; return the losses and the norm of the gradient. Earlier gradients are dropped."""
         config = self.config.compute
         pieces = work.pieces(config.pieces)
         losses: dict[str, Tensor] = {}
@@ -100,13 +95,13 @@ class Learner:
         return losses | {"gradient_norm": norm}
 
     def _exchanging(self, now: bool) -> contextlib.AbstractContextManager[None]:
-        """Ranks add their gradients up once a step, with the last piece."""
+        """Return a context in which ranks exchange gradients: once a step, with the last piece."""
         if now or not isinstance(self.model, DistributedDataParallel):
             return contextlib.nullcontext()
         return self.model.no_sync()
 
     def checkpoint(self, step: int, stream: Mapping[str, Any] | None) -> Checkpoint:
-        """Everything that decides the next losses; ``stream`` is the resume state of the last batch trained on."""
+        """Return all that determines the next losses; ``stream`` is the resume state of the last batch trained on."""
         return Checkpoint(
             step=step,
             epoch=0 if stream is None else stream["epoch"],
@@ -118,7 +113,7 @@ class Learner:
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from there; the configurations must agree (see :func:`trainer.run.checkpoint.require_same_run`)."""
+        """Load a checkpoint whose configuration agrees (see :func:`trainer.run.checkpoint.require_same_run`)."""
         self.network.load_state_dict(checkpoint.model)
         _restore_optimizer(self.optimizer, checkpoint.optimizer)
         if self.average is not None and checkpoint.ema is not None:
@@ -126,7 +121,7 @@ class Learner:
 
 
 def build(config: TrainConfig, ranks: Ranks) -> Learner:
-    """Reads every weight file that the configuration names, so that a missing one is noticed before anything runs.
+    """Build the parts of a run, and read every weight file that the configuration names.
 
     Raises:
         UsageError: a file or option is missing or wrong; the message names the key.
@@ -137,9 +132,12 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
             f"compute.pieces = {compute.pieces}: give a divisor of stream.batch_size = {config.stream.batch_size}"
         )
     if compute.cuda_graph and ranks.device.type != "cuda":
-        raise UsageError("compute.cuda_graph = true: there is no GPU here; leave it out")
+        raise UsageError("compute.cuda_graph = true: PyTorch sees no GPU here; leave the key out")
     if compute.cuda_graph and ranks.world_size > 1:
-        raise UsageError("compute.cuda_graph = true: on one rank only, ranks exchange gradients outside of a graph")
+        raise UsageError(
+            f"compute.cuda_graph = true: {ranks.world_size} ranks exchange gradients outside of a graph; leave the key "
+            "out, or use one rank"
+        )
     if compute.compile == "step" and TorchVersion(torch.__version__) < "2.7":
         raise UsageError(
             f"compute.compile = step: PyTorch is {torch.__version__}, and this needs 2.7 or later; update it, or take "
@@ -173,7 +171,7 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
 
 
 def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int) -> float:
-    """Of the step after ``step`` others, in an epoch from 0.
+    """Return the learning rate of the step after ``step`` others; epochs count from 0.
 
     learning_rate * decay^epoch * (step + 1) / warmup_steps, the last factor at most 1; with ``schedule`` "cosine" also
     times (1 + cos(pi p)) / 2, where p is the part of the run that is over.
@@ -188,7 +186,7 @@ def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int
 
 @torch.no_grad()
 def gradient_norm(parameters: Iterable[nn.Parameter], longest: float) -> Tensor:
-    """The length of the gradient of all parameters; longer ones than ``longest`` are shortened to it (0: never)."""
+    """Return the norm of the gradient of all parameters, and clip the gradient to ``longest`` (0: no clipping)."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     if longest:
@@ -197,11 +195,11 @@ def gradient_norm(parameters: Iterable[nn.Parameter], longest: float) -> Tensor:
 
 
 class AveragedNetwork:
-    """Exponential moving average of a network: often better pictures than its last weights, for one copy of them.
+    """Exponential moving average of a network: often better pictures than the last weights.
 
         average <- average + (1 - d) (weights - average),    d = min(decay, (1 + n) / (10 + n)) at update n = 1, 2, ...
 
-    The ramp lets the random first weights go: a decay of 0.999 alone would still hold a third of them after 1000
+    The ramp removes the random initial weights: with a decay of 0.999 alone, a third of them would remain after 1000
     updates.
 
     Args:
@@ -209,7 +207,7 @@ class AveragedNetwork:
         decay: d after the ramp, in 0 .. 1, 1 excluded.
 
     Attributes:
-        network: a copy that holds the average, without gradients: call it for pictures.
+        network: a copy that holds the average, without gradients.
     """
 
     def __init__(self, network: VoxelNetwork, decay: float) -> None:
@@ -218,7 +216,7 @@ class AveragedNetwork:
 
     @torch.no_grad()
     def update(self, network: VoxelNetwork, update: int) -> None:
-        """Take in the weights after optimiser step number ``update`` (from 1). Nothing waits for the device."""
+        """Add the weights after optimiser step number ``update`` (from 1), without waiting for the device."""
         share = 1 - min(self._decay, (1 + update) / (10 + update))
         pairs = list(zip(self.network.state_dict().values(), network.state_dict().values(), strict=True))
         real = [pair for pair in pairs if pair[0].is_floating_point()]
@@ -229,7 +227,7 @@ class AveragedNetwork:
 
 
 def _seed(seed: int, rank: int, step: int) -> int:
-    """Of the random numbers of one step on one rank (dropout): so a resumed run has those of the uninterrupted one."""
+    """Return the seed of one step on one rank, so that dropout of a resumed run is that of the uninterrupted one."""
     return int.from_bytes(hashlib.blake2b(f"{seed} {rank} {step}".encode(), digest_size=8).digest(), "little")
 
 
@@ -241,10 +239,10 @@ def _set_numerics(compute: ComputeConfig) -> None:
 
 
 def _restore_optimizer(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> None:
-    """Its moments and settings, for this device and memory format.
+    """Load moments and settings for this device and memory format.
 
-    PyTorch would take over the kernel of the saving device, and the memory order of the saved moments; a fused kernel
-    goes through parameter, gradient and moments as through lists of numbers, and would mix them up.
+    PyTorch would keep the kernel of the saving device and the memory order of the saved moments. A fused kernel reads
+    parameter, gradient and moments in memory order, and would mix up their elements.
     """
     groups = [
         {**group, "fused": ours["fused"]}
@@ -276,9 +274,9 @@ def _network(config: TrainConfig) -> VoxelNetwork:
 
 
 def obeying_weights(config: TrainConfig) -> TrainConfig:
-    """The configuration with those options of the network under which its ``network.weights`` were trained.
+    """Return the configuration with the network options with which its ``network.weights`` were trained.
 
-    Options that the configuration states itself win.
+    Options in the configuration override them.
 
     Raises:
         UsageError: the file cannot be read, or is of another network or number of bins.

@@ -18,7 +18,7 @@ from v2v_protocol.errors import UsageError, V2VError
 
 
 class Diverged(V2VError):
-    """A loss or a gradient is infinite or not a number; nothing is saved from then on."""
+    """A loss or gradient is infinite or not a number; nothing is saved after it."""
 
 
 def train(
@@ -30,15 +30,15 @@ def train(
     out: Path,
     resume: Checkpoint | None = None,
 ) -> int:
-    """Train to the configured end, or until ``stop``; either way ``out/last.pt`` is where a later run goes on.
+    """Train to the configured end, or until ``stop``, and save ``out/last.pt`` to resume from.
 
     Returns:
-        optimiser steps so far, those before ``resume`` included.
+        Optimiser steps so far, including those before ``resume``.
 
     Raises:
-        Diverged: see there.
-        UsageError: a checkpoint cannot be written.
-        V2VError: what the stream raises. It costs no steps: they are saved first.
+        Diverged: a loss or gradient is not finite.
+        UsageError: the folder cannot be written, the server refuses ``resume``, or a recording cannot be scored.
+        V2VError: the stream failed; the steps so far are saved first.
     """
     run, task = config.run, learner.task
 
@@ -51,7 +51,7 @@ def train(
         if position is not None:
             dataset.load_state_dict(position)
         if dataset.epoch > epoch:
-            # Under this batch size or number of ranks, nothing but what an epoch drops was left of the one before.
+            # With this batch size or number of ranks, the rest of the epoch has no whole batch.
             epoch, position = dataset.epoch, dataset.state_dict()
     feed = Feed(dataset, ranks.device, config.stream.loader_workers)
     batches = feed.epochs(epoch, run.epochs)
@@ -70,7 +70,7 @@ def train(
     begun, saved, judged = step, None, step
 
     def look() -> None:
-        """Read the meter: from time to time, and always before anything is saved."""
+        """Read the meter and stop a run that has diverged; called before each save."""
         values = meter.read(feed.wait_seconds, feed.transfer_seconds)
         if not values:
             return
@@ -87,7 +87,7 @@ def train(
         reporter.metrics(step, epoch, learner.optimizer.param_groups[0]["lr"], values)
 
     def judge(*, with_films: bool) -> None:
-        """Losses, and films, of the batch that is not trained on."""
+        """Report the losses, and films, of the held-out batch."""
         assert held_out is not None
         values, films = task.judge(learner.trained, held_out, run.preview_samples if with_films else 0)
         reporter.held_out(step, values)
@@ -121,7 +121,7 @@ def train(
         if held_out is not None and first and step == 0:
             judge(with_films=False)
         if validation is not None and not ranks.from_first(step == 0 or reporter.is_validated(step)):
-            # A run that ended within a validation has it when it goes on.
+            # The run ended during this validation.
             if position is not None and position["position"] == 0:
                 validate(epoch)
             if ranks.any(stop.wanted):
@@ -131,7 +131,7 @@ def train(
             values = learner.step(task.prepare(batch, batch.epoch), step, batch.epoch)
             step, epoch, position = step + 1, batch.epoch, batch.resume_state
 
-            # What is said and kept of it.
+            # Report and save.
             meter.add(values)
             reporter.advance(step, dataset, config)
             ended = position["epoch"] > epoch
@@ -150,7 +150,7 @@ def train(
                 save(epoch_name(epoch))
             if ended:
                 validate(epoch + 1)
-        # Data that failed before the first step leave nothing to keep: the folder stays as it was, free for a new run.
+        # If the data failed before the first step, nothing is saved, so that the folder is free for a new run.
         if saved != step and (step > begun or stop.failure is None):
             look()
             save(LAST)

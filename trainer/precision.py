@@ -1,10 +1,9 @@
-"""How exactly products are computed: IEEE's float32 for all that is scored, and bfloat16 that adds up in float32.
+"""The precision of products: IEEE float32 for scores, and bfloat16 whose gradients are summed in float32.
 
-bfloat16: weights are cast once, and their gradients are not added up in bfloat16.
-
-Autocast by itself has the choice of two evils for a weight that one forward pass uses many times, as a loop over time
-or over E-RAFT's updates does. It keeps the cast copy, and then the gradients of all uses are added up in the eight bits
-of bfloat16, where a sum stops growing at 256 times what is added. Or it casts anew for every use.
+A loop over time, or over E-RAFT's updates, uses a weight many times in one forward pass. Autocast offers two ways, both
+bad. With its cache, it sums the gradients of all uses in the eight bits of bfloat16, where a sum stops growing at 256
+times the summand. Without it, it casts the weight for every use. Here each weight is cast once, and its gradients are
+summed in float32.
 """
 
 from __future__ import annotations
@@ -19,17 +18,16 @@ from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
 _PRODUCTS = frozenset({F.conv1d, F.conv2d, F.conv_transpose2d, F.linear})
-"""What autocast computes in bfloat16 from (input, weight, bias)."""
+"""Functions of (input, weight, bias) that autocast computes in bfloat16."""
 
 
 @contextlib.contextmanager
 def bfloat16_products(device: torch.device, *, enabled: bool, share: bool = True) -> Iterator[None]:
-    """Autocast for one forward pass.
+    """Run one forward pass under autocast.
 
     Args:
-        device: where it computes.
-        enabled: False leaves everything as it is.
-        share: False casts weights for every use: for code that ``torch.compile`` traces, which finds equal casts.
+        enabled: False changes nothing.
+        share: False casts weights for every use: for code that ``torch.compile`` traces, which merges equal casts.
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(torch.autocast(device.type, torch.bfloat16, enabled=enabled, cache_enabled=False))
@@ -40,7 +38,7 @@ def bfloat16_products(device: torch.device, *, enabled: bool, share: bool = True
 
 @contextlib.contextmanager
 def ieee_products() -> Iterator[None]:
-    """Products of float32 are IEEE's on a GPU, whatever a training outside allows itself ("tf32"): for scores."""
+    """Compute float32 products as IEEE on a GPU, also within a training with "tf32": for scores."""
     before = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     try:
@@ -50,12 +48,12 @@ def ieee_products() -> Iterator[None]:
 
 
 class _SharedWeights(TorchFunctionMode):
-    """Gives products one cast copy of each weight and bias, and every use of it a gradient in float32."""
+    """Casts each weight and bias once for all products, and gives each use a float32 gradient."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
         self._device = device
-        self._copies: dict[int, tuple[Tensor, Tensor]] = {}  # by id of the original, which must live as long
+        self._copies: dict[int, tuple[Tensor, Tensor]] = {}  # by id of the original, which is kept alive
 
     def __torch_function__(
         self,
@@ -78,7 +76,7 @@ class _SharedWeights(TorchFunctionMode):
 
 
 class _Use(torch.autograd.Function):
-    """One use of a copy, which is a use of the original for its gradient."""
+    """One use of a cast copy, whose gradient goes to the original."""
 
     @staticmethod
     def forward(_context: Any, _original: Tensor, copy: Tensor) -> Tensor:

@@ -30,39 +30,39 @@ SIGNAL_STATUS = 128
 def _parser() -> Parser:
     parser = Parser(
         "v2v-train", "CONFIG.yaml [flags]",
-        "Train a network on the stream. Without an address it starts a server of its own. Ctrl-C and SIGTERM end the "
-        "run after the present step and save it; the third one ends it at once.",
+        "Train a network on the stream. Without an address it starts its own server. Ctrl-C and SIGTERM end the run "
+        "after the current step and save it; the third signal ends it at once.",
         [
             "v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid",
             "v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4",
             "torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555",
         ],
-        "Exit status: 0 trained to the end, 1 diverged, 2 wrong usage, input or no server, 128 + N ended and saved "
-        f"after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
+        "Exit status: 0 trained to the end, 1 diverged, 2 wrong usage or input, full disk or no server, 128 + N ended "
+        f"and saved after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
     )  # fmt: skip
     stream = parser.group("Stream")
     source = stream.add_mutually_exclusive_group()
     source.add_argument(
-        "--connect", metavar="ADDRESS", help="of a running server, or several with commas (stream.address)"
+        "--connect", metavar="ADDRESS", help="address of a running server, or several with commas (stream.address)"
     )
     source.add_argument("--videos", metavar="DIR", help="start a server on these videos (stream.videos)")
-    stream.add_argument("--workers", type=int, metavar="N", help="of the started server (stream.workers)")
+    stream.add_argument("--workers", type=int, metavar="N", help="number of workers of that server (stream.workers)")
     run = parser.group("Run")
     run.add_argument("config", metavar="CONFIG.yaml", help="a file, or the name of a shipped configuration")
     run.add_argument(
-        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="change one key, repeatable"
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="set one key; repeatable"
     )
-    run.add_argument("--resume", metavar="FILE", help="checkpoint to go on from")
+    run.add_argument("--resume", metavar="FILE", help="checkpoint to continue from")
     run.add_argument(
         "--out", metavar="DIR",
-        help="folder of the run (run.out; default runs/NAME of the config, with --resume that of the checkpoint)",
+        help="folder of the run (run.out; default runs/NAME of CONFIG, with --resume the folder of the checkpoint)",
     )  # fmt: skip
-    run.add_argument("--show-config", action="store_true", help="print all keys with their values, and end")
+    run.add_argument("--show-config", action="store_true", help="print all keys with their values and exit")
     return parser
 
 
 def _settings(arguments: argparse.Namespace) -> list[str]:
-    """The flags as settings, behind the ones that were typed."""
+    """Return the flags as settings, after those of ``--set``."""
     given = {
         "stream.address": "" if arguments.videos else arguments.connect,
         "stream.videos": arguments.videos,
@@ -75,10 +75,11 @@ def _settings(arguments: argparse.Namespace) -> list[str]:
 
 @contextmanager
 def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
-    """The address to connect to; of a server of our own, for as long as the block lasts, where none is configured.
+    """Yield the address to connect to; if none is configured, of a server that runs until the block ends.
 
     Raises:
-        UsageError: nothing to serve, on any rank; ServerLost: the server does not come up.
+        UsageError: no videos, or the server of rank 0 did not start.
+        ServerLost: the server did not start.
     """
     if stream.address:
         yield stream.address
@@ -86,14 +87,14 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
     if not stream.videos:
         raise UsageError("stream.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
     if mine.hosts > 1:
-        raise UsageError("ranks on several hosts: start v2v-serve yourself and give all of them --connect ADDRESS")
+        raise UsageError(f"ranks on {mine.hosts} hosts: start v2v-serve yourself and give all ranks --connect ADDRESS")
     if not mine.first:
         address, error = mine.from_first(None)
         if error:
             raise UsageError(f"rank 0 could not start a server: {error}")
         yield address
         return
-    # What the server says of itself is not shown, and cataloguing a new corpus takes a while.
+    # The server's output is not shown, and cataloguing a new corpus takes a while.
     print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
     with ExitStack() as stack:
         try:
@@ -107,12 +108,12 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
 
 
 def _lacks_bfloat16() -> bool:
-    # PyTorch says it with "AVX512", or for other makes; an x86 processor of this name has neither it nor a fast detour.
+    # PyTorch reports "AVX512", or the name of another architecture, where there may be native bfloat16.
     return torch.backends.cpu.get_cpu_capability() == "AVX2"
 
 
 def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | None) -> tuple[int, int]:
-    """The steps so far, and the signal that ended the run or 0. What was learned with is freed on return."""
+    """Train; return the steps so far, and the signal that ended the run or 0. The learner is freed on return."""
     learner = build(config, mine)
     if mine.first:
         require_writable(out)
@@ -123,10 +124,10 @@ def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | N
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """One run; returns the exit status.
+    """Run one training; return the exit status.
 
     Raises:
-        V2VError: of the configuration, of what :func:`trainer.learner.build` reads, or of :func:`trainer.loop.train`.
+        V2VError: see :func:`load_config`, :func:`trainer.learner.build` and :func:`trainer.loop.train`.
     """
     config = load_config(arguments.config, _settings(arguments))
     if arguments.show_config:
@@ -138,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
         out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
     else:
-        # Where the checkpoint is, not where a run of this configuration would begin: another one may be there.
+        # Not the default folder of the configuration, which may hold another run.
         out = Path(config.run.out or Path(arguments.resume).parent)
         resume = load_checkpoint(arguments.resume)
         config = config.with_network_options(resume.config["network"]["options"], weights="")
@@ -149,7 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
     with ranks(config.compute.device, config.compute.group_timeout_seconds) as mine:
         if config.compute.precision == "bfloat16" and mine.device.type == "cpu" and _lacks_bfloat16():
             print(
-                "v2v-train: warning: this processor has bfloat16 in software only, nine times slower than float32: "
+                "v2v-train: warning: this processor has bfloat16 in software only, nine times slower than float32; use "
                 "--set compute.precision=float32",
                 file=sys.stderr,
             )
@@ -161,7 +162,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     return run_command(_parser(), run, argv, failures=(Diverged,), interrupted="interrupted before the first step")
 
 

@@ -54,7 +54,9 @@ class WeightFile:
         first: dict[str, str] = {}
         for name, own in names.items():
             if not torch.equal(self.state[first.setdefault(own, name)], self.state[name]):
-                raise UsageError(f"{self.path}: two tensors have the same name without prefixes; is it two networks?")
+                raise UsageError(
+                    f"{self.path}: two tensors have the same name without prefixes; give a file of one network"
+                )
         return names
 
     def recognise(self, name: str | None = None) -> tuple[str, dict[str, Any]] | None:
@@ -126,12 +128,13 @@ def read_weights(path: str | Path, *, ema: bool = False) -> WeightFile:
     """Read a file of published weights or one of this project's checkpoints, without executing code from it.
 
     Args:
-        path: a file of ``torch.save``.
+        path: a file of ``torch.save``, or ``shipped``: the network that comes with this package (:data:`SHIPPED`).
         ema: whether to take the averaged weights of one of this project's checkpoints.
 
     Raises:
         UsageError: there is no such file, it is not a PyTorch file, or it has no state dict.
     """
+    path = SHIPPED if str(path) == "shipped" else path
     content = read_torch_file(path)
     trained = content.get("config") if isinstance(content, Mapping) else None
     network = trained.get("network") if isinstance(trained, Mapping) else None

@@ -1,4 +1,4 @@
-"""The consumer's side: a PyTorch dataset that receives finished batches from a v2v server.
+"""Provide the consumer's side: a PyTorch dataset that receives finished batches from a v2v server.
 
 from v2v_client import V2VStreamDataset
 
@@ -10,7 +10,7 @@ Modules and folders:
     dataset     the dataset; its batch, delivery (samples to batches) and ordering; options: what a consumer may request
     session/    conversation (pure: states, messages, times), connection (runs it over a link), link (the socket)
     memory/     arena (workers of this host write there), slots (which sample has which row), buffers (reused)
-    position/   plan (who gets which samples), state (what is saved), position (of one copy), shared (of all copies)
+    position/   plan (which samples a consumer gets), state (what is saved), position (one copy), shared (all copies)
     loaders     adjustments for other loaders and training loops
     in_process  samples by index, without a server; notebook: their pictures
     tools/      the load test; local_server: a server as a subprocess

@@ -52,6 +52,10 @@ _REPEATED = (
     "other samples, call dataset.set_epoch(n) with another n for each pass. To repeat them on purpose, call "
     "dataset.set_epoch({epoch}) before each pass"
 )
+_OF_A_LOADER_WORKER = (
+    ". A loader worker counts the batches that it has prefetched: ignore this if the loop took only one batch to "
+    "inspect it"
+)
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "
     "begun with another batch size, world size or number of loader workers. The samples do not change"
@@ -70,7 +74,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
     wrong, because the state of a batch counts all earlier batches of the epoch as delivered.
 
     One iteration is one epoch from its beginning. Finishing it advances the epoch. Leaving it early and iterating again
-    repeats it, with a RepeatedSamplesWarning the first time (not after inspecting a single batch). After
+    repeats it, with a RepeatedSamplesWarning the first time (not after inspecting a single batch; loader workers count
+    the batches that they prefetched). After
     :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples and equally many
     batches. Samples that do not fill a global batch at the end of an epoch are dropped.
 
@@ -334,7 +339,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             end_with_parent()
         begun = self._position.begin(self._consumer)
         if begun.repeats and not is_evaluated_by_lightning():
-            warnings.warn(_REPEATED.format(epoch=begun.epoch), RepeatedSamplesWarning, stacklevel=2)
+            text = _REPEATED.format(epoch=begun.epoch) + ("" if get_worker_info() is None else _OF_A_LOADER_WORKER)
+            warnings.warn(text, RepeatedSamplesWarning, stacklevel=2)
         return self._iterate(begun)
 
     def _iterate(self, begun: Iteration) -> Iterator[Batch]:

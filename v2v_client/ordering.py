@@ -83,13 +83,13 @@ class ReorderWindow:
         would cost the server as much as the sample does.
         """
         asked: list[int] = []
-        room = min(
+        allowed = min(
             self._credit - len(self._outstanding),
             self._credit + self._batch_size - len(self._places),
         )
-        if room < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
+        if allowed < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
             return ()
-        while len(asked) < room:
+        while len(asked) < allowed:
             if not self._unasked and not self._begin_batch():
                 break
             index = self._unasked.pop()

@@ -4,8 +4,9 @@
     colours.py   event counts, grey pictures and flow as RGB, and one scale for all panels of a page
     camera.py    one simulated clip as its virtual camera saw it: activity over time, pauses, moments worth showing
     strip.py     a camera's activity over its clip
+    overview.py  the whole picture of a video, and where in it the cameras look
     sheet.py     a page of cameras: frame, bins, flow, with headings and legend
-    grids.py     voxel grids of which nothing else is known
+    grids.py     voxel grids alone, as `simulate` returns them
     film.py      the same clips as a film
     files.py     PNG, GIF, MP4, and one HTML file that holds both
 

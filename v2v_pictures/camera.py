@@ -1,8 +1,8 @@
-"""One simulated clip as its virtual camera saw it: what to write beside it, when much happened, when it stood still."""
+"""One simulated clip as its virtual camera saw it: a description, its activity over time, its pauses."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,13 +15,18 @@ from v2v_protocol.sample import Provenance
 
 _SETTLED_SHARE = 0.1
 """Moments are chosen behind this share of a clip: at its beginning every pixel still waits for its first event."""
+_MOSTLY = 0.5
+_FEWEST_EVENTS = 1e-3
+"""Events a pixel and voxel grid below which a camera without noise counts as blind: 16 of a crop of 128 x 128."""
+_STILL_QUANTILE, _STILL_LEVELS = 0.995, 8
+"""Grey levels that a codec changes by itself where nothing moves."""
 
 
 def check_drawable(arrays: Collection[str]) -> None:
-    """Refuses arrays that a picture cannot be made of.
+    """Check that a picture can be made of these arrays.
 
     Raises:
-        UsageError: voxels or frames are not among them.
+        UsageError: voxels or frames are missing.
     """
     if not {"voxels", "frames"} <= set(arrays):
         raise UsageError("a picture needs both arrays: voxels,frames")
@@ -35,12 +40,12 @@ class Camera:
         voxels: [T, bins, H, W], signed event counts.
         frames: [T, H, W] uint8; frame t closes voxel grid t.
         flow: [T, 2, H, W], px, or None.
-        title: for instance the recipe's name.
+        title: written beside the camera, for instance the recipe's name.
         provenance: where the clip came from, and the draw.
         frames_per_bin: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
-        noise_share: share of the clip's events that the same draw without noise does not have, or None: not measured.
+        quiet: as ``rates``, of the same draw without noise, or None: not measured.
     """
 
     voxels: npt.NDArray[Any]
@@ -51,7 +56,7 @@ class Camera:
     frames_per_bin: int = 1
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
-    noise_share: float | None = None
+    quiet: npt.NDArray[np.float64] | None = None
 
     @classmethod
     def of(
@@ -62,10 +67,10 @@ class Camera:
         frames_per_bin: int = 1,
         whole: npt.NDArray[np.uint8] | None = None,
     ) -> Camera:
-        """From the arrays of one sample. Lead frames and lead voxels, which stand in front, are left out.
+        """Create a camera from the arrays of one sample, without lead frames and lead voxels.
 
         Raises:
-            UsageError: voxels or frames are not among the arrays.
+            UsageError: voxels or frames are missing.
         """
         check_drawable(arrays)
         voxels, frames, flow = arrays["voxels"], arrays["frames"][:, 0], arrays.get("flow")
@@ -83,7 +88,7 @@ class Camera:
 
     @property
     def crop(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom of what the camera sees, px of the whole picture."""
+        """Left, top, right and bottom of the crop, px of the whole picture."""
         params = self.provenance.params
         height, width = self.frames.shape[1:]
         left, top, scale = params.crop_left_px, params.crop_top_px, params.scale
@@ -91,7 +96,7 @@ class Camera:
 
     @property
     def rates(self) -> npt.NDArray[np.float64]:
-        """[2, T * bins]: events a pixel in each bin, brighter and darker. A signed bin counts with its sign alone."""
+        """[2, T * bins] float64: brighter and darker events a pixel of each bin, from the signed counts."""
         flat = self.voxels.reshape(-1, *self.voxels.shape[2:])
         brighter = [np.maximum(each, 0).mean(dtype=np.float64) for each in flat]
         darker = [np.maximum(-each.astype(np.float32), 0).mean(dtype=np.float64) for each in flat]
@@ -99,7 +104,7 @@ class Camera:
 
     @property
     def paused(self) -> npt.NDArray[np.bool_]:
-        """[T * bins]: whether the camera stood still: every frame of the bin repeats the one before."""
+        """[T * bins] bool: True where every frame of the bin repeats the one before."""
         grids, bins = self.voxels.shape[:2]
         still = np.zeros(((self.lead_voxels + grids) * bins, self.frames_per_bin), np.bool_)
         for first, length in self.provenance.params.pauses:
@@ -108,24 +113,54 @@ class Camera:
         return still_bins[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
-        """Voxel grids worth showing: each the most active of its stretch of time, where the scene has settled. Paused
-        bins, in which only noise fires, count nothing, and the more of them a grid has the less it is worth. Its
-        liveliest bin counts nothing either: a cut of the film is a flash of one bin, and no motion."""
+        """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.
+
+        Noise does not count where it is known, paused bins never do. The most active bin of a grid does not count
+        either, because a cut of the film is a flash of one bin.
+
+        Returns:
+            At most ``count`` numbers of voxel grids, ascending.
+        """
         bins = self.voxels.shape[1]
         moving = ~self.paused.reshape(-1, bins)
-        each = self.rates.sum(axis=0).reshape(-1, bins) * moving
+        each = (self.rates if self.quiet is None else self.quiet).sum(axis=0).reshape(-1, bins) * moving
         activity = (each.sum(axis=1) - (each.max(axis=1) if bins > 1 else 0.0)) * moving.mean(axis=1)
         first = min(round(len(activity) * _SETTLED_SHARE), len(activity) - 1)
         edges = np.linspace(first, len(activity), min(count, len(activity) - first) + 1).round().astype(int)
         return [int(start + np.argmax(activity[start:end])) for start, end in pairwise(edges)]
 
+    def noise_share(self, grids: Sequence[int]) -> float | None:
+        """Return which share of the events of these voxel grids is noise: 0 to 1, or None where it is not known."""
+        if self.quiet is None:
+            return None
+        events, quiet = (self._in_grids(rates, grids) for rates in (self.rates, self.quiet))
+        return max(0.0, 1.0 - quiet / events) if events else 0.0
+
+    def warning(self, grids: Sequence[int]) -> str:
+        """Say why most of what these voxel grids show is no motion; "" where motion makes most events."""
+        share = self.noise_share(grids)
+        if self.quiet is None or share is None:
+            return ""
+        if self._in_grids(self.quiet, grids) / len(grids) < _FEWEST_EVENTS:
+            why = "nothing moves here" if self._is_still(grids) else "no motion reaches the thresholds"
+            return f"{why}: all events are noise" if share > _MOSTLY else why
+        return f"mostly noise: {share:.0%} of the events" if share > _MOSTLY else ""
+
+    def _in_grids(self, rates: npt.NDArray[np.float64], grids: Sequence[int]) -> float:
+        return float(rates.sum(axis=0).reshape(len(self.voxels), -1)[list(grids)].sum())
+
+    def _is_still(self, grids: Sequence[int]) -> bool:
+        """Whether no frame differs from the one of the voxel grid before it."""
+        for grid in grids:
+            before, now = self.frames[max(0, grid - 1)].astype(np.int16), self.frames[grid]
+            if np.quantile(np.abs(now - before), _STILL_QUANTILE) > _STILL_LEVELS:
+                return False
+        return True
+
     def describe(self) -> str:
-        """The draw in one line: what is nothing is left out."""
+        """Return the draw in one line, without what is zero."""
         params = self.provenance.params
-        parts = []
-        if self.noise_share is not None and self.noise_share > 0.5:
-            parts.append(f"mostly noise: {self.noise_share:.0%} of the events")
-        parts.append(f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}")
+        parts = [f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}"]
         if params.noise_sigma:
             parts.append(f"noise {params.noise_sigma:.3f}")
         if params.hot_pixel_count:
@@ -152,7 +187,7 @@ _UNITS = {"_hz": (1.0, " Hz"), "_seconds": (1e3, " ms"), "_share": (100.0, " %")
 
 
 def _with_unit(name: str, value: float) -> str:
-    """``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
+    """Write ``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
     for ending, (factor, unit) in _UNITS.items():
         if name.endswith(ending):
             return f"{name.removesuffix(ending).replace('_', ' ')} {factor * value:.2g}{unit}"

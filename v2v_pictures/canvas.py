@@ -23,19 +23,16 @@ MARK: Colour = (173, 96, 0)
 PAUSED: Colour = (196, 199, 207)
 
 TITLE_PT, HEADING_PT, TEXT_PT = 26, 20, 16
+MARGIN_PX, GAP_PX = 28, 8
 
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)  # Pillow carries it, so that a page looks alike on every host
+    return ImageFont.load_default(size)  # ships with Pillow: pages look the same on every host
 
 
 class Canvas:
-    """A white page.
-
-    Args:
-        width_px, height_px: its size.
-    """
+    """A white page."""
 
     def __init__(self, width_px: int, height_px: int) -> None:
         self.width_px, self.height_px = width_px, height_px
@@ -45,18 +42,18 @@ class Canvas:
     def text(
         self, x: float, y: float, text: str, *, size: int = TEXT_PT, colour: Colour = INK, anchor: str = "la"
     ) -> float:
-        """Writes one line and returns where it ends. ``anchor`` is Pillow's: "la" left top, "ma" middle top, "ra"."""
+        """Write one line and return where it ends. ``anchor`` is Pillow's: "la" left top, "ma" middle top, "ra"."""
         self._draw.text((x, y), text, fill=colour, font=_font(size), anchor=anchor)
         return x + text_width(text, size)
 
     def title(self, x: float, y: float, text: str) -> None:
-        """The page's title: as large as fits, and its end alone where nothing does."""
+        """Write the page's title as large as fits, or only its end if no size fits."""
         width = self.width_px - 2 * x
         size = next((size for size in range(TITLE_PT, TEXT_PT, -1) if text_width(text, size) <= width), TEXT_PT)
         self.text(x, y, shortened(text, width, size), size=size)
 
     def panel(self, x: int, y: int, image: Image, width_px: int, height_px: int) -> None:
-        """A picture with a thin border, scaled into the given size with its shape kept, on a shade where it is less."""
+        """Draw a picture with a thin border, scaled to fit the given size; shade what it does not cover."""
         height, width = image.shape[:2]
         scale = min(width_px / width, height_px / height)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -69,7 +66,7 @@ class Canvas:
         self._draw.rectangle((x - 1, y - 1, x + width_px, y + height_px), outline=LINE)
 
     def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
-        """A filled rectangle up to but without right and bottom; nothing where that is no whole pixel."""
+        """Fill a rectangle, without its right column and bottom row; draw nothing below one whole pixel."""
         left, top, right, bottom = map(round, (left, top, right, bottom))
         if right > left and bottom > top:
             self._draw.rectangle((left, top, right - 1, bottom - 1), fill=colour)
@@ -77,20 +74,20 @@ class Canvas:
     def frame(
         self, left: float, top: float, right: float, bottom: float, colour: Colour = LINE, width_px: int = 1
     ) -> None:
-        """A rectangle's outline."""
+        """Draw a rectangle's outline."""
         self._draw.rectangle(tuple(map(round, (left, top, right, bottom))), outline=colour, width=width_px)
 
     def line(self, x0: float, y0: float, x1: float, y1: float, colour: Colour = LINE, width_px: int = 1) -> None:
-        """A straight line."""
+        """Draw a straight line."""
         self._draw.line((x0, y0, x1, y1), fill=colour, width=width_px)
 
     def arrow(self, x0: float, y: float, x1: float, colour: Colour = SOFT) -> None:
-        """A horizontal arrow to the right."""
+        """Draw a horizontal arrow to the right."""
         self._draw.line((x0, y, x1 - 8, y), fill=colour, width=2)
         self._draw.polygon(((x1, y), (x1 - 11, y - 5), (x1 - 11, y + 5)), fill=colour)
 
     def vector(self, x: float, y: float, along_x: float, along_y: float) -> None:
-        """An arrow from (x, y) that stands out from any colour: dark with a light rim."""
+        """Draw an arrow from (x, y), dark with a light rim, so that it stands out from any colour."""
         length = math.hypot(along_x, along_y)
         tip = (x + along_x, y + along_y)
         back_x, back_y = along_x / length, along_y / length
@@ -104,7 +101,7 @@ class Canvas:
             self._draw.line((*sides[0], *tip, *sides[1]), fill=colour, width=width)
 
     def hatch(self, left: float, top: float, right: float, bottom: float) -> None:
-        """The sign of a paused camera: slanted lines on a shade."""
+        """Draw the sign of a paused camera: slanted lines on a shade."""
         if right - left < 1:
             return
         self.box(left, top, right, bottom, SHADE)
@@ -116,19 +113,25 @@ class Canvas:
         self._page.paste(stripes, (round(left), round(top)))
 
     def image(self) -> Image:
-        """The page: [height, width, 3] uint8 RGB."""
+        """Return the page: [height, width, 3] uint8 RGB."""
         return np.asarray(self._page, np.uint8).copy()
 
 
 def text_width(text: str, size: int = TEXT_PT) -> float:
-    """px that a line takes."""
+    """Return the width of a line of text, px."""
     return float(_font(size).getlength(text))
 
 
 def shortened(text: str, width_px: float, size: int = TEXT_PT) -> str:
-    """The text, or as much of its end as fits behind three dots."""
+    """Return the text, or as much of its end as fits behind three dots."""
     if text_width(text, size) <= width_px:
         return text
     while text and text_width("..." + text, size) > width_px:
         text = text[1:]
     return "..." + text
+
+
+def label(page: Canvas, x: int, y: int, text: str, colour: Colour = INK) -> None:
+    """Write text on a ground of its own, so that the panel below does not hide it."""
+    page.box(x, y, x + text_width(text) + 10, y + 24, PAPER)
+    page.text(x + 5, y + 2, text, colour=colour)

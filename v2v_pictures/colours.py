@@ -19,13 +19,13 @@ DARKER = (5, 93, 176)
 
 _QUANTILE = 0.98
 _PALEST = 0.35
-"""Share of full colour that the least event has."""
+"""Share of full colour that the smallest count has."""
 
 
 def full_colour(counts: Iterable[npt.NDArray[np.generic]]) -> float:
-    """The count that gets full colour: the 98th percentile of all events that are there, at least 1.
+    """Return the count that gets full colour: the 98th percentile of all non-zero counts, at least 1.
 
-    One hot pixel must not make everything else pale, and one scale for a whole page makes its panels comparable.
+    A percentile keeps one hot pixel from making everything else pale. One scale for a page makes its panels comparable.
 
     Args:
         counts: signed event counts, any shapes.
@@ -35,7 +35,7 @@ def full_colour(counts: Iterable[npt.NDArray[np.generic]]) -> float:
 
 
 def draw_events(counts: npt.NDArray[np.generic], full: float) -> Image:
-    """Signed counts as colour: white is none, red brighter, blue darker.
+    """Draw signed counts as colour: white is none, red brighter, blue darker.
 
     Args:
         counts: [H, W], signed event counts.
@@ -55,7 +55,7 @@ def draw_events(counts: npt.NDArray[np.generic], full: float) -> Image:
 
 
 def draw_grey(picture: npt.NDArray[np.generic]) -> Image:
-    """[H, W] uint8, or floating point in 0 .. 1 (clipped), as RGB."""
+    """Draw [H, W] uint8, or floating point in 0 .. 1 (clipped), as RGB [H, W, 3]."""
     if picture.dtype != np.uint8:
         picture = np.rint(np.clip(picture.astype(np.float32), 0, 1) * 255).astype(np.uint8)
     image: Image = np.repeat(picture.astype(np.uint8)[..., None], 3, axis=-1)
@@ -81,7 +81,7 @@ def _wheel() -> npt.NDArray[np.float64]:
 
 
 def draw_flow(flow: npt.NDArray[np.generic], largest_px: float | None = None) -> Image:
-    """A flow field: white does not move, red moves right, yellow down, blue-cyan left, violet up.
+    """Draw a flow field: white does not move, red moves right, yellow down, blue-cyan left, violet up.
 
     The colour wheel of the Middlebury pages (Baker et al., "A Database and Evaluation Methodology for Optical Flow",
     IJCV 2011).
@@ -108,7 +108,7 @@ def draw_flow(flow: npt.NDArray[np.generic], largest_px: float | None = None) ->
 
 
 def draw_wheel(radius_px: int) -> Image:
-    """The legend of flow: each pixel has the colour of the flow that leads to it from the centre; outside it is white.
+    """Draw the legend of flow: each pixel has the colour of the flow from the centre to it; outside it is white.
 
     Returns:
         [2 r + 1, 2 r + 1, 3] uint8.

@@ -1,4 +1,4 @@
-"""Pictures and films as files. The ending of the name says which."""
+"""Pictures and films as files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _QUALITY = "20"  # x264's rate factor: no visible loss of thin red and blue line
 
 
 def png_bytes(image: Image) -> bytes:
-    """[h, w, 3] uint8 RGB as PNG."""
+    """Encode [h, w, 3] uint8 RGB as PNG."""
     file = io.BytesIO()
     Pictures.fromarray(np.ascontiguousarray(image)).save(file, "PNG", optimize=True)
     return file.getvalue()
 
 
 def gif_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
-    """A film as GIF, of few colours, so that it fits a page."""
+    """Encode a film as GIF, with few colours to keep it small."""
     pages = [Pictures.fromarray(np.ascontiguousarray(image)) for image in film]
     palette = _palette(np.concatenate([np.asarray(pages[at]) for at in {0, len(pages) // 2, len(pages) - 1}]))
     few = [page.quantize(palette=palette, dither=Pictures.Dither.NONE) for page in pages]
@@ -41,8 +41,7 @@ def gif_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
 
 
 def _palette(sampled: Image) -> Pictures.Image:
-    """Colours that mean something as they are, and a selection of all others, which are photographs: a picture that
-    Pillow takes for a palette."""
+    """Return a palette picture for Pillow: exact colours for what has a meaning, a selection for photographs."""
     found, counts = np.unique(sampled.reshape(-1, 3), axis=0, return_counts=True)
     common = found[np.argsort(-counts, kind="stable")][:_GIF_COMMON]
     others = Pictures.fromarray(sampled).quantize(_GIF_COLOURS).getpalette() or []
@@ -56,7 +55,7 @@ def _palette(sampled: Image) -> Pictures.Image:
 
 
 def mp4_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
-    """A film as H.264 in MP4, which every browser and projector plays."""
+    """Encode a film as H.264 in MP4, which every browser plays."""
     file = io.BytesIO()
     height, width = (side // 2 * 2 for side in film[0].shape[:2])  # 4:2:0 wants even sides
     with av.open(file, "w", format="mp4") as container:
@@ -71,7 +70,7 @@ def mp4_bytes(film: Sequence[Image], frames_per_second: float) -> bytes:
 
 
 def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second: float) -> str:
-    """One HTML file that holds the sheet and the film, and needs nothing else."""
+    """Write one HTML page that holds the sheet and the film, without other files."""
     picture = base64.b64encode(png_bytes(sheet)).decode()
     movie = base64.b64encode(mp4_bytes(film, frames_per_second)).decode() if film else ""
     video = f'<video controls loop autoplay muted src="data:video/mp4;base64,{movie}"></video>' if movie else ""
@@ -85,7 +84,7 @@ def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second
 
 
 def write(path: Path, content: bytes | str) -> None:
-    """Writes a file.
+    """Write a file.
 
     Raises:
         UsageError: the folder is missing or cannot be written.
@@ -97,7 +96,7 @@ def write(path: Path, content: bytes | str) -> None:
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Writes a picture as PNG.
+    """Write a picture as PNG.
 
     Raises:
         UsageError: the folder is missing or cannot be written.

@@ -1,4 +1,4 @@
-"""Voxel grids of which nothing else is known: what a call of ``simulate`` gave."""
+"""A picture of voxel grids alone, as ``simulate`` returns them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import Canvas
+from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas
 from v2v_pictures.colours import Image, draw_events, full_colour
-from v2v_pictures.sheet import GAP_PX, MARGIN_PX, MOST_BINS, SCALE_PX, bin_headings, draw_scale, events_heading
+from v2v_pictures.sheet import MOST_BINS, SCALE_PX, bin_headings, draw_scale, events_heading
 
 _HEADING_PX, _LABEL_PX, _SCALE_PX = 74, 140, 100
 _MOST_GRIDS = 4
 
 
 def draw_grids(voxels: npt.NDArray[Any], *, tile_px: int = 192) -> Image:
-    """A row of bins for each of up to four grids, evenly spaced over the clip.
+    """Draw a row of bins for each of up to four grids, evenly spaced over the clip.
 
     Args:
         voxels: [T, bins, H, W], signed event counts, T at least 1.

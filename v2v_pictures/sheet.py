@@ -1,7 +1,6 @@
-"""A page of virtual cameras: for each its draw, its activity over time, and moments of it: frame, bins, flow.
+"""A page of virtual cameras: for each its draw, its activity over time, and frame, bins and flow of some moments.
 
-The page explains itself: headings over the columns, an arrow for time, pauses hatched and named, one scale of colour
-for all panels, a legend below.
+Headings over the columns, an arrow for time, named pauses, and a legend below explain it. All panels share one scale.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import Canvas
+from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
+from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
 from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
-MARGIN_PX, GAP_PX = 28, 8
 _TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 64, 58, 38, 54, 132
 SCALE_PX = 341
 _BETWEEN_PX = 26
 _LEAST_SOURCE_PX = 120
 MOST_BINS = 8
 _ARROWS = 4
-"""Arrows along a side of a panel of flow: colours alone are not told apart by everybody."""
+"""Arrows along a side of a panel of flow, for readers who cannot tell the colours apart."""
 _STILL = 0.15
 """Flow below this share of the largest gets no arrow."""
 
@@ -47,7 +46,7 @@ class Scale:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Scale:
-        """For these cameras, from the moments that a sheet shows of them."""
+        """Return the scale for these cameras, from the moments that a sheet shows of them."""
         shown = [camera.voxels[moment] for camera in cameras for moment in camera.moments(3)]
         flows = [camera.flow.astype(np.float32) for camera in cameras if camera.flow is not None]
         longest = max((float(np.quantile(np.hypot(flow[:, 0], flow[:, 1]), 0.99)) for flow in flows), default=1.0)
@@ -55,33 +54,41 @@ class Scale:
         return cls(full_colour(shown), max(1.0, longest), max(highest, 1e-9))
 
 
-def draw_sheet(cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_px: int = 192) -> Image:
-    """The page.
+def draw_sheet(
+    cameras: Sequence[Camera], title: str, *, moments: int = 1, tile_px: int = 192, whole: Camera | None = None
+) -> Image:
+    """Draw the page.
 
     Args:
-        cameras: at least one; all with as many bins, and all or none with flow.
+        cameras: at least one; all with equally many bins, and all or none with flow.
         title: of the page.
         moments: how many voxel grids to show of each camera.
         tile_px: side of a panel.
+        whole: a camera that sees the whole picture, to show first; None leaves it out.
 
     Returns:
         [height, width, 3] uint8 RGB.
     """
-    scale = Scale.of(cameras)
+    scale = Scale.of(cameras if whole is None else [whole, *cameras])
     bins = min(cameras[0].voxels.shape[1], MOST_BINS)
     with_flow = cameras[0].flow is not None
     columns = 1 + bins + with_flow
     width = 2 * MARGIN_PX + columns * (tile_px + GAP_PX) + 2 * 2 * GAP_PX
     strip_px = LABEL_PX + _STRIP_PX + TICKS_PX + GAP_PX
     block = _CAMERA_PX + strip_px + moments * (tile_px + GAP_PX) + _BETWEEN_PX
-    page = Canvas(width, _TITLE_PX + _HEADING_PX + len(cameras) * block + _LEGEND_PX)
+    first = _TITLE_PX
+    if whole is not None:
+        width, first = max(width, overview_width(tile_px)), first + overview_height(whole, tile_px)
+    page = Canvas(width, first + _HEADING_PX + len(cameras) * block + _LEGEND_PX)
     left = _columns(bins, with_flow, tile_px)
     page.title(MARGIN_PX, 18, title)
-    _headings(page, left, bins, with_flow, tile_px)
+    if whole is not None:
+        draw_overview(page, whole, cameras, _TITLE_PX, tile_px, scale.full, scale.highest_rate)
+    _headings(page, left, bins, with_flow, tile_px, first)
     for number, camera in enumerate(cameras):
-        top = _TITLE_PX + _HEADING_PX + number * block
+        top = first + _HEADING_PX + number * block
         picks = camera.moments(moments)
-        _camera_line(page, camera, number, top)
+        _camera_line(page, camera, number, picks, top)
         top += _CAMERA_PX
         strip_left = MARGIN_PX
         if camera.whole is not None:
@@ -105,8 +112,8 @@ def _columns(bins: int, with_flow: bool, tile_px: int) -> list[int]:
     return [*edges, edges[-1] + step + 2 * GAP_PX] if with_flow else edges
 
 
-def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px: int) -> None:
-    y, below = _TITLE_PX, _TITLE_PX + 27
+def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px: int, y: int) -> None:
+    below = y + 27
     page.text(left[0] + tile_px / 2, y, "video frame", size=canvas.HEADING_PT, anchor="ma")
     page.text(left[0] + tile_px / 2, below, "at the end of the bins", colour=canvas.SOFT, anchor="ma")
     events_heading(page, left[1], y)
@@ -117,7 +124,7 @@ def _headings(page: Canvas, left: list[int], bins: int, with_flow: bool, tile_px
 
 
 def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> None:
-    """The bins' numbers over their panels, and arrows of time between them."""
+    """Write the bins' numbers over their panels, with arrows of time between them."""
     for number, x in enumerate(left):
         x_end = page.text(x, y, f"bin {number + 1}", colour=canvas.SOFT)
         if number + 1 < len(left):
@@ -129,14 +136,14 @@ def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> Non
 
 
 def events_heading(page: Canvas, x: float, y: float, what: str = "simulated events:") -> None:
-    """What red and blue are, in red and blue."""
+    """Write the heading of events, with what red and blue mean."""
     x = page.text(x, y, what, size=canvas.HEADING_PT)
     x = page.text(x + 10, y, "brighter", size=canvas.HEADING_PT, colour=BRIGHTER)
     page.text(x + 10, y, "darker", size=canvas.HEADING_PT, colour=DARKER)
 
 
 def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], largest_px: float, tile_px: int) -> None:
-    """Flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
+    """Draw flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
     page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
     height, width = flow.shape[1:]
     scale = min(tile_px / width, tile_px / height)
@@ -155,33 +162,13 @@ def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], larg
             page.vector(centre_x - along[0] / 2, centre_y - along[1] / 2, *along)
 
 
-def label(page: Canvas, x: int, y: int, text: str, colour: canvas.Colour = canvas.INK) -> None:
-    """Text on a ground of its own, so that the panel below does not hide it."""
-    page.box(x, y, x + canvas.text_width(text) + 10, y + 24, canvas.PAPER)
-    page.text(x + 5, y + 2, text, colour=colour)
-
-
-def whole_panel(page: Canvas, camera: Camera, x: int, y: int, width_px: int, height_px: int) -> None:
-    """The video's picture, small, and a box around what the camera sees of it."""
-    if camera.whole is None:
-        return
-    height, width = camera.whole.shape
-    scale = min(width_px / width, height_px / height)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    page.panel(x, y, draw_grey(camera.whole), *size)
-    left, top, right, bottom = (edge * scale for edge in camera.crop)
-    for colour, wider in ((canvas.PAPER, 1), (canvas.MARK, 0)):
-        page.frame(
-            x + max(0, left) - wider, y + max(0, top) - wider, x + min(size[0], right) - 1 + wider,
-            y + min(size[1], bottom) - 1 + wider, colour, 2 + wider,
-        )  # fmt: skip
-
-
-def _camera_line(page: Canvas, camera: Camera, number: int, top: int) -> None:
+def _camera_line(page: Canvas, camera: Camera, number: int, picks: Sequence[int], top: int) -> None:
     page.line(MARGIN_PX, top - 8, page.width_px - MARGIN_PX, top - 6, canvas.SHADE, 2)
     x = page.text(MARGIN_PX, top, f"Camera {number + 1}", size=canvas.HEADING_PT)
     if camera.title:
         x = page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
+    if warning := camera.warning(picks):
+        x = page.text(x + 18, top + 4, warning)
     x = page.text(x + 18, top + 4, camera.describe(), colour=canvas.SOFT)
     right = page.width_px - MARGIN_PX
     if right - x > _LEAST_SOURCE_PX:
@@ -212,6 +199,8 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
     page.text(x + 58, y + 28, f"in the strip: the voxel grid shown below it{crop}")
     said = "threshold: the change of log brightness that makes an event, brighter / darker"
     page.text(x, y + 56, said, colour=canvas.SOFT)
+    said = "pale bars of the strip: noise; a bar is as long as the square root of the events"
+    page.text(x, y + 80, said, colour=canvas.SOFT)
     if cameras[0].flow is not None:
         radius = 46
         x = page.width_px - MARGIN_PX - 2 * radius - 1
@@ -221,7 +210,7 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
 
 
 def draw_scale(page: Canvas, full: float, x: int, y: int) -> None:
-    """The scale of events, SCALE_PX wide: which colour is how many of which sign."""
+    """Draw the colour scale of events, SCALE_PX wide."""
     ramp = np.linspace(-full, full, SCALE_PX, dtype=np.float32)[None].repeat(20, axis=0)
     page.text(x + SCALE_PX / 2, y, "events a pixel and bin", anchor="ma")
     page.panel(x, y + 26, draw_events(ramp, full), SCALE_PX, 20)

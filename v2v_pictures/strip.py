@@ -1,4 +1,4 @@
-"""A camera's activity over its whole clip, as a strip: brighter events up, darker down, pauses hatched and named."""
+"""A camera's activity over its whole clip, as a strip: brighter events up, darker down, noise pale, pauses hatched."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LABEL_PX, TICKS_PX = 22, 24
 """Above and below the strip."""
 _HATCH_PX = 7
 _PALE = 0.6
-"""How much of the way to white the bars of a pause are: they are noise."""
+"""How much of the way to white the bars of noise are."""
 
 
 def draw_strip(
@@ -29,14 +29,13 @@ def draw_strip(
     picks: Sequence[int] = (),
     cursor: int | None = None,
 ) -> None:
-    """The strip, LABEL_PX of text above it and TICKS_PX below it.
+    """Draw the strip, with LABEL_PX of text above it and TICKS_PX below it.
 
     Args:
-        page: to draw on.
-        camera: whose activity.
         left, top, width, height: of the strip itself, px.
         highest: events a pixel and bin of a full bar, which reaches from the middle to the edge; above 0, written above
-            the strip. Higher rates are cut there. One value for all strips of a page makes them comparable.
+            the strip. Higher rates are cut there. One value for all strips of a page makes them comparable. A bar's
+            length is the square root of its share, so that a quiet camera still shows when it fires.
         picks: voxel grids to point at.
         cursor: a bin to draw a line at, for films.
     """
@@ -49,10 +48,11 @@ def draw_strip(
     pauses = [(at[start], at[end]) for start, end in zip(edges[::2], edges[1::2], strict=True)]
     for start, end in pauses:
         page.hatch(start, top, end, top + height)
-    for number, still in enumerate(camera.paused):
-        up, down = np.minimum(rates[:, number] / highest, 1.0) * (height / 2)
-        page.box(at[number], middle - up, at[number + 1], middle, _pale(BRIGHTER) if still else BRIGHTER)
-        page.box(at[number], middle, at[number + 1], middle + down, _pale(DARKER) if still else DARKER)
+    moving = np.where(camera.paused, 0.0, rates if camera.quiet is None else np.minimum(camera.quiet, rates))
+    for bars, brighter, darker in ((rates, _pale(BRIGHTER), _pale(DARKER)), (moving, BRIGHTER, DARKER)):
+        for number, (up, down) in enumerate(np.sqrt(np.minimum(bars / highest, 1.0)).T * (height / 2)):
+            page.box(at[number], middle - up, at[number + 1], middle, brighter)
+            page.box(at[number], middle, at[number + 1], middle + down, darker)
     for start, end in pauses:  # seen behind full bars too
         page.hatch(start, top, end, top + _HATCH_PX)
         page.hatch(start, top + height - _HATCH_PX, end, top + height)
@@ -73,7 +73,7 @@ def draw_strip(
 
 
 def _ticks(page: Canvas, grids: int, left: int, width: int, top: int, picks: Sequence[int]) -> None:
-    """The number of each pick in the middle of its place; the first and the last grid where there is room for them."""
+    """Write the number of each pick below it, and those of the first and last grid where they fit."""
     free_from, free_to = float(left), float(left + width)
     for place, pick in enumerate(picks):
         text = f"{pick + 1}" if len(picks) > 1 else f"voxel grid {pick + 1}"

@@ -8,6 +8,6 @@ __version__ = "0.1.0"
 PROTOCOL_VERSION = 8
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""
 
-NUMERICS_VERSION = 3
+NUMERICS_VERSION = 4
 """Version of everything that turns (spec, catalogue, seed, epoch, index) into bytes: permutation, draws,
 kernel. It is part of a sample's identity; a change that alters any byte of any sample raises it."""

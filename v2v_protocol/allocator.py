@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 
 LARGEST_SAMPLE_BYTES = 32 << 20
-"""As much as every glibc takes for a limit, and more than a sample has."""
+"""The largest limit that every glibc accepts; larger than a sample."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 """Parameters of mallopt(3), from glibc's malloc.h."""
 _EVER_BYTES = (1 << 31) - 1

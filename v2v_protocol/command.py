@@ -53,7 +53,7 @@ class Parser(argparse.ArgumentParser):
         general = self.group(_GENERAL)
         general.add_argument("-h", "--help", action="help", help="show this help and exit")
         general.add_argument("--version", action="version", version=version_of(name), help="show the version and exit")
-        general.add_argument("--debug", action="store_true", help="show the trace of an error")
+        general.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
     def group(self, title: str) -> argparse._ArgumentGroup:
         """Return the group with this title; create it on first use."""
@@ -130,7 +130,8 @@ def run_command(
     except V2VError as error:
         if arguments.debug:
             traceback.print_exc()
-        print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
+        if not error.is_reported:
+            print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
         failed = isinstance(error, failures) and not isinstance(error, UsageError)
         return FAILED if failed else WRONG_USAGE
     except KeyboardInterrupt:

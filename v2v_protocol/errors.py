@@ -34,7 +34,13 @@ class RepeatedSamplesWarning(UserWarning):
 
 
 class V2VError(Exception):
-    """Base class of every exception that the project raises on purpose."""
+    """Base class of every exception that the project raises on purpose.
+
+    Attributes:
+        is_reported: whether a command has already written it to its log, so that it is not printed again.
+    """
+
+    is_reported = False
 
 
 class UsageError(V2VError):
@@ -117,8 +123,8 @@ class RemoteError(V2VError):
 
     def __init__(self, code: str, text: str | None = None) -> None:
         if text is None:
-            # PyTorch builds an exception of a loader worker again from one text: the trace of the worker, at whose end
-            # the message stands.
+            # PyTorch rebuilds an exception of a loader worker from one text: the worker's traceback, which ends with
+            # the message.
             text, code = _taken_apart(code)
         self.code = code
         self.text = text

@@ -24,14 +24,14 @@ from v2v_protocol.safe_json import parse_json
 SIDES = ("consumer", "worker")
 VARIABLE = "V2V_KEYS"
 KEY_LETTERS = 40
-"""Of a CURVE key, in Z85."""
+"""Length of a CURVE key in Z85, characters."""
 _Z85 = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
 HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
-"""What a socket's monitor says of handshakes: ended without a word, succeeded, other mechanism, not authenticated."""
+"""Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""
 _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
 _MISMATCH = 0x11000002
 _MOST_SILENT = 5
-"""Handshakes in a row that the server ended without a word; a server that is stopped may end one or two."""
+"""Consecutive handshakes that the server ended without a reply; a server that is stopping may end one or two."""
 _ASK_EVERY = 5
 _OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 
@@ -79,16 +79,17 @@ def key_for(address: str, side: str, file: str | os.PathLike[str] | None) -> Pee
 
 
 def read_key(file: Path) -> PeerKey:
-    """
+    """Read a key file.
+
     Raises:
-        KeyRefused: it cannot be read, others can read it, or it is no key file.
+        KeyRefused: it cannot be read, other users can read it, or it is not a key file.
     """
     try:
         key = PeerKey(**parse_json(read_private(file)))
     except (ValueError, TypeError):
-        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made") from None
+        raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made") from None
     if key.side not in SIDES or not all(map(is_key, (key.server, key.public, key.secret))):
-        raise KeyRefused(f"{file} is no key file: give one that `v2v-keys new` made")
+        raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made")
     return key
 
 
@@ -110,7 +111,9 @@ def read_private(file: Path) -> str:
         with file.open("rb") as opened:
             mode = stat.S_IMODE(os.fstat(opened.fileno()).st_mode)
             if mode & 0o077:
-                raise KeyRefused(f"key file {file} has mode {mode:04o}, so others may have it: chmod 600 {file}")
+                raise KeyRefused(
+                    f"key file {file} has mode {mode:04o}, so other users may have read it: chmod 600 {file}"
+                )
             return opened.read(4096).decode(errors="replace")
     except OSError as error:
         raise KeyRefused(f"key file {file} cannot be read: {error.strerror}") from error
@@ -184,21 +187,21 @@ class Handshakes:
                 self._is_proven = True
             elif event == _AUTHENTICATION:
                 raise KeyRefused(
-                    f"{self._address} refuses {self._mine}: it was revoked, or never was a {self._side} key there; "
-                    f"`v2v-keys list` on the server's host shows those that are"
+                    f"{self._address} refuses {self._mine}: the key was revoked, or is not a {self._side} key there; "
+                    f"`v2v-keys list` on the server's host shows the valid keys"
                 )
             elif (event == _MECHANISM and value == _MISMATCH) or self._is_lost():
                 raise KeyRefused(
                     f"{self._address} asks for no key, and this side has one ({self._mine}): nothing was sent; leave "
-                    f"the key out (keys='', or no {VARIABLE}) only if that server is known to be without keys"
+                    f"the key out (keys='', or no {VARIABLE}) only if you know that this server uses no keys"
                     if self._has_key
                     else f"{self._address} asks for a key, and {self._mine}: set {VARIABLE} (or keys=, --keys) to a "
                     f"file that `v2v-keys new NAME --for {self._side}` made"
                 )
             elif self._has_key and not self._is_proven and self._silent >= _MOST_SILENT:
                 raise KeyRefused(
-                    f"{self._address} ended {self._silent} handshakes without a word: it is not the server that "
-                    f"{self._mine} was made for, or no server of ours; ask for a new key file"
+                    f"{self._address} ended {self._silent} handshakes without a reply: it is not the server that "
+                    f"{self._mine} was made for, or not a v2v server; ask for a new key file"
                 )
 
     def _is_lost(self) -> bool:
@@ -222,7 +225,7 @@ def mechanism_of(address: str, seconds: float = 2.0) -> bytes:
     greeting = b""
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=seconds) as peer:
-            peer.sendall(_OUR_SIGNATURE)  # and no more: who has the whole greeting of the other decides
+            peer.sendall(_OUR_SIGNATURE)  # send no more: the side that has the whole greeting of the other decides
             while len(greeting) < 64 and (piece := peer.recv(64 - len(greeting))):
                 greeting += piece
     except (OSError, ValueError):

@@ -1,15 +1,15 @@
-"""The messages, as frozen dataclasses. How they become bytes is :mod:`v2v_protocol.wire`; who may send what when is
-`docs/protocol.md`.
+"""The messages, as frozen dataclasses. :mod:`v2v_protocol.wire` encodes them; `docs/protocol.md` states which peer may
+send which message when.
 
     consumer -> server     Hello, Want, Ping, Goodbye
     server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Denied, Pong
     worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), LeaseFailed, Ping, Goodbye
     server -> worker       Lease, Stop, Denied, Pong
-    anybody -> server      See
-    server -> anybody      Seen
+    any peer -> server     See
+    server -> any peer     Seen
 
-Field types are the few that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
-float or str, and Mapping (plain values, checked by whoever knows its form).
+Field types are those that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
+float or str, and Mapping (plain values, checked by the code that uses them).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 
 
 class ErrorCode(StrEnum):
-    """Why the server denied a request."""
+    """Reason why the server denied a request."""
 
     VERSION = "version"
     MALFORMED = "malformed"
@@ -37,21 +37,21 @@ class ErrorCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Opens (or opens again, after a server restart) a consumer's session.
+    """Open a consumer's session, or open it again after a server restart.
 
     Attributes:
-        spec: what the consumer asks for, see ``StreamSpec.from_dict``; missing fields take the server's defaults.
-        arrays: names of the arrays wanted.
-        batch_size: samples of a batch; it only sizes the suggested credit.
+        spec: requested fields, see ``StreamSpec.from_dict``; missing fields take the server's defaults.
+        arrays: names of the requested arrays.
+        batch_size: samples of a batch; it only sets the suggested credit.
         seed: seed of the stream.
-        quarantine: number of the quarantine snapshot to go on under; None: the newest.
+        quarantine: number of the quarantine snapshot to use; None: the newest.
         stride: samples from the beginning of one batch of this consumer to that of its next: batch size x ranks x
-            loader workers. It settles a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
-        name, host: what people shall read of this consumer, "rank 0 of 2" on "gpu-1" for instance.
-        packed: whether it asks for compressed arrays, because a network lies between. It must take both.
+            loader workers. It sets a ``sibling_spacing`` that the spec leaves open; 0: the batch size.
+        name, host: display names of this consumer, for instance "rank 0 of 2" on "gpu-1".
+        packed: whether it asks for compressed arrays, because the connection is a network. It must accept both forms.
         secret: random bytes that own the session, at most 64. A Hello with the same secret, and the same key if there
-            are keys, takes the session over to its own connection. It is never published. Without one, a consumer
-            that connects again gets a new session.
+            are keys, takes the session over to its own connection. It is never published. Without a secret, a consumer
+            that reconnects gets a new session.
     """
 
     spec: Mapping[str, Any]
@@ -68,16 +68,15 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """Asks for samples of one epoch; each index is one unit of credit spent until it is answered.
+    """Ask for samples of one epoch; each index uses one unit of credit until it is answered.
 
-    An index that is asked for again while it is in work is not made twice.
+    An index that is requested again while it is in work is not made twice.
 
     Attributes:
         epoch, indices: which samples.
-        arenas, slots: for each index, memory that a worker of the same host may put its sample into, see
-            :mod:`v2v_protocol.arena`; "" and 0 where there is none. Empty: none for any.
-        waited_seconds: for how long the consumer has waited for samples in all since its Hello. For people to read;
-            nothing goes by it.
+        arenas, slots: for each index, memory that a worker of the same host may write its sample to, see
+            :mod:`v2v_protocol.arena`; "" and 0 for an index without a slot. Empty: no index has a slot.
+        waited_seconds: total time that the consumer has waited for samples since its Hello. For display only.
     """
 
     epoch: int
@@ -89,15 +88,15 @@ class Want:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """Is anybody there? Sent when nothing else was, so that any traffic counts as life."""
+    """Ask for a sign of life. It is sent only after a silence, because any message counts as a sign of life."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goodbye:
-    """The sender leaves in peace: forget its session, or give its leases to others.
+    """The sender leaves in an orderly way: forget its session, or give its leases to other workers.
 
     Attributes:
-        waited_seconds: of a consumer, as :class:`Want` says it.
+        waited_seconds: of a consumer, as in :class:`Want`.
     """
 
     waited_seconds: float = 0.0
@@ -105,8 +104,9 @@ class Goodbye:
 
 @dataclass(frozen=True, slots=True)
 class See:
-    """Asks for the state of the service. Needs no session, and may be said on the workers' side too. The answer is the
-    next state that is made, a few times a second; several before it get one answer."""
+    """Ask for the state of the service. It needs no session, and workers' ports accept it too. The answer is the next
+    state that is built, a few times a second; several requests before it get one answer.
+    """
 
 
 # --- server -> consumer -----------------------------------------------------------------------------------------------
@@ -114,14 +114,14 @@ class See:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """Answers Hello.
+    """Answer to Hello.
 
     Attributes:
-        spec: the resolved spec, every field present.
-        spec_digest, catalogue_digest, numerics_version: the server's half of every sample's identity.
+        spec: the resolved spec, with every field.
+        spec_digest, catalogue_digest, numerics_version: the server's part of every sample's identity.
         sequences: N, samples of one epoch before ranks drop a remainder.
-        credit: samples the consumer may have asked for and not yet received, at most.
-        quarantine: number of the quarantine snapshot its samples are made under, until a new verdict falls.
+        credit: largest number of samples that the consumer may have requested and not yet received.
+        quarantine: number of the quarantine snapshot that its samples are made under, until a new entry is written.
     """
 
     spec: Mapping[str, Any]
@@ -137,20 +137,21 @@ class Welcome:
 class SampleHeader:
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
-    With ``slot`` set and no frames behind it, the arrays lie in that slot, one after the other.
+    If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other.
 
     Attributes:
         epoch, index: which sample.
         names, dtypes: of the arrays, in the order of the raw frames.
         shapes: of all arrays, flattened: ndim, extents, ndim, extents ...
-        provenance: ``Provenance.to_dict()`` as :func:`v2v_protocol.wire.encode_map` encodes it, so that a server need
-            not open it.
+        provenance: ``Provenance.to_dict()``, encoded by :func:`v2v_protocol.wire.encode_map`, so that a server need not
+            decode it.
         worker: name of the server worker that made it.
-        cpu_seconds: processor time it took there.
-        decoded: whether a clip was decoded for it, or read; False where it came from that of a sibling.
-        cache: "hit" or "miss" where its worker has a cache, "miss: " and a reason where that can keep no more; else "".
-        slot: the slot that the lease named, to which this worker writes no more; 0: it named none.
-        quarantine: number of the quarantine snapshot that the lease named, as the provenance says it.
+        cpu_seconds: processor time that it took there.
+        decoded: whether its clip was decoded or read; False if it came from a sibling.
+        cache: "hit" or "miss" if its worker has a cache, "miss: " and a reason if the cache stores nothing more;
+            otherwise "".
+        slot: the slot that the lease named, to which this worker no longer writes; 0: the lease named no slot.
+        quarantine: number of the quarantine snapshot that the lease named, as in the provenance.
         packed: the raw frames are zstd frames, one for each array.
     """
 
@@ -171,7 +172,7 @@ class SampleHeader:
 
 @dataclass(frozen=True, slots=True)
 class Unavailable:
-    """One asked sample cannot be made from any of its candidates; ``text`` says what each of them lacked."""
+    """A requested sample cannot be made from any of its candidates; ``text`` lists the reason of each."""
 
     epoch: int
     index: int
@@ -188,10 +189,10 @@ class Denied:
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """Answers Ping.
+    """Answer to Ping.
 
     Attributes:
-        trouble: why nobody can make a sample now, and what to do about it; empty where somebody can.
+        trouble: why no worker can make a sample now, and what to do about it; empty if one can.
     """
 
     trouble: str = ""
@@ -199,7 +200,7 @@ class Pong:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Answers See.
+    """Answer to See.
 
     Attributes:
         json: ``v2v_server.console.state.ServiceState.to_dict()`` as JSON, UTF-8.
@@ -213,34 +214,44 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class WorkerHello:
-    """A worker offers itself, with room for ``credit`` leases at a time. ``host`` is for people to read."""
+    """Offer a worker that accepts ``credit`` leases at a time.
+
+    Attributes:
+        name: of the worker; no other connected worker may have it.
+        numerics_version: of the samples that it makes.
+        credit: leases that it takes at a time.
+        host: for display.
+        secret: random bytes that own the name, at most 64. A hello with the same secret, and the same key if there are
+            keys, replaces the connection before. It is never published.
+    """
 
     name: str
     numerics_version: int
     credit: int
     host: str = ""
+    secret: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """The worker starts on this lease now: only a lease that was begun can be blamed for what happens next."""
+    """The worker starts on this lease now. Only a lease that was begun can be blamed for what happens next."""
 
     lease: int
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A lease's sample is done; the frames of its SampleHeader message follow, to be passed on as they are.
+    """A lease's sample is done; the frames of its SampleHeader message follow, and are passed on unchanged.
 
     Attributes:
         lease: number of the lease.
-        begins: number of the lease that the worker starts on next, as :class:`Begun` says it; 0: it has none at hand.
-        decode_seconds: that its clip took to be decoded, or read; 0 where that of a sibling was at hand.
-        simulate_seconds: from the clip to the arrays.
-        handover_seconds: of finding the sample's memory, and of packing and sending the one before.
-        memory_bytes: of the worker's process; 0: not known.
+        begins: number of the lease that the worker starts on next, as in :class:`Begun`; 0: it has no lease.
+        decode_seconds: time to decode or read its clip; 0 if a sibling's clip was available.
+        simulate_seconds: time from the clip to the arrays.
+        handover_seconds: time to find the sample's memory, and to pack and send the previous sample.
+        memory_bytes: memory of the worker's process; 0: not known.
 
-    The last four are for people to read; nothing goes by them.
+    The last four are for display only.
     """
 
     lease: int
@@ -253,10 +264,10 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class LeaseFailed:
-    """The lease's video could not give what it promised. ``frame`` and ``reason`` are those of VideoError.
+    """The lease's video could not be used. ``frame`` and ``reason`` are those of VideoError.
 
     Attributes:
-        here: the worker's host cannot read the file, or has another one in its place, which says nothing of the video.
+        here: the worker's host cannot read the file, or has another one in its place; the video may be sound elsewhere.
     """
 
     lease: int
@@ -270,30 +281,30 @@ class LeaseFailed:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """One clip of one video, and the sample to be made from it.
+    """One clip of one video, and the sample to make from it.
 
     Attributes:
         lease: number of the lease.
         spec: canonical bytes of the StreamSpec.
-        spec_digest, catalogue_digest: of the identity of its samples.
-        seed, epoch: of the identity of its samples.
-        indices: first the sample to be made; then its siblings, which are made from the same clip and follow in leases
-            of their own, if nothing comes in between: a worker that decodes for all of them at once decodes once.
+        spec_digest, catalogue_digest: parts of the identity of its samples.
+        seed, epoch: parts of the identity of its samples.
+        indices: the sample to make, then its siblings, which are made from the same clip and follow in leases of their
+            own if nothing intervenes. A worker that decodes for all of them decodes once.
         arrays: names of the arrays to send.
         video: catalogue id; the worker finds the file below its own root.
-        fingerprint: what the file must still be.
-        rows: rows of the picture that may be used, ``Rows`` syntax.
+        fingerprint: expected fingerprint of the file.
+        rows: usable rows of the picture, ``Rows`` syntax.
         width_px, height_px: of the upright picture, before rows.
-        frames_per_second: average rate, for noise stated per second; 0 where unknown.
-        thresholds: (positive, negative) when the corpus states them for this video, else empty.
+        frames_per_second: average rate, for noise stated per second; 0 if unknown.
+        thresholds: (positive, negative) if the corpus states them for this video, otherwise empty.
         start_frame: first frame of the sequence.
-        frame_index: ``FrameIndex.to_bytes()`` of at least the part of the file that is needed.
-        candidate: which candidate of the index this is.
-        refusals: candidates passed over before, as ``Refusal.to_dict()`` says them: {"refusals": [...]}.
-        quarantine: number of the quarantine snapshot that let the candidate pass.
-        scene: ``Scene.to_bytes()`` of the part of the video that is needed; empty where the spec asks for none.
-        arena, slot: where the sample may be put, see :mod:`v2v_protocol.arena`; "" and 0: in the message only.
-        packed: whether arrays that go into the message are to be compressed.
+        frame_index: ``FrameIndex.to_bytes()`` of at least the needed part of the file.
+        candidate: number of the candidate of the index, from 0.
+        refusals: refusals of earlier candidates, as ``Refusal.to_dict()``: {"refusals": [...]}.
+        quarantine: number of the quarantine snapshot under which the candidate was chosen.
+        scene: ``Scene.to_bytes()`` of the needed part of the video; empty if the spec does not use scenes.
+        arena, slot: memory that the sample may be written to, see :mod:`v2v_protocol.arena`; "" and 0: none.
+        packed: whether to compress arrays that go into the message.
     """
 
     lease: int

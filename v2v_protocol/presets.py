@@ -1,6 +1,6 @@
-"""Named recipes: each as what it changes of the fields' own defaults, which are those of the paper.
+"""Named recipes, each stated as its changes to the fields' defaults, which are those of the paper.
 
-:data:`v2v_protocol.recipe.PRESETS` has them as recipes.
+:data:`v2v_protocol.recipe.PRESETS` holds them as recipes.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ DEFAULT_PRESET = "paper"
 
 PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
-    # Ablation "-F": one draw of the thresholds per video, for ever.
+    # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
     "paper-fixed-thresholds": {"threshold_source": "video"},
     # Ablation "LDR": contrast raised, then clipped.
     "paper-contrast": {"contrast_probability": 0.8},
     # EVFlowNet: the frame before the first target frame, for pseudo flow.
     "paper-flow": {"lead_frames": 1},
-    # ERAFT: that frame, and one more voxel grid in front.
+    # ERAFT: that frame, and one more voxel grid before the first.
     "paper-eraft": {"lead_frames": 1, "lead_voxels": 1},
-    # The paper's pixel without noise, hot pixels or pauses: for tests and for looking.
+    # The paper's pixel without noise, hot pixels or pauses: for tests and for viewing.
     "noise-free": {
         "noise_sigma": (0.0, 0.0),
         "hot_pixel_share": (0.0, 0.0),
@@ -39,7 +39,7 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     # The paper's pixel with the dark floor of a sensor, drawn: recorded events are followed better from 0.01 to 0.2
     # than at the paper's 0.001 (`python -m bench sensor`, docs/effects.md).
     "sensor": {"log_eps": (0.01, 0.2)},
-    # A DAVIS346 in ordinary light; where each value comes from is told in docs/effects.md.
+    # A DAVIS346 in ordinary light; docs/effects.md gives the source of each value.
     "davis346": {
         # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
         "threshold": (0.134, 0.405),

@@ -1,5 +1,6 @@
-"""The programs, as pip installs them. One whose packages were not installed along says so in a line; those that one
-starts come from where it came from."""
+"""Entry points of the installed programs. A program whose packages are missing says so in one line. Programs that one
+starts run from the same installation.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +13,16 @@ from pathlib import Path
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer"})
 
 Program = Callable[[], int | None]
-"""Returns the exit status; None is success."""
+"""A function that returns the exit status; None is success."""
 
 
 def _program(name: str, module: str, function: str, extra: str) -> Program:
-    """A program whose modules are imported when it runs.
+    """Return a program whose modules are imported when it runs.
 
     Args:
-        name: of the command.
+        name: name of the command.
         module, function: what it runs.
-        extra: the extra of the distribution that brings what it imports.
+        extra: the extra of the distribution that installs its imports.
     """
 
     def run() -> int | None:
@@ -43,14 +44,14 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
 
 
 def environment() -> dict[str, str]:
-    """The environment in which one of our processes starts another by ``python -m``.
+    """Return the environment in which one of our processes starts another by ``python -m``.
 
-    That looks for modules in the folder that somebody happens to stand in, before all others: a checkout of another
-    state than the installed one, or a file named like a module. It shall look there only if this process did.
+    By default ``python -m`` looks for modules in the current folder first: it may hold another version of this package,
+    or a file named like a module. The new process looks there only if this process did.
     """
     try:
         is_home = Path(__file__).parents[1].samefile(os.curdir)
-    except OSError:  # the folder is gone
+    except OSError:  # the current folder was deleted
         is_home = False
     return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 

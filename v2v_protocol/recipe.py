@@ -57,7 +57,7 @@ SMALLEST_THRESHOLD_SHARE = 0.25
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
 LARGEST_EVENTS = 2.0**49
-"""Most events a pixel may fire in a clip: beyond, float64 does not resolve a threshold any more."""
+"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +70,26 @@ class Recipe:
 
     voxels_per_clip: int = whole(40, 1, 1_000_000, "T, voxel grids of a clip", group="Clip")
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
-    frames_per_bin: int = whole(1, 1, 1024, "steps between video frames that fall into one bin")
-    lead_frames: int = whole(0, 0, 1, "1 puts the frame before the first target frame in front (flow networks)")
-    lead_voxels: int = whole(0, 0, 1, "1 puts one more voxel grid in front (ERAFT)")
-    frame_stride: int = whole(1, 1, 1000, "n uses every n-th frame, as if the video's rate were 1/n of what it is")
+    frames_per_bin: int = whole(1, 1, 1024, "steps between video frames in one bin")
+    lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
+    lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
+    frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
     resize_scale: Range = span(
         (1.0, 1.0), 0.01, LARGEST_SCALE,
-        "scale of the picture before the crop; raised, as far as the upper end allows, where the crop would not fit",
+        "scale of the picture before the crop; raised, up to the upper end, if the crop would not fit",
     )  # fmt: skip
-    flip_probability: float = number(0.5, 0.0, 1.0, "chance of a horizontal flip")
+    flip_probability: float = number(0.5, 0.0, 1.0, "probability of a horizontal flip")
     pause_probability: float = number(
-        0.0102, 0.0, 1.0, "chance, per frame, that a running camera stops (the frame repeats)"
+        0.0102, 0.0, 1.0, "probability per frame that a running camera stops (the frame repeats)"
     )
-    pause_stay_probability: float = number(0.9791, 0.0, 1.0, "chance, per frame, that a stopped camera stays so")
+    pause_stay_probability: float = number(
+        0.9791, 0.0, 1.0, "probability per frame that a stopped camera stays stopped"
+    )
     contrast_probability: float = number(
-        0.0, 0.0, 1.0, "chance that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up"
+        0.0, 0.0, 1.0, "probability that F becomes clip((F - 127.5) s + 127.5, 0, 255), rounded half up"
     )
     contrast_scale: Range = span((1.0, 3.0), 0.0, 100.0, "range of s in contrast_probability")
 
@@ -100,12 +102,12 @@ class Recipe:
         (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
     )
     threshold_ratio: Range = span(
-        (1.0, 1.5), 1e-6, 1e6, "the other threshold, as a multiple; a coin says which of the two is the positive one"
+        (1.0, 1.5), 1e-6, 1e6, "the larger threshold as a multiple of the smaller; which of them is positive is random"
     )
     threshold_source: str = word(
         "sample", ("sample", "video"),
-        "sample draws thresholds afresh for every sample; video once per video for ever (those of the list file, if it "
-        "states any)",
+        "sample: new thresholds for every sample; video: the same for all samples of a video (those of the list file, "
+        "if it states any)",
     )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
@@ -124,13 +126,16 @@ class Recipe:
         group=EFFECTS,
     )  # fmt: skip
     shot_noise_hz: Range = span(
-        (0.0, 0.0), 0.0, 1e4, "noise events of a black pixel, both polarities together; a white one has a quarter",
+        (0.0, 0.0), 0.0, 1e4,
+        "rate of noise events of a black pixel, both polarities together; a white pixel has a quarter",
         unit="Hz",
     )  # fmt: skip
-    leak_hz: Range = span((0.0, 0.0), 0.0, 1e4, "positive events that every pixel fires by itself", unit="Hz")
-    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "how long a pixel is blind after an event", unit="s")
+    leak_hz: Range = span(
+        (0.0, 0.0), 0.0, 1e4, "rate of positive events that every pixel fires without a change of brightness", unit="Hz"
+    )
+    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "time after an event in which a pixel fires none", unit="s")
     photoreceptor_hz: Range = span(
-        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass", unit="Hz", off=True
+        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass filter", unit="Hz", off=True
     )
     dead_pixel_share: Range = span((0.0, 0.0), 0.0, 1.0, "share of the crop's pixels that never fire")
 
@@ -151,19 +156,19 @@ class Recipe:
 
     @property
     def has_effects(self) -> bool:
-        """True where a draw may switch on an effect beyond the paper's model."""
+        """Whether a draw may switch on an effect beyond the paper's model."""
         return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
 
     @property
     def timed_effects(self) -> bool:
-        """True where a draw may switch on an effect that is stated in Hz or seconds."""
+        """Whether a draw may switch on an effect that is stated in Hz or seconds."""
         return any(
             getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )
 
     @property
     def needs_seconds(self) -> bool:
-        """True where a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
+        """Whether a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
         return self.noise_unit == "second" or self.timed_effects
 
     @property
@@ -195,22 +200,24 @@ class Recipe:
 
     @property
     def smallest_and_largest_threshold(self) -> tuple[float, float]:
-        """End of what the recipe itself can draw for either polarity, log units."""
+        """Limits of the thresholds that the recipe itself can draw for either polarity, log units."""
         (low, high), (ratio_low, ratio_high) = self.threshold, self.threshold_ratio
         return low * min(1.0, ratio_low), high * max(1.0, ratio_high)
 
     @property
     def most_events(self) -> float:
-        """:func:`most_events` of the worst draw; what is stated per second, at one frame a second."""
+        """Upper bound from :func:`most_events` for the worst draw; quantities per second are taken at one frame per
+        second.
+        """
         return self.worst_events(1.0)
 
     def worst_events(self, step_seconds: float, thresholds: tuple[float, float] | None = None) -> float:
-        """:func:`most_events` of the worst draw.
+        """Return the upper bound of :func:`most_events` for the worst draw.
 
         Args:
-            step_seconds: from one frame to the next, all along the clip.
-            thresholds: those that are stated for the video, which hold where ``threshold_source`` is "video"; None
-                where none are.
+            step_seconds: time from one frame to the next, constant over the clip.
+            thresholds: thresholds stated for the video, used if ``threshold_source`` is "video"; None if there are
+                none.
         """
         low, high = self.smallest_and_largest_threshold
         if thresholds is not None and self.threshold_source == "video":
@@ -227,18 +234,18 @@ class Recipe:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values (ranges as lists), in a stable order."""
+        """Return all fields as plain values (ranges as lists), in a stable order."""
         values = {
             field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
             for field in dataclasses.fields(self)
         }
-        # It was a number before it could be a range, and the digest of a stream shall not change.
+        # A fixed value is written as a number: older digests depend on this form.
         low, high = self.log_eps
         return values | {"log_eps": low} if low == high else values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """A recipe from plain values.
+        """Build a recipe from plain values.
 
         Args:
             values: fields by name; missing ones take the value of ``values["preset"]``, by default ``paper``.
@@ -248,10 +255,10 @@ class Recipe:
         """
         rest = dict(values)
         base = preset(rest.pop("preset", DEFAULT_PRESET))
-        return base.replace(**{str(key): value for key, value in rest.items()})  # from YAML, say: {1: 2}
+        return base.replace(**{str(key): value for key, value in rest.items()})  # YAML keys may be numbers: {1: 2}
 
     def replace(self, /, **changes: Any) -> Recipe:
-        """This recipe with some fields changed.
+        """Return this recipe with some fields changed.
 
         Raises:
             RecipeError: an unknown key or a bad value.
@@ -261,18 +268,19 @@ class Recipe:
 
 
 def effect_settings() -> dict[str, Setting]:
-    """The fields of a recipe that switch on an effect beyond the paper's model."""
+    """Return the fields of a recipe that switch on an effect beyond the paper's model."""
     return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
 
 
 def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """End of what any pixel's threshold can be, for nominal ones between two values."""
+    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
     spread = LARGEST_NORMAL * mismatch_sigma
     return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
 
 
 def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
-    """An upper bound of the events that one pixel can fire in a clip, and the measure of the arithmetic it needs.
+    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
+    needed.
 
     ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
     the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
@@ -292,10 +300,10 @@ PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_
 
 
 def preset(name: object) -> Recipe:
-    """The preset of that name.
+    """Return the preset with this name.
 
     Raises:
-        RecipeError: no such preset; the message lists them.
+        RecipeError: there is no such preset; the message lists them.
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)

@@ -1,4 +1,4 @@
-"""What a command measured or did, as a JSON file: one list of flat records."""
+"""Write what a command measured or did to a JSON file: one list of flat records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refusal: what a video cannot do, in one form from the catalogue to a sample's provenance."""
+"""Describe what a video cannot do, in one form from the catalogue to a sample's provenance."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from enum import StrEnum
 
 
 class RefusalKind(StrEnum):
-    """Who refuses a video.
+    """Which part refuses a video.
 
-    UNUSABLE: the catalogue; the file cannot be opened, or is no video.
+    UNUSABLE: the catalogue; the file cannot be opened, or is not a video.
     UNSUITED: the schedule; it gives no sequence under the recipe.
-    FAILED: a worker; it did not give what the catalogue had promised, or the worker died over it.
-    QUARANTINED: the quarantine, which remembers what workers died of.
+    FAILED: a worker; the file did not deliver what was catalogued, or the worker died over it.
+    QUARANTINED: the quarantine, which records the sequences that brought workers down.
     """
 
     UNUSABLE = "unusable"
@@ -23,15 +23,15 @@ class RefusalKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A video that cannot give what was asked of it.
+    """A video that cannot be used for a request.
 
     Attributes:
         video: its catalogue id.
-        frame: the first frame that could not be had, presentation order; None where no single frame is to blame.
-        reason: why, in one line.
-        kind: who says so.
-        time: when, ISO 8601, UTC; empty where the file's bytes say the same at any time.
-        remedy: which setting would admit it, in words; empty where none would.
+        frame: the first unavailable frame, presentation order; None if no single frame is to blame.
+        reason: one line of text.
+        kind: which part refuses it.
+        time: when, ISO 8601, UTC; empty if the reason depends only on the file's bytes.
+        remedy: which setting would admit it, in words; empty if no setting would.
     """
 
     video: str
@@ -47,5 +47,5 @@ class Refusal:
         return f"{self.video}{where}: {self.reason}{remedy}"
 
     def to_dict(self) -> dict[str, str | int | None]:
-        """Plain values for a provenance, which says the same at any time."""
+        """Return plain values for a provenance, without the time."""
         return {"video": self.video, "frame": self.frame, "reason": self.reason, "kind": str(self.kind)}

@@ -1,4 +1,4 @@
-"""JSON from files that others may have written."""
+"""Parse JSON from files that others may have written."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The one reader of YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
+"""Read YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
 
-An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values, so the
-bound is on the values after aliases are replaced, and it is checked before any of them is built.
+An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values. So the
+bound applies to the values after aliases are replaced, and it is checked before any of them is built.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import yaml
 
 LARGEST_BYTES = 1 << 20
 MOST_VALUES = 100_000
-"""Scalars, lists and mappings of a text, each alias counted as all that it stands for."""
+"""Scalars, lists and mappings of a text; an alias counts as all the values that it repeats."""
 MOST_LEVELS = 32
 
 
@@ -32,7 +32,7 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise YamlError(" ".join(str(error).split())[:200]) from error
-    # Of values that do not fit their tag: a date that does not exist, `!!int ""`, `!!bool 3`, `!!timestamp x`.
+    # Raised for values that do not fit their tag: an invalid date, `!!int ""`, `!!bool 3`, `!!timestamp x`.
     except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:
         raise YamlError(f"a value does not fit its type: {' '.join(str(error).split())[:160]}") from error
 
@@ -64,7 +64,9 @@ def format_yaml(value: Any) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuse what expands beyond the limits, and a key that is there twice (SafeLoader takes the last silently)."""
+    """Loader that refuses texts that expand beyond the limits, and duplicate keys (SafeLoader silently takes the
+    last).
+    """
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -82,7 +84,7 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         if is_alias:
             if id(node) not in self._extents:
-                raise yaml.composer.ComposerError(None, None, "an alias refers to what it is part of", mark)
+                raise yaml.composer.ComposerError(None, None, "an alias refers to a node that contains it", mark)
             values, levels = self._extents[id(node)]
         else:
             values, levels = self._values - before + 1, self._deepest - self._level + 1
@@ -95,7 +97,7 @@ class _Loader(yaml.SafeLoader):
 
     def _check_limits(self, mark: yaml.Mark | None) -> None:
         for count, limit, unit in (
-            (self._values, MOST_VALUES, "values (aliases count as what they stand for)"),
+            (self._values, MOST_VALUES, "values (aliases count as the values that they repeat)"),
             (self._deepest, MOST_LEVELS, "levels"),
         ):
             if count > limit:
@@ -109,13 +111,13 @@ class _Loader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 continue  # no key of ours
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} appears twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
-    """8:32 is text, not 512 as a number of base 60 in YAML 1.1."""
+    """Construct a whole number, or text. 8:32 is text here, not 512 as a number of base 60 in YAML 1.1."""
     return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
 
 

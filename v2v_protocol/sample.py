@@ -1,4 +1,4 @@
-"""One sample: who it is, what was drawn for it, where it came from."""
+"""One sample: its identity, its draw, and its provenance."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
 }  # fmt: skip
-"""Arrays a consumer may ask for: dtype and shape of one sample's (no batch dimension), by the recipe and the spec's
+"""Arrays a consumer may request: dtype and shape for one sample (no batch dimension), by the recipe and the spec's
 ``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
 1 where forward and backward flow agree."""
 DEFAULT_ARRAYS = ("voxels", "frames")
@@ -39,7 +39,7 @@ Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 
 @dataclass(frozen=True, slots=True)
 class SampleId:
-    """Identity of a sample. Equal identities mean equal bytes, whoever makes the sample, wherever, whenever.
+    """Identity of a sample. Equal identities mean equal bytes on any host, at any time.
 
     Attributes:
         spec_digest: digest of the :class:`v2v_protocol.spec.StreamSpec`.
@@ -99,7 +99,7 @@ class SampleParams:
     log_eps: float | None = None
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
-        """Which decoded frame each position of the clip shows.
+        """Return which decoded frame each position of the clip shows.
 
         Returns:
             [steps + 1] int64, starting at 0, each entry equal to the one before (paused) or one more.
@@ -111,7 +111,7 @@ class SampleParams:
         return np.cumsum(advance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for the provenance; ``effects`` and ``log_eps`` only where there is something to say."""
+        """Return plain values for the provenance; ``effects`` and ``log_eps`` are left out if they are empty."""
         values = _fields(self)
         if not self.effects:
             del values["effects"]
@@ -122,22 +122,22 @@ class SampleParams:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a sample came from: enough to make it again and to explain it. Deterministic: no clock, no host.
+    """Origin of a sample: enough to make it again and to explain it. Deterministic: no clock, no host.
 
     Attributes:
         id: the sample's identity.
         video: catalogue id (relative POSIX path) of the source.
         fingerprint: size and hash of the source file.
         start_frame: first frame of the sequence, presentation order.
-        candidate: 0, or which substitute of the index this is.
-        refusals: of the candidates passed over before it, in their order.
+        candidate: number of the candidate of the index; 0 unless the sample is a substitute.
+        refusals: refusals of the candidates before it, in their order.
         params: the draw.
         saturated_bins: voxel bins whose count did not fit the dtype and were clipped.
         irregular_timestamps: steps whose time stamps were missing or not increasing (noise per second used the
             average rate there).
         decoder: codec name, and whether its decoding is bit-exact on every host.
         quarantine: number of the quarantine snapshot it was made under.
-        scene: what was decided by the statistics of its scene, and the figures behind it; empty with scene "off".
+        scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
     """
 
     id: SampleId
@@ -164,7 +164,7 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as they travel in the sample's header; ``scene`` only where there is something to say."""
+        """Return plain values, as they travel in the sample's header; ``scene`` is left out if it is empty."""
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
@@ -176,7 +176,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
-        """The provenance back from plain values.
+        """Build a provenance from plain values.
 
         Raises:
             ProtocolError: a field is missing or unknown.
@@ -201,15 +201,17 @@ class Provenance:
 
 
 def _fields(item: Any) -> dict[str, Any]:
-    """A dataclass's fields; ``dataclasses.asdict`` copies all that is in them, for a quarter of a millisecond here."""
+    """Return a dataclass's fields. ``dataclasses.asdict`` copies every value in them, which takes a quarter of a
+    millisecond.
+    """
     return {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
 
 
 def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> Layout:
-    """dtype and shape of each asked array of one sample, as :data:`ARRAYS` states them.
+    """Return dtype and shape of each requested array of one sample, as :data:`ARRAYS` states them.
 
     Raises:
-        UsageError: an array nobody makes, none at all, or one asked twice.
+        UsageError: an unknown array, an array requested twice, or an empty request.
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
@@ -220,18 +222,18 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
 
 
 def layout_bytes(layout: Layout) -> int:
-    """Bytes of one sample of that layout."""
+    """Return the bytes of one sample of that layout."""
     return sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
 
 
 def new_arrays(layout: Layout) -> dict[str, npt.NDArray[Any]]:
-    """Arrays for one sample of that layout, of unspecified content."""
+    """Allocate arrays for one sample of that layout, with unspecified content."""
     return {name: np.empty(shape, dtype) for name, (dtype, shape) in layout.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """What the arrays of a sample must be.
+    """Expected form of a sample's arrays.
 
     Attributes:
         names, dtypes, shapes: as a SampleHeader states them.
@@ -245,7 +247,7 @@ class Form:
 
     @classmethod
     def of(cls, layout: Layout) -> Form:
-        """The form of samples whose arrays have these dtypes and shapes (``array_layout``)."""
+        """Return the form of samples whose arrays have these dtypes and shapes (``array_layout``)."""
         return cls(
             names=tuple(layout),
             dtypes=tuple(dtype for dtype, _ in layout.values()),
@@ -260,7 +262,7 @@ class Sample:
 
     Attributes:
         arrays: by name, in the shapes of :func:`array_layout`.
-        provenance: where it came from.
+        provenance: origin of the sample.
     """
 
     arrays: Mapping[str, npt.NDArray[Any]]
@@ -271,14 +273,14 @@ class Sample:
         return f"Sample({shapes}, {self.provenance.video}@{self.provenance.start_frame})"
 
     def to_events(self, bin_us: float) -> EventList:
-        """Events (x, y, t, p) with the counts of the voxels, lead voxels included, for bins of ``bin_us`` microseconds.
-        Their times within a bin are invented, by the rule of :mod:`v2v_protocol.events`.
+        """Convert the voxels, lead voxels included, to events (x, y, t, p) for bins of ``bin_us`` microseconds. Their
+        times within a bin are invented, by the rule of :mod:`v2v_protocol.events`.
 
         Raises:
-            UsageError: the sample has no voxels, or a duration out of range.
+            UsageError: the sample has no voxels, or the duration is out of range.
         """
         if "voxels" not in self.arrays:
-            raise UsageError("events are made of voxels: ask for that array")
+            raise UsageError("the sample has no voxels, which events are made from: request that array")
         return to_events(self.arrays["voxels"], bin_us)
 
     def _repr_html_(self) -> str:

@@ -1,9 +1,9 @@
-"""A setting, stated once.
+"""Declare a setting once.
 
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
 
-is a field of a frozen dataclass. From this line follow its check, its command-line flag
-(:mod:`v2v_protocol.command`), its key in a YAML file or a message, and its line in ``docs/reference/keys.md``.
+is a field of a frozen dataclass. Its check, its command-line flag (:mod:`v2v_protocol.command`), its key in a YAML file
+or a message, and its line in ``docs/reference/keys.md`` are derived from this line.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ _LONGEST_SHOWN = 200
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What is known of one field.
+    """Declaration of one field.
 
     Attributes:
         kind: "range" is a pair (lowest, highest) of a uniform draw; one number stands for both ends. "bounds" is a pair
             of whole numbers, written LEAST:MOST; one number stands for both.
-        default: of the field.
+        default: default value of the field.
         help: one line for people, without a full stop.
-        low, high: limits of a number, both allowed.
-        off: 0 stands for "off", although ``low`` is above it; a range may not begin at 0 and end above it.
-        words: the choices of a word; a registry stays itself, so that what is added to it counts.
-        unit: of a number, as in "px" or "Hz".
-        group: heading under which help and the reference page show it.
-        metavar: what stands for the value in help.
-        bare: what a flag without a value stands for; None: it must have one.
-        is_hidden: a program's own business: no line in help or on the reference page.
+        low, high: limits of a number, inclusive.
+        off: 0 means "off", although ``low`` is above it; a range may not begin at 0 and end above it.
+        words: the choices of a word; a registry is kept by reference, so later additions count.
+        unit: unit of a number, such as "px" or "Hz".
+        group: heading in help and on the reference page.
+        metavar: placeholder for the value in help.
+        bare: value of a flag that is given without one; None: a value is required.
+        is_hidden: internal to a program: left out of help and the reference page.
     """
 
     kind: Literal["whole", "bounds", "number", "range", "switch", "word", "text"]
@@ -58,7 +58,7 @@ class Setting:
 
     @property
     def expected(self) -> str:
-        """What to do, for a message: "give a whole number from 1 to 1024"."""
+        """Instruction for an error message: "give a whole number from 1 to 1024"."""
         if self.kind == "word":
             return f"choose one of {', '.join(self.words)}"
         plain = {
@@ -73,15 +73,15 @@ class Setting:
 
     @property
     def single(self) -> Setting:
-        """Of a range: one number drawn from it."""
+        """For a range: the setting of one number drawn from it."""
         return dataclasses.replace(self, kind="number")
 
     def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:
-        """``value`` in the field's own type: a float for a number, two for a range.
+        """Return ``value`` in the field's own type: a float for a number, two for a range.
 
         Args:
-            name: what the message calls it.
-            error: the kind of error to raise.
+            name: name of the field in the message.
+            error: class of the error to raise.
 
         Raises:
             UsageError: it has another type or is outside the limits.
@@ -94,7 +94,7 @@ class Setting:
         return checked
 
     def _converted(self, value: object) -> Any:
-        """None where it is not what was expected."""
+        """Convert a value; None if it has another type or is outside the limits."""
         if self.kind == "switch":
             return value if isinstance(value, bool) else None
         if self.kind == "text":
@@ -140,49 +140,49 @@ class Setting:
         return (self.low <= number <= self.high and math.isfinite(number)) or (self.off and number == 0)
 
     def _hint(self, value: object) -> str:
-        # scene: off, say, of which the message would show nothing that was written.
+        # For instance scene: off; the message would not show what the user wrote.
         if self.kind in ("word", "text") and isinstance(value, bool):
             return " (YAML reads off, on, no and yes as truth values: put it in quotes)"
         return ""
 
 
 def whole(default: int, low: int, high: int, help: str, **more: Any) -> Any:
-    """A field for a whole number. ``more``: other attributes of :class:`Setting`, here and below."""
+    """Return a field for a whole number. ``more``: other attributes of :class:`Setting`, here and below."""
     return _field(Setting("whole", default, help, low, high, **more))
 
 
 def bounds(default: tuple[int, int], low: int, high: int, help: str, **more: Any) -> Any:
-    """A field for two whole numbers, least and most, or one that is both."""
+    """Return a field for two whole numbers, least and most, or one number for both."""
     return _field(Setting("bounds", default, help, low, high, **more))
 
 
 def number(default: float, low: float, high: float, help: str, **more: Any) -> Any:
-    """A field for a finite number."""
+    """Return a field for a finite number."""
     return _field(Setting("number", default, help, low, high, **more))
 
 
 def span(default: tuple[float, float], low: float, high: float, help: str, **more: Any) -> Any:
-    """A field for the range of a draw."""
+    """Return a field for the range of a draw."""
     return _field(Setting("range", default, help, low, high, **more))
 
 
 def switch(default: bool, help: str, **more: Any) -> Any:
-    """A field that is true or false."""
+    """Return a field that is true or false."""
     return _field(Setting("switch", default, help, **more))
 
 
 def word(default: str, choices: Any, help: str, **more: Any) -> Any:
-    """A field for one of some words; ``choices`` is a ``Literal``, or the words."""
+    """Return a field for one of some words; ``choices`` is a ``Literal``, or the words."""
     return _field(Setting("word", default, help, words=typing.get_args(choices) or choices, **more))
 
 
 def text(default: str, help: str, **more: Any) -> Any:
-    """A field for any text."""
+    """Return a field for any text."""
     return _field(Setting("text", default, help, **more))
 
 
 def of_type(hint: Any) -> Setting | None:
-    """What a type alone says of a field: a Literal, bool, int, float or str; None for any other."""
+    """Return the setting that a type alone implies: for a Literal, bool, int, float or str; None for any other."""
     if typing.get_origin(hint) is Literal:
         return Setting("word", None, "", words=typing.get_args(hint))
     kinds: dict[Any, Any] = {bool: "switch", int: "whole", float: "number", str: "text"}
@@ -195,7 +195,7 @@ def _field(setting: Setting) -> Any:
 
 @cache
 def settings_of(cls: Any) -> Mapping[str, Setting]:
-    """The settings of a dataclass, by name, in their order. A group goes on until a field names the next."""
+    """Return the settings of a dataclass, by name, in their order. A group continues until a field names the next."""
     found: dict[str, Setting] = {}
     group = ""
     for item in dataclasses.fields(cls):
@@ -207,11 +207,11 @@ def settings_of(cls: Any) -> Mapping[str, Setting]:
 
 
 def check_settings(item: Any, name: Callable[[str], str], error: type[UsageError] = UsageError) -> None:
-    """Check and converts all settings of a dataclass, in its ``__post_init__``, frozen or not.
+    """Check and convert all settings of a dataclass, in its ``__post_init__``, frozen or not.
 
     Args:
-        name: what messages call a field.
-        error: the kind of error to raise.
+        name: returns the name of a field for messages.
+        error: class of the error to raise.
 
     Raises:
         UsageError: see :meth:`Setting.check`.
@@ -223,7 +223,8 @@ def check_settings(item: Any, name: Callable[[str], str], error: type[UsageError
 def require_known(
     keys: Iterable[object], known: Iterable[str], what: str, error: type[UsageError] = UsageError
 ) -> None:
-    """
+    """Check that all keys are known.
+
     Raises:
         UsageError: a key is unknown; the message names the nearest known one, and all of them.
     """
@@ -234,10 +235,10 @@ def require_known(
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> int:
-    """``value``, which must be a whole number.
+    """Return ``value`` if it is a whole number within the limits.
 
     Raises:
-        UsageError: it is none, or outside the limits; the message calls it ``name``.
+        UsageError: it is not; the message uses ``name``.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise UsageError(f"{name} = {format_value(value)}: give a whole number from {low} to {high}")
@@ -245,13 +246,13 @@ def require_whole(name: str, value: object, low: int, high: int) -> int:
 
 
 def nearest(key: object, known: Iterable[str]) -> str:
-    """ " (did you mean 'bins'?)", or nothing where no known key is like it."""
+    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar."""
     close = difflib.get_close_matches(str(key), list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def format_value(value: object) -> str:
-    """A value for a message: as it is written, but no page of it."""
+    """Format a value for a message, shortened."""
     as_text = repr(list(value) if isinstance(value, tuple) else value)
     return as_text if len(as_text) <= _LONGEST_SHOWN else as_text[:_LONGEST_SHOWN] + " ..."
 

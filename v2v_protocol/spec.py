@@ -1,4 +1,4 @@
-"""The stream specification: everything a consumer may ask for that changes the bytes of its samples."""
+"""The stream specification: everything a consumer may request that changes the bytes of its samples."""
 
 from __future__ import annotations
 
@@ -30,17 +30,16 @@ MOST_SAMPLES_PER_DECODE = 32
 
 @dataclass(frozen=True, slots=True)
 class StreamSpec:
-    """What a stream is made of, apart from the videos and the seed.
+    """Definition of a stream, apart from the videos and the seed.
 
-    Two streams of equal digest over equal catalogues, seeds and numerics versions are equal byte for byte. What does
-    not change a draw (asked arrays, batch size, compression) is deliberately not here.
+    Two streams of equal digest over equal catalogues, seeds and numerics versions are equal byte for byte. Settings
+    that do not change a draw (requested arrays, batch size, compression) are deliberately not here.
 
     Attributes:
         recipe: the virtual cameras and views to draw from.
 
-    The K samples of one decode (``samples_per_decode``) are no more alike in their cameras than any others, but they
-    show the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart
-    (``v2v_server.schedule.epoch``).
+    The K samples of one decode (``samples_per_decode``) have independent cameras like any other samples, but they show
+    the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart (``v2v_server.schedule.epoch``).
 
     Raises:
         UsageError: a value outside its choices or limits.
@@ -53,40 +52,42 @@ class StreamSpec:
         "float32 is exact up to 2**24 events a bin",
         group="Stream",
     )  # fmt: skip
-    shuffle: bool = switch(True, "another order in every epoch; false is the catalogue's order")
-    max_sequences_per_video: int = whole(10, 1, 1_000_000, "most sequences that one video contributes to an epoch")
+    shuffle: bool = switch(True, "use another random order in every epoch; false keeps the catalogue's order")
+    max_sequences_per_video: int = whole(10, 1, 1_000_000, "largest number of sequences from one video in an epoch")
     on_bad_video: OnBadVideo = word(
         "substitute", OnBadVideo,
-        "what becomes of a sample whose video fails: substitute makes it from the next candidate and says so in the "
-        "provenance; raise makes the consumer raise SampleUnavailable",
+        "if the video of a sample fails: substitute makes the sample from the next candidate and notes it in the "
+        "provenance; raise raises SampleUnavailable in the consumer",
     )  # fmt: skip
     samples_per_decode: int = whole(
         1, 1, MOST_SAMPLES_PER_DECODE,
-        "K, samples made from each decoded clip, each with a camera, crop, flip and pauses of its own",
+        "K, number of samples from each decoded clip, each with its own camera, crop, flip and pauses",
     )  # fmt: skip
     sibling_spacing: int = whole(
         0,
         0,
         2**40,
-        "how far apart in the epoch those K samples are; 0: a batch of the consumer, so that none holds two",
+        "distance of these K samples in the epoch; 0: one batch of the consumer, so no batch holds two",
     )
     flow_method: FlowMethod = word(
         "auto", FlowMethod,
-        "how flow is estimated where it is asked for; auto chooses for each step by how much moves",
+        "method that estimates flow, if flow is requested; auto chooses for each step by the amount of motion",
         group="Flow",
     )  # fmt: skip
     flow_direction: FlowDirection = word(
-        "forward", FlowDirection, "on the grid of a step's earlier frame (forward) or of its later one (backward)"
+        "forward", FlowDirection, "flow on the pixel grid of a step's earlier frame (forward) or later frame (backward)"
     )
-    flow_from: int = whole(0, 0, 1_000_000, "flow of the voxels before this one is not computed but zero")
+    flow_from: int = whole(
+        0, 0, 1_000_000, "index of the first voxel with computed flow; flow of earlier voxels is zero"
+    )
     flow_margin_px: int = whole(
-        64, -1, LARGEST_SIDE_PX, "flow is estimated on the crop and this much of the picture around it; -1: on all",
+        64, -1, LARGEST_SIDE_PX, "margin around the crop in which flow is also estimated; -1: the whole picture",
         unit="px",
     )  # fmt: skip
     scene: SceneChoice = word(
         "off", SceneChoice,
-        "auto decodes all videos once, leaves out sequences with a cut or with nothing to see, and spares flow where "
-        "nothing moves (if flow_method is auto)",
+        "auto decodes all videos once, leaves out sequences with a shot boundary or with nothing to see, and skips "
+        "flow where nothing moves (if flow_method is auto)",
         group="Scene",
     )  # fmt: skip
 
@@ -99,12 +100,12 @@ class StreamSpec:
             )
         if self.samples_per_decode == 1 and self.sibling_spacing:
             raise UsageError(
-                f"spec sibling_spacing = {self.sibling_spacing} says how far apart the samples of one decode are, and "
-                "samples_per_decode is 1: leave it 0, or ask for more samples_per_decode"
+                f"spec sibling_spacing = {self.sibling_spacing} applies only to samples_per_decode above 1, which is "
+                "1: set sibling_spacing = 0, or raise samples_per_decode"
             )
 
     def spaced(self, stride: int) -> StreamSpec:
-        """This spec with its ``sibling_spacing`` settled.
+        """Return this spec with its ``sibling_spacing`` set.
 
         Args:
             stride: samples from the beginning of one batch of the consumer to that of its next.
@@ -114,19 +115,19 @@ class StreamSpec:
         return dataclasses.replace(self, sibling_spacing=stride)
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values."""
+        """Return all fields as plain values."""
         plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return plain | {"recipe": self.recipe.to_dict()}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], default: StreamSpec | None = None) -> StreamSpec:
-        """A spec from what somebody asked for.
+        """Build a spec from requested values.
 
         Args:
             values: fields by name; ``recipe`` is a preset's name or a mapping of recipe fields (see
                 :meth:`Recipe.from_dict`); a missing or None field takes the value of ``default``. ``preset`` names one
                 of :data:`SPEED_PRESETS`, which the other fields may change.
-            default: the server's own spec; the paper's when None.
+            default: the server's own spec; the paper's if None.
 
         Raises:
             RecipeError, UsageError: an unknown key or a bad value.
@@ -143,7 +144,7 @@ class StreamSpec:
         return dataclasses.replace(base, **changes)
 
     def canonical(self) -> bytes:
-        """The one encoding of this spec that its digest is taken of: JSON, keys sorted, no spaces."""
+        """Return the canonical encoding that the digest is computed from: JSON, keys sorted, no spaces."""
         return _canonical(self)
 
     @property
@@ -153,8 +154,9 @@ class StreamSpec:
 
 
 class SpecOptions(TypedDict, total=False):
-    """What a consumer may ask for besides its recipe, as keyword arguments, for editors and type checkers; None takes
-    the server's value. A test holds it to the fields of :class:`StreamSpec`, which say what each is."""
+    """What a consumer may request besides its recipe, as keyword arguments, for editors and type checkers; None takes
+    the server's value. A test keeps it equal to the fields of :class:`StreamSpec`, which explain each one.
+    """
 
     preset: SpeedPreset | None
     voxel_dtype: VoxelDtype | None
@@ -174,7 +176,7 @@ SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))
 """What :meth:`StreamSpec.from_dict` takes."""
 
 
-# Asked for with every lease, and a spec never changes.
+# Cached: every lease uses it, and a spec never changes.
 @lru_cache(maxsize=64)
 def _canonical(spec: StreamSpec) -> bytes:
     return json.dumps(spec.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
@@ -190,14 +192,14 @@ SPEED_PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {"samples_per_decode": 2},
     "fast": {"samples_per_decode": 4},
 }
-"""What speed is bought with: the fields of the spec that each preset sets. `docs/accuracy.md` says why these."""
+"""Spec fields that each speed preset sets, trading accuracy for speed. `docs/accuracy.md` gives the reasons."""
 
 
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
-    """``base`` with the settings of a speed preset.
+    """Return ``base`` with the settings of a speed preset.
 
     Raises:
-        UsageError: no such preset.
+        UsageError: there is no such preset.
     """
     if not isinstance(name, str) or name not in SPEED_PRESETS:
         near, known = nearest(name, SPEED_PRESETS), ", ".join(SPEED_PRESETS)

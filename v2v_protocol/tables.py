@@ -1,4 +1,4 @@
-"""Tables for notebooks: plain HTML, in which nothing that is shown can be markup."""
+"""Format tables for notebooks as plain HTML without markup from the values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 
 
 def html_table(title: str, rows: Mapping[str, Any]) -> str:
-    """A heading and one line for each row. Names and values are escaped: file names come from strangers."""
+    """Return a heading and one line for each row. Names and values are escaped: file names come from untrusted
+    sources.
+    """
     lines = "".join(
         f'<tr><th style="text-align:left">{html.escape(str(name))}</th>'
         f'<td style="text-align:left">{html.escape(str(value))}</td></tr>'

@@ -1,11 +1,11 @@
-"""Messages <-> frames of a ZeroMQ multipart message.
+"""Encode messages to the frames of a ZeroMQ multipart message, and decode them.
 
 Frame 0 is a msgpack map: ``{"v": protocol version, "t": type name, ...fields}``. A SampleHeader is followed by one raw
-frame per array; a Result by the frames of a whole SampleHeader message, which a broker passes on as they are.
+frame per array; a Result by the frames of a whole SampleHeader message, which a broker passes on unchanged.
 
-Everything that comes off a wire is hostile until it is decoded: sizes are limited before anything is allocated, types
-are checked field by field, dtypes come from an allow-list, nothing is ever unpickled. Whatever bytes arrive,
-:func:`decode` either returns a message or raises a :class:`v2v_protocol.errors.ProtocolError`.
+All received data is treated as hostile: sizes are limited before anything is allocated, types are checked field by
+field, dtypes come from an allow-list, and nothing is ever unpickled. For any bytes, :func:`decode` either returns a
+message or raises a :class:`v2v_protocol.errors.ProtocolError`.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from v2v_protocol.messages import (
 LARGEST_HEADER_BYTES = 1 << 20
 """Frame 0. The largest in use is a Lease: a frame index of a few thousand frames is a few kilobytes."""
 LARGEST_REQUEST_BYTES = 1 << 16
-"""What a consumer says. The largest in use is a Want of all its credit, with the name of an arena for each index."""
+"""A consumer's message. The largest in use is a Want of all its credit, with the name of an arena for each index."""
 MOST_CONTAINERS = 4096
-"""Lists and maps of a header. They cost a hundred times their bytes; the most in use, in a Lease, are some dozens."""
+"""Lists and maps in a header. They cost a hundred times their bytes; a Lease, the largest in use, has some dozens."""
 LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
-"""CURVE adds 33 to a frame."""
+"""Bytes added to a frame by encryption; CURVE adds 33."""
 _MOST_ARRAYS = 8
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
@@ -86,10 +86,10 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
 def encode(message: Message) -> Frames:
-    """The header frame of a message, alone in a list so that payload frames can be appended.
+    """Encode a message's header frame, alone in a list so that payload frames can be appended.
 
     Raises:
-        LimitExceeded: the header is larger than any peer would accept.
+        LimitExceeded: the header is larger than any peer accepts.
     """
     cls = type(message)
     fields: dict[str, Any] = {"v": PROTOCOL_VERSION, "t": _NAMES[cls]}
@@ -116,16 +116,17 @@ def encode_sample(
     quarantine: int = 0,
     pack: Callable[[Buffer], bytes] | None = None,
 ) -> Frames:
-    """A whole SampleHeader message. The arrays are not copied (but by ``pack``): leave them alone until they are sent.
+    """Encode a whole SampleHeader message. The arrays are not copied (except by ``pack``): do not change them until
+    they are sent.
 
     Args:
         slot: the slot that the lease named.
-        in_slot: the arrays lie there, so the header goes alone.
-        pack: compresses an array's bytes into a zstd frame that states its size; None sends them as they are.
+        in_slot: the arrays lie there, so only the header is sent.
+        pack: compresses an array's bytes to a zstd frame that states its size; None sends them uncompressed.
         epoch, index, arrays, provenance, worker, cpu_seconds, decoded, cache, quarantine: see :class:`SampleHeader`.
 
     Raises:
-        LimitExceeded: an array dtype that is not on the allow-list, or an array that is not C-contiguous.
+        LimitExceeded: an array dtype is not on the allow-list, or an array is not C-contiguous.
     """
     shapes: list[int] = []
     for name, array in arrays.items():
@@ -154,32 +155,32 @@ def encode_sample(
 
 
 def encode_map(fields: Mapping[str, Any]) -> bytes:
-    """Plain values, as a field of a message that not everybody opens who passes it on."""
+    """Encode plain values as a field of a message that is passed on without decoding it."""
     packed: bytes = msgpack.packb(fields, use_bin_type=True)
     return packed
 
 
 def decode_map(packed: bytes) -> dict[str, Any]:
-    """What :func:`encode_map` was given.
+    """Decode the result of :func:`encode_map`.
 
     Raises:
         LimitExceeded: it is nested too deeply.
-        ProtocolError: it is nothing of the kind.
+        ProtocolError: it is not a map.
     """
     return _mapping(_unpacked(packed, "a map"))
 
 
 def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
-    """The message in a header frame.
+    """Decode the message in a header frame.
 
     Args:
         header: the frame.
-        most_bytes: limit for it.
+        most_bytes: size limit of the frame.
 
     Raises:
         VersionMismatch: the peer speaks another version.
         LimitExceeded: the frame, or a list in it, is too large, or nested too deeply.
-        ProtocolError: anything else that is not a message of ours.
+        ProtocolError: any other malformed message.
     """
     if len(header) > most_bytes:
         raise LimitExceeded(f"a header of {len(header)} bytes; the limit is {most_bytes}")
@@ -209,14 +210,15 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
 
 
 def largest_packed_bytes(size: int) -> int:
-    """Most that an array of so many bytes takes compressed: noise grows by a 256th and a little."""
+    """Return the largest compressed size of an array of this many bytes: noise grows by a 256th and a little."""
     return size + size // 256 + 64
 
 
 def largest_frame_bytes(sizes: Iterable[int]) -> int:
-    """Most that ZeroMQ counts for a frame of a sample with arrays of these sizes, compressed and encrypted or not.
+    """Return the largest size that ZeroMQ counts for a frame of a sample with arrays of these sizes, compressed and
+    encrypted or not.
 
-    What is larger cuts its sender off (MAXMSGSIZE), so a byte too few here is a stream that never begins.
+    A larger frame disconnects its sender (MAXMSGSIZE), so a limit one byte too small would break every stream.
     """
     return max(LARGEST_HEADER_BYTES, *(largest_packed_bytes(size) + _ENCRYPTION_BYTES for size in sizes))
 
@@ -224,12 +226,12 @@ def largest_frame_bytes(sizes: Iterable[int]) -> int:
 def decode_sample(
     header: SampleHeader, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
-    """The arrays behind a SampleHeader, as read-only views of the payload (no copy).
+    """Return the arrays behind a SampleHeader, as read-only views of the payload (no copy).
 
     Args:
         header, payload: of the sample.
-        unpack: of a packed array's frame and its number of bytes makes these bytes; it raises ProtocolError where the
-            frame holds anything else. None: packed samples are refused.
+        unpack: takes a packed array's frame and its number of bytes, and returns these bytes; it raises ProtocolError
+            for any other content. None: packed samples are refused.
 
     Raises:
         ProtocolError, LimitExceeded: names, dtypes, shapes and frame lengths do not agree, or break a limit.
@@ -239,7 +241,7 @@ def decode_sample(
             f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
         )
     if header.packed and unpack is None:
-        raise ProtocolError("sample: its arrays are compressed, which was not asked for")
+        raise ProtocolError("sample: its arrays are compressed, but compression was not requested")
     arrays: dict[str, npt.NDArray[Any]] = {}
     for (name, (dtype, shape)), raw in zip(layout_of(header).items(), payload, strict=True):
         size = math.prod(shape) * np.dtype(dtype).itemsize
@@ -254,7 +256,7 @@ def decode_sample(
 
 
 def layout_of(header: SampleHeader) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """dtype and shape of each array of a sample, as its header says.
+    """Return dtype and shape of each array of a sample, as its header states them.
 
     Raises:
         ProtocolError, LimitExceeded: names, dtypes and shapes do not agree, or break a limit.
@@ -303,13 +305,13 @@ def _unpacked(packed: Buffer, what: str) -> Any:
 
 
 # --- field checks -----------------------------------------------------------------------------------------------------
-# A server decodes two headers a sample: what a check would only need for an error is made up when there is one.
+# A server decodes two headers per sample, so texts for errors are built only when there is one.
 
 Check: TypeAlias = Callable[[Any], Any]
 
 
 def _shown(value: Any) -> str:
-    """A value for an error message. Of containers, whose nesting nobody has looked at yet, only what they are."""
+    """Format a value for an error message. Containers, whose nesting is not checked yet, show only their type."""
     return f"{value!r:.40}" if type(value) in (int, float, bool, str, bytes) else f"of {type(value).__name__}"
 
 

@@ -1,4 +1,4 @@
-"""`python -m v2v_server` is `v2v-serve`, also where its packages are not installed: it says so in a line."""
+"""Run `v2v-serve` as `python -m v2v_server`. If its packages are not installed, it says so in one line."""
 
 import sys
 

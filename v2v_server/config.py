@@ -1,5 +1,6 @@
-"""What `v2v-serve` can be told, as one frozen, validated dataclass: from a YAML file, from flags, or from both (a flag
-wins). Every message names the flag."""
+"""Settings of `v2v-serve`, as one frozen, validated dataclass: from a YAML file, from flags, or from both (a flag
+wins). Every message names the flag.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ class ServeConfig:
     """Settings of one server. Flags are these names with dashes; keys of a YAML file are these names with either.
 
     Attributes:
-        spec: the default for consumers that ask for nothing else. Its fields are flags and keys beside the others.
+        spec: the default for consumers that request nothing else. Its fields are flags and keys like the others.
 
     Raises:
         UsageError: an unknown key, a value of the wrong kind or outside its limits.
@@ -40,73 +41,81 @@ class ServeConfig:
     )
     list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
-    cache_dir: str = text("", "folder of the catalogue index; without it the user's cache", metavar="DIR")
+    cache_dir: str = text("", "folder of the catalogue index (default: the user's cache folder)", metavar="DIR")
     cache: str = text(
         "",
-        "folder that keeps what was decoded, for later epochs to read; servers may share it",
+        "folder that caches decoded frames for later epochs; servers may share it",
         metavar="DIR",
     )
-    cache_gib: float = number(100.0, 0.0, 1e6, "at most so much lies in --cache", unit="GiB", metavar="N")
+    cache_gib: float = number(100.0, 0.0, 1e6, "size limit of --cache", unit="GiB", metavar="N")
     copies: str = text(
-        "", "folder that videos are fetched to from object storage; without it one in the user's cache", metavar="DIR"
+        "", "folder for videos fetched from object storage (default: in the user's cache folder)", metavar="DIR"
     )
     copies_gib: float = number(
-        100.0, 0.001, 1e6, "at most so much lies in --copies; what was not read for longest goes", unit="GiB",
+        100.0, 0.001, 1e6, "size limit of --copies; the least recently read files are deleted first", unit="GiB",
         metavar="N",
     )  # fmt: skip
-    list_refused: bool = switch(False, "name every video that cannot be used at the start, not only the first five")
+    list_refused: bool = switch(False, "at the start, list every unusable video instead of the first five")
     workers: tuple[int, int] = bounds(
         (2, 2), 0, MOST_WORKERS,
-        "worker processes that the server starts, and starts again when they die; with LEAST:MOST as many as keep "
-        "consumers from waiting",
+        "number of worker processes that the server starts, and restarts if they die; with LEAST:MOST the server "
+        "adjusts the number so that consumers do not wait",
         group="Workers",
     )  # fmt: skip
     scale_seconds: float = number(
         60.0, 0.1, 1e6,
-        "with LEAST:MOST workers leave when many were idle for so long; more come when consumers waited for a sixth",
+        "with LEAST:MOST: time after which idle workers are stopped; workers are added after consumers waited for a "
+        "sixth of it",
         unit="s", metavar="S",
     )  # fmt: skip
     engine: str = word(
-        "local", ("local", "ray"), "who places them: local is this host, ray a Ray cluster that this host is a node of"
+        "local",
+        ("local", "ray"),
+        "where workers run: local is this host, ray is a Ray cluster that this host belongs to",
     )
-    ray_address: str = text("auto", "the cluster; auto: the one of this host", metavar="HOST:PORT")
+    ray_address: str = text("auto", "address of the Ray cluster; auto: the cluster of this host", metavar="HOST:PORT")
     ray_label: str = text(
-        "", "workers go only to nodes with this label: those that have the videos", metavar="KEY=VALUE"
+        "", "start workers only on Ray nodes with this label: those that have the videos", metavar="KEY=VALUE"
     )
     expect_workers: int = whole(
         0, 0, MOST_WORKERS,
-        "workers that will serve in all, other hosts' too; a consumer's credit is settled for them when it connects, "
-        "up to 400 samples and --max-credit-bytes. 0: the local ones, or those there are",
+        "total number of workers expected, including other hosts; sets how many samples each consumer may request "
+        "ahead, up to 400 and --max-credit-bytes. 0: the local workers, or those connected",
     )  # fmt: skip
     lease_deadline_seconds: float = number(
-        60.0, 0.001, 1e6, "a worker silent for longer over one sample is taken for hung", unit="s", metavar="S"
+        60.0, 0.001, 1e6, "a worker that is silent over one sample for longer is treated as hung", unit="s", metavar="S"
     )
     bind: str = text(
-        DEFAULT_BIND, "address for consumers; port * is a free one", metavar="ADDRESS", group="Addresses and consumers"
+        DEFAULT_BIND,
+        "address for consumers; port * chooses a free port",
+        metavar="ADDRESS",
+        group="Addresses and consumers",
     )
-    worker_bind: str = text("", "address for workers; without it one that is private to this host", metavar="ADDRESS")
+    worker_bind: str = text("", "address for workers (default: an address private to this host)", metavar="ADDRESS")
     keys: str = text(
-        "", "folder that v2v-keys init made: every tcp address takes its keys only, and all is encrypted", metavar="DIR"
+        "",
+        "folder that v2v-keys init made: tcp addresses then accept only its keys, and all traffic is encrypted",
+        metavar="DIR",
     )
     insecure: bool = switch(
-        False, "allow addresses that other machines can reach, although nothing is encrypted or authenticated"
+        False, "allow addresses that other machines can reach, without encryption or authentication"
     )
-    port_file: str = text("", "receives the bound address once the server is ready", metavar="FILE")
+    port_file: str = text("", "file that the bound address is written to once the server is ready", metavar="FILE")
     session_idle_seconds: float = number(
-        600.0, 0.001, 1e6, "a consumer silent for longer is forgotten; it can come back", unit="s", metavar="S"
+        600.0, 0.001, 1e6, "a consumer that is silent for longer is forgotten; it can reconnect", unit="s", metavar="S"
     )
-    max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "bound on the bytes in flight to one consumer")
+    max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "largest number of bytes in flight to one consumer")
     page: int = whole(
-        0, 0, 65535, "port of a page to watch the service by, and of its metrics; without a PORT 5580, 0 is none",
+        0, 0, 65535, "port of the status page and its metrics; 5580 if no PORT is given, 0: no page",
         bare=5580, metavar="PORT", group="Watching",
     )  # fmt: skip
-    page_host: str = text("127.0.0.1", "address of this host that the page listens at", metavar="HOST")
+    page_host: str = text("127.0.0.1", "address of this host that the page listens on", metavar="HOST")
     page_names: str = text(
-        "", "names that the page may be asked by besides addresses and this host's own, with commas between",
+        "", "comma-separated host names that the page accepts, in addition to IP addresses and this host's name",
         metavar="NAMES",
     )  # fmt: skip
     log_format: str = word(
-        "text", LOG_FORMATS, "what is said on standard error: text for people, or json, an object a line"
+        "text", LOG_FORMATS, "format of standard error: text for people, or json, one object per line"
     )  # fmt: skip
     parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
     spec: StreamSpec = field(default_factory=StreamSpec)
@@ -120,9 +129,9 @@ class ServeConfig:
             _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
         if self.page and not self.insecure and not is_loopback(self.page_host):
             raise UsageError(
-                f"--page-host {self.page_host} can be reached from other machines, and the page asks nobody for a key: "
-                "let it listen at 127.0.0.1 and reach it by `ssh -L`, or type out --insecure if everyone on that "
-                "network may watch this service"
+                f"--page-host {self.page_host} can be reached from other machines, and the page requires no key: "
+                "listen on 127.0.0.1 and reach it by `ssh -L`, or give --insecure if everyone on that network may "
+                "watch this service"
             )
         if self.engine == "ray" and not self.worker_bind:
             raise UsageError(
@@ -133,43 +142,43 @@ class ServeConfig:
 
     @property
     def least_workers(self) -> int:
-        """Of the server's own."""
+        """Smallest number of the server's own workers."""
         return self.workers[0]
 
     @property
     def most_workers(self) -> int:
-        """Of the server's own."""
+        """Largest number of the server's own workers."""
         return self.workers[1]
 
     @property
     def workers_in_all(self) -> int:
-        """That may come to serve, other hosts' too, as far as is known."""
+        """Largest number of workers that may serve, including other hosts, as far as is known."""
         return max(self.most_workers, self.expect_workers)
 
     @property
     def ray_labels(self) -> dict[str, str]:
-        """What nodes for workers must be labelled with."""
+        """Labels that Ray nodes must have to run workers."""
         key, _, value = self.ray_label.partition("=")
         return {key: value} if key else {}
 
     @classmethod
     def load(cls, file: str | None, flags: Mapping[str, Any], settings: Sequence[str] = ()) -> ServeConfig:
-        """The configuration from an optional YAML file and the flags that were given (None: not given).
+        """Build the configuration from an optional YAML file and the given flags (None: not given).
 
         Args:
             file: the YAML file.
             flags: by the names of the attributes, and of the fields of the spec.
-            settings: of `--set`, to change single fields of the recipe.
+            settings: values of `--set`, which change single fields of the recipe.
 
         Raises:
             UsageError: the file cannot be read, it has a key twice, or see the class.
         """
         values: dict[str, Any] = {}
         for key, value in ({} if file is None else read_yaml_mapping("--config", file)).items():
-            # Who copies a flag writes it as the flag is written.
+            # Users who copy a flag write its name with dashes.
             name = key.replace("-", "_")
             if name in values:
-                raise UsageError(f"--config {file}: {name} is there twice, with dashes and with underscores; keep one")
+                raise UsageError(f"--config {file}: {name} appears twice, with dashes and with underscores; keep one")
             values[name] = value
         require_known(values, SERVE_KEYS, f"key in --config {file}:")
         values |= {name: value for name, value in flags.items() if value is not None}
@@ -180,19 +189,19 @@ class ServeConfig:
 
 
 SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)
-"""What a YAML file for ``v2v-serve --config`` may hold."""
+"""Keys of a YAML file for ``v2v-serve --config``."""
 
 
 def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Any:
-    """What `--recipe` and any number of `--set KEY=VALUE` ask for together.
+    """Combine `--recipe` and any number of `--set KEY=VALUE`.
 
     Args:
         recipe: a preset's name, a YAML file of recipe fields (it may name its ``preset``), or None.
         settings: "key=value" texts, values in YAML ("[0.2, 0.5]", "true", "3").
-        configured: what a configuration file says instead of ``recipe``: a preset's name or a mapping of fields.
+        configured: recipe of a configuration file, used without ``recipe``: a preset's name or a mapping of fields.
 
     Returns:
-        None when nothing was asked, else something ``StreamSpec.from_dict`` takes as ``recipe``.
+        None if nothing was given, otherwise a value that ``StreamSpec.from_dict`` accepts as ``recipe``.
 
     Raises:
         UsageError: the file cannot be read, or a setting is not "key=value".
@@ -217,7 +226,7 @@ def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any 
 
 
 def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
-    """The mapping in a YAML file.
+    """Read a YAML file that holds a mapping.
 
     Raises:
         UsageError: it cannot be read, has a key twice, or holds something else; the message names the flag.
@@ -249,7 +258,7 @@ def _check_address(flag: str, address: str, *, is_safe: bool) -> None:
         raise UsageError(f"{flag} {address!r}: write tcp://HOST:PORT with a port from 1 to 65535, or * for a free one")
     if not is_safe and not is_loopback(host[1:-1] if host[0] == "[" and host[-1] == "]" else host):
         raise UsageError(
-            f"{flag} {address} is reachable from other machines, and nothing is encrypted or authenticated: "
-            f"bind to 127.0.0.1, give --keys DIR (v2v-keys init makes it), or type out --insecure if everyone on that "
+            f"{flag} {address} is reachable from other machines, without encryption or authentication: "
+            f"bind to 127.0.0.1, give --keys DIR (v2v-keys init creates it), or give --insecure if everyone on that "
             "network may use this server"
         )

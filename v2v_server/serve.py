@@ -1,4 +1,4 @@
-"""One server from start to stop: catalogue, sockets, workers, the loop, and a clean end. One thread, one loop."""
+"""Run one server from start to stop: catalogue, sockets, workers, the loop, and a clean end. One thread, one loop."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
-from v2v_server.broker.worker_registry import REST_SECONDS
+from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
@@ -62,28 +62,30 @@ from v2v_server.video.rows import Rows
 _MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
-"""Of the loop without any message; also from one look at deadlines and deaths to the next."""
+"""Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
-"""What keeps everybody waiting for longer is said."""
+"""Time after which blocked leases are reported."""
+_RECORD_SECONDS = 2.0
+"""Longest time to retry writing a quarantine entry while another process writes to the file."""
 _GIVE_BACK_SECONDS = 12.0
-"""From the end of a connection until the memory that it took is handed back; its session is forgotten by then."""
+"""Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
 
 
 def question_workers(workers: int, cores: int) -> str:
-    """A line on more workers than can be of use; empty where there is nothing to say."""
+    """Return a warning if there are more workers than cores; empty otherwise."""
     if workers <= _MANY_WORKERS_A_CORE * cores:
         return ""
     return (
-        f"warning: --workers {workers} on {cores} cores: each keeps one core busy, and more than that only "
+        f"warning: --workers {workers} on {cores} cores: each uses one core, and more than {cores} only "
         f"cost memory; --workers {cores} makes as many samples"
     )
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
-    """The catalogue the configuration asks for, with its progress on stderr.
+    """Open the catalogue that the configuration asks for, with its progress on stderr.
 
     Raises:
-        CorpusError: nothing there, or nothing that can be used.
+        CorpusError: there are no videos, or no usable ones.
     """
     cores = usable_cores()
     with catalogue_progress(log=Log(is_json=config.log_format == "json")) as progress:
@@ -95,13 +97,13 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             copies=config.copies or None,
             copies_gib=config.copies_gib,
             scene=config.spec.scene != "off",
-            # A host whose workers are all elsewhere has its cores to itself.
+            # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),
             progress=progress,
             notice=progress.notice,
         )
     gc.collect()
-    give_back_freed_memory()  # of a million names, tens of megabytes that nobody needs again
+    give_back_freed_memory()  # opening a catalogue of a million names leaves tens of megabytes unused
     return catalogue
 
 
@@ -110,7 +112,7 @@ def serve(config: ServeConfig) -> None:
 
     Raises:
         CorpusError: the corpus gives no sequence.
-        UsageError: an address cannot be bound, the port file not written, or the engine not had.
+        UsageError: an address cannot be bound, the port file cannot be written, or the engine is not available.
         WorkerCrashLoop: the workers die without finishing anything.
     """
     keep_freed_memory()
@@ -139,7 +141,7 @@ def serve(config: ServeConfig) -> None:
         max_credit_bytes=config.max_credit_bytes,
         expected_workers=config.workers_in_all,
     )
-    # Workers of this host come in where no key is asked for.
+    # Workers of this host use an address that requires no key.
     worker_flags = ["--keys", ""] if config.engine == "local" else []
     worker_flags += ["--log-format", config.log_format]
     if config.cache:
@@ -179,18 +181,16 @@ def serve(config: ServeConfig) -> None:
 
 
 class Server:
-    """The loop: carries messages to the dispatcher, and its actions out.
+    """The loop: pass messages to the dispatcher, and carry out its actions.
 
     Args:
-        config: of the server.
-        catalogue: the corpus.
-        dispatcher: decides.
-        transport: has the consumers and the workers.
-        supervisor: has the workers' processes.
+        dispatcher: decides what to do.
+        transport: sockets of consumers and workers.
+        supervisor: runs the workers' processes.
         quarantine: the snapshots.
-        quarantine_file: where verdicts are written down.
-        clock: gives the time, seconds.
-        page: to watch the service by.
+        quarantine_file: file that new entries are written to.
+        clock: returns the time, seconds; None: a :class:`v2v_server.system.clock.Clock`.
+        page: the status page; None: no page.
     """
 
     def __init__(
@@ -227,9 +227,10 @@ class Server:
         self._missing_told = -math.inf
         self._blocked_due: float | None = None
         self._give_back_at = math.inf
+        self._unrecorded: list[tuple[AddToQuarantine, float]] = []  # until when each is tried
 
     def turn(self, longest_wait_seconds: float) -> None:
-        """Take what has come, and does what is due. Waits for a message if none is there.
+        """Handle the available messages, waiting for one if there are none, and do what is due.
 
         Raises:
             WorkerCrashLoop: the workers die without finishing anything.
@@ -239,8 +240,8 @@ class Server:
         now = self._clock()
         for arrival in arrivals:
             match arrival:
-                case FromWorker(identity, frames):
-                    self._carry_out(self._dispatcher.from_worker(identity, frames, now))
+                case FromWorker(identity, frames, user):
+                    self._carry_out(self._dispatcher.from_worker(identity, frames, now, user))
                 case FromConsumer(identity, frames, user):
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now, user))
                 case ConsumerGone(identity):
@@ -250,12 +251,17 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for identity, stalled in self._supervisor.stalled(now).items():
-                self._dispatcher.worker_stalled(identity, stalled)
+            for name, stalled in self._supervisor.stalled(now).items():
+                self._dispatcher.worker_stalled(self._route(name), stalled)
+            unrecorded, self._unrecorded = self._unrecorded, []
+            for record, until in unrecorded:
+                self._carry_out(self._record(record, until))
             self._carry_out(self._dispatcher.tick(now))
             for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
-                self._say(f"worker {death.identity.decode()} {death.loss.text}; its work is given to others", "warning")
-                self._carry_out(self._dispatcher.worker_lost(death.identity, death.loss, now))
+                self._say(
+                    f"worker {death.identity.decode()} {death.loss.text}; its leases go to other workers", "warning"
+                )
+                self._carry_out(self._dispatcher.worker_lost(self._route(death.identity), death.loss, now))
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
@@ -267,7 +273,7 @@ class Server:
             self._show(now)
 
     def close(self) -> None:
-        """Tell the workers to stop, ends them, and ends all connections."""
+        """Stop and end the workers, and close all connections."""
         self._status.close()
         if self._announced:
             state = self._watch.state(self._clock())
@@ -282,11 +288,11 @@ class Server:
             self._page.stop()
         self._transport.close()
         if self._port_file is not None:
-            with contextlib.suppress(OSError):  # its folder is gone, say: nothing that a server could mend
+            with contextlib.suppress(OSError):  # for instance, its folder is gone; the server cannot repair that
                 self._port_file.unlink(missing_ok=True)
 
     def _carry_out(self, actions: list[Action]) -> None:
-        """Do what the dispatcher wants, in its order, and tells it what came of it."""
+        """Carry out the dispatcher's actions in order, and report the results to it."""
         dispatcher, now = self._dispatcher, self._clock
         todo = deque(actions)
         while todo:
@@ -295,7 +301,7 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
-                    if not self._transport.send(message) and not self._supervisor.watches(message.identity):
+                    if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case CutOff(identity):
                     self._transport.cut(identity)
@@ -303,7 +309,7 @@ class Server:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(dispatcher.quarantine_recorded(record, self._record(record), now())))
+                    todo.extendleft(reversed(self._record(record, now() + _RECORD_SECONDS)))
                 case CheckVideo() as missing:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
@@ -312,39 +318,56 @@ class Server:
                     todo.extend(self._watch.ask(show))
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
-        """End the process of a worker that hangs, if it is one of ours."""
-        loss = self._supervisor.give_up(hopeless.identity, hopeless.reason) or Loss(
+        """End the process of a hung worker, if it is one of ours."""
+        name = self._name(hopeless.identity)
+        loss = self._supervisor.give_up(name, hopeless.reason) or Loss(
             Cause.UNEXPLAINED, hopeless.reason, for_all=False
         )
-        name = hopeless.identity.decode(errors="replace")
-        self._say(f"worker {name} {hopeless.reason}: {loss.text}; its work is given to others", "warning")
+        text = f"worker {clean_name(name.decode())} {hopeless.reason}: {loss.text}; its leases go to other workers"
+        self._say(text, "warning")
         return loss
 
-    def _record(self, record: AddToQuarantine) -> list[QuarantineEntry]:
-        """Write a verdict down. A server that cannot write goes on: its operator is told what that costs.
+    def _name(self, identity: bytes) -> bytes:
+        """Return the name by which the supervisor knows a worker; empty if it has not said hello."""
+        return self._dispatcher.registry.name_of(identity).encode()
+
+    def _route(self, name: bytes) -> bytes:
+        """Return the routing id of a worker of the supervisor; empty if it has not said hello."""
+        return self._dispatcher.registry.named(name.decode()) or b""
+
+    def _record(self, record: AddToQuarantine, until: float) -> list[Action]:
+        """Write a quarantine entry. If that fails, the server continues and logs the consequence.
+
+        Args:
+            record: the entry.
+            until: time until which the next turns retry while another process writes.
 
         Returns:
-            the lines that the quarantine has more now.
+            what the dispatcher does about it; nothing while it is retried.
         """
-        entry = record.entry
+        entry, now = record.entry, self._clock()
+        written: list[QuarantineEntry] = []
         try:
-            written = write_entry(self._quarantine_file, entry, self._quarantine)
+            written = write_entry(self._quarantine_file, entry, self._quarantine, wait_seconds=0.0)
         except (OSError, CorpusError) as error:
+            if isinstance(error, BlockingIOError) and now < until:
+                self._unrecorded.append((record, until))
+                return []
             self._say(
-                f"{entry.path} from frame {entry.frame}: {entry.reason}; it is passed over this once and comes "
-                f"again, because the quarantine cannot be written: {error}",
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
+                f"be tried again, because the quarantine cannot be written: {error}",
                 "error",
                 record.request,
                 video=entry.path,
             )
-            return []
         for line in written:
             self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
-        return written
+        return self._dispatcher.quarantine_recorded(record, written, now)
 
     def _check_video(self, missing: CheckVideo) -> bool:
-        """Whether the video is here as it was catalogued. If so, the operator is told of the host that has it not,
-        once in a while: all workers of a host fail alike."""
+        """Check the file against the catalogue. If it matches, warn (rate-limited, since all workers of a host fail
+        alike) that the worker's host does not have it.
+        """
         try:
             self._catalogue.check(missing.video, missing.fingerprint)
         except VideoChanged:
@@ -355,13 +378,13 @@ class Server:
         now = time.monotonic()
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
-            name = missing.identity.decode(errors="replace")
+            name = clean_name(self._name(missing.identity).decode())
             is_local = not isinstance(self._catalogue.root, Copies)
             self._say(
                 f"worker {name} failed on {missing.video}, which "
-                f"{'is on this host as it was catalogued' if is_local else 'is not known to be gone or changed'}: "
-                f"{missing.reason}; others make the sample, and it gets no work for {REST_SECONDS:g} s. Look at "
-                "--videos on its host",
+                f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
+                f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
+                "Check --videos on its host",
                 "warning",
                 missing.request,
                 video=missing.video,
@@ -369,17 +392,17 @@ class Server:
         return True
 
     def _warn_if_blocked(self, now: float) -> None:
-        """Another server that writes holds the index for moments; what lasts is said, once."""
+        """Warn once if leases stay blocked. Another server that writes blocks the index only briefly."""
         if not self._dispatcher.blocked_reason:
             self._blocked_due = None
         elif self._blocked_due is None:
             self._blocked_due = now + _SOON_SECONDS
         elif now >= self._blocked_due:
             self._blocked_due = math.inf
-            self._say(f"no sample is begun: {self._dispatcher.blocked_reason}", "warning")
+            self._say(f"no samples are started: {self._dispatcher.blocked_reason}", "warning")
 
     def _scale(self, now: float) -> None:
-        """More workers, or fewer, where their number is not fixed and what is seen speaks for it."""
+        """Change the number of workers if it is not fixed and the load requires it."""
         if self._scaling is None:
             return
         seen = self._dispatcher
@@ -389,11 +412,11 @@ class Server:
             self._say(f"workers: {decision.workers} from now on, because {decision.reason}")
 
     def _show(self, now: float) -> None:
-        """Say once that the server is ready; after that keeps the status up to date."""
+        """Announce once that the server is ready; then update the status."""
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
             address, worker_address = self._transport.address, self._transport.worker_address
-            # A private address is of no use to workers elsewhere.
+            # Workers on other hosts cannot use a private address.
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
@@ -404,12 +427,12 @@ class Server:
             self._status.show(now, self._watch.state(now))
 
     def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
-        """A line for whoever runs the server.
+        """Write a log line.
 
         Args:
             text, level: the line.
-            sample: that it is about.
-            about: what else programs may want to know.
+            sample: the request that the line is about.
+            about: additional fields for programs.
         """
         self._status.interrupt()
         identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
@@ -419,25 +442,25 @@ class Server:
 
 
 def _turned_away(news: TurnedAway) -> str:
-    times = f"turned away, {AWAY_SECONDS:g} s at a time, until that ends; what is at work goes on"
+    times = f"rejected, for {AWAY_SECONDS:g} s at a time, until that ends; existing connections continue"
     if news.address:
         return (
-            f"{news.address} opens connections for {news.side}s and says nothing on them: new ones from there are "
+            f"{news.address} opens connections for {news.side}s and sends nothing: new ones from this address are "
             f"{times}"
         )
     return (
-        f"connections for {news.side}s are gone before they can be asked where they come from: hosts that have not "
-        f"spoken here within the hour are {times}"
+        f"connections for {news.side}s close before their addresses can be read: hosts that have sent no message "
+        f"within the hour are {times}"
     )
 
 
 def _private_address(label: str) -> str:
-    """Where local workers connect: a socket without a file, so that nothing is left even after a kill -9."""
+    """Return an address for local workers: a socket without a file, so that nothing is left even after a kill -9."""
     return f"ipc://@v2v-{label}-{secrets.token_hex(8)}" if sys.platform.startswith("linux") else "tcp://127.0.0.1:*"
 
 
 def _write_port_file(file: str, address: str) -> None:
-    """Write the address in one step: whoever sees the file sees all of it."""
+    """Write the address in one step, so that readers see the whole content or no file."""
     path = Path(file)
     partial = path.parent / f".{path.name}.{os.getpid()}"
     try:
@@ -451,7 +474,7 @@ def _write_port_file(file: str, address: str) -> None:
 
 @contextlib.contextmanager
 def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """The first SIGINT or SIGTERM asks for a clean stop; a second one of them does what it always did."""
+    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def on_signal(number: int, frame: object) -> None:

@@ -6,6 +6,7 @@
     headers    the largest and most expensive header that is allowed, as fast as possible
     hello      sends Hello ten times a second, requests as much as allowed, and never reads
     leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
+    thief      takes the ids that the status shows for routing ids, and sends Hello and Goodbye under each of them
     look       requests the state of the service without a pause, and never reads
     idle       opens connections, half of them in the middle of the handshake, and sends nothing
     flood      bytes that are not ZMTP, as fast as possible
@@ -25,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import os
 import signal
 import socket
@@ -41,9 +43,9 @@ import zmq
 
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import key_for, read_key
-from v2v_protocol.messages import Hello, See, Want
+from v2v_protocol.messages import Goodbye, Hello, See, Seen, Want
 from v2v_protocol.spec import SpecOptions
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
 
 PEERS = 8
 IDLE_EACH = 125
@@ -89,6 +91,22 @@ def leave(address: str, number: int) -> None:
     with _dealer(address, None) as peer:
         peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
         peer.poll(1000)
+
+
+def thief(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, number) as peer:
+        peer.send_multipart(encode(See()))
+        if not peer.poll(_REFUSAL_MS):
+            return
+        seen = decode(peer.recv_multipart()[0])
+    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Seen) else []
+    for each in shown:
+        for name in (each["id"].encode(), bytes.fromhex(each["id"])):
+            with _dealer(address, name) as peer:
+                peer.send_multipart(encode(Goodbye()))
+                peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
+                peer.poll(100)
 
 
 def look(address: str, number: int) -> None:
@@ -206,7 +224,7 @@ class Handshakes:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (parts, headers, hello, leave, look, idle, flood, trickle, slow)
+    each.__name__: each for each in (parts, headers, hello, leave, thief, look, idle, flood, trickle, slow)
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)
@@ -259,11 +277,19 @@ def _from_elsewhere(address: str) -> str:
 
 
 @contextmanager
-def _dealer(address: str, number: int | None) -> Iterator[zmq.Socket[bytes]]:
-    """Connect a DEALER under its own name (None: a new one) that receives at most one message and reads none."""
+def _dealer(address: str, number: int | bytes | None) -> Iterator[zmq.Socket[bytes]]:
+    """Connect a peer that takes one message at a time.
+
+    Args:
+        address: of the server.
+        number: of the peer, which makes its routing id; or that id; None takes a new one.
+    """
     peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
     try:
-        name = b"hostile-%d-%d" % (os.getpid(), number) if number is not None else b"leaver-" + os.urandom(8)
+        if isinstance(number, bytes):
+            name = number
+        else:
+            name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
         peer.setsockopt(zmq.ROUTING_ID, name)
         peer.setsockopt(zmq.LINGER, 0)
         peer.setsockopt(zmq.RCVHWM, 1)

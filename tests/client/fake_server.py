@@ -1,4 +1,4 @@
-"""A small honest server: the real wire format over a ROUTER socket, and faults on request.
+"""Run a small correct server: the real wire format over a ROUTER socket, with faults on request.
 
 The bytes of a sample are a function of (seed, epoch, index), see :func:`expected`. Credit is counted as a real server
 counts it: a request beyond it is refused whole.
@@ -31,7 +31,7 @@ _PARAMS = SampleParams(0.2, 0.3, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 
 
 
 def expected(name: str, seed: int, epoch: int, index: int, spec: StreamSpec = SPEC) -> np.ndarray[Any, Any]:
-    """The array of that name of one sample."""
+    """Return the array of that name of one sample."""
     dtype, shape = array_layout(spec.recipe, spec.voxel_dtype, (name,))[name]
     random_bytes = np.random.default_rng([seed, epoch, index, len(name)])
     return random_bytes.integers(0, 100, shape).astype(dtype)
@@ -46,7 +46,7 @@ class _Session:
 
 
 class FakeServer:
-    """Serves in a thread from ``with`` on.
+    """Serve in a thread inside a ``with`` block.
 
     Attributes (set them before use or under :meth:`call`; the thread reads them):
         catalogue, sequences, credit: what Welcome says.
@@ -131,14 +131,14 @@ class FakeServer:
         self._context.term()
 
     def call(self, command: Callable[[], Any]) -> Any:
-        """Runs ``command`` in the server's thread, between two messages."""
+        """Run ``command`` in the server's thread, between two messages."""
         future: Future[Any] = Future()
         self._commands.put((command, future))
         self._wake.send(b"")
         return future.result()
 
     def restart(self, **changes: Any) -> None:
-        """As a killed and restarted server: the same port, no memory of anybody, some attributes changed."""
+        """Restart like a killed server: the same port, no sessions, some attributes changed."""
 
         def again() -> None:
             self._socket.close(linger=0)
@@ -150,18 +150,18 @@ class FakeServer:
         self.call(again)
 
     def forget(self) -> None:
-        """Forgets all sessions, as a server does with silent ones."""
+        """Forget all sessions, as a server does with silent ones."""
         self.call(self._sessions.clear)
 
     def until_all_left(self) -> None:
-        """Returns once no session is left without Goodbye; a last one may be on its way.
+        """Return once all sessions have said Goodbye; the last Goodbye may still be on its way.
 
         Raises:
             TimeoutError: one is left.
         """
-        everybody_left: Future[None] = Future()
-        self.call(lambda: self._waiting.append(everybody_left))
-        everybody_left.result(20.0)
+        all_left: Future[None] = Future()
+        self.call(lambda: self._waiting.append(all_left))
+        all_left.result(20.0)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
@@ -262,7 +262,7 @@ class FakeServer:
             self._answer(identity, session, *key)
 
     def answer(self, epoch: int, index: int) -> None:
-        """Answers that sample to everybody who waits for it, held or not; under :meth:`call`."""
+        """Answer that sample to every session that waits for it, held or not; use it under :meth:`call`."""
         for identity, session in self._sessions.items():
             if (epoch, index) in session.unanswered:
                 self._answer(identity, session, epoch, index)

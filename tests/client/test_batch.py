@@ -1,4 +1,4 @@
-"""A batch on its way to a device."""
+"""Test batches: access to their tensors, and copies to a device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from v2v_client import Batch
 
 
 class Somewhere:
-    """A tensor of which only the place matters."""
+    """Stand in for a tensor of which only the device matters."""
 
     def __init__(self, device: str, *, pinned: bool) -> None:
         self.device = torch.device(device)
@@ -37,18 +37,16 @@ def of(voxels: Any) -> Batch:
 @pytest.mark.parametrize(
     ("device", "pinned", "returns_early"), [("cpu", False, False), ("cpu", True, True), ("cuda:1", False, True)]
 )
-def test_only_memory_that_waits_for_the_copy_is_copied_behind_our_back(
-    device: str, pinned: bool, returns_early: bool
-) -> None:
-    """Memory of our own is lent to other processes the moment the batch is dropped."""
+def test_only_pinned_memory_is_copied_asynchronously(device: str, pinned: bool, returns_early: bool) -> None:
+    """Other memory may be written to by other processes as soon as the batch is dropped."""
     voxels = Somewhere(device, pinned=pinned)
     of(voxels).to("cuda:0", non_blocking=True)
     of(voxels).to("cuda:0")
     assert voxels.moves == [("cuda:0", returns_early), ("cuda:0", False)]
 
 
-def test_it_gives_its_tensors_by_name_and_is_no_mapping() -> None:
-    """Frameworks rebuild a Mapping, and count what they can iterate over: a Batch has to go through them whole."""
+def test_a_batch_gives_tensors_by_name_but_is_not_a_mapping() -> None:
+    """Frameworks rebuild mappings and count the items of iterables, but must pass on a Batch unchanged."""
     batch = of(torch.ones(1, 2))
     assert batch["voxels"] is batch.voxels
     assert dict(batch) == dict(batch.arrays)

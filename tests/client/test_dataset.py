@@ -47,7 +47,7 @@ def server():
 
 @pytest.fixture(scope="module", autouse=True)
 def old_objects():
-    """What was there before is not looked through again and again: with torch that takes a third of a second."""
+    """Freeze existing objects, so that garbage collection skips them: with torch it takes a third of a second."""
     gc.collect()
     gc.freeze()
     yield
@@ -59,9 +59,10 @@ def nothing_leaks(old_objects):
     gc.collect()
     process = psutil.Process()
     threads, files, children = process.num_threads(), process.num_fds(), len(process.children())
+    before = set(threading.enumerate())
     yield
     gc.collect()
-    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    others = [thread for thread in threading.enumerate() if thread not in before]
     for thread in others:
         thread.join(10.0)  # PyTorch closes the queues of its workers without waiting for the threads that feed them
     assert [thread.name for thread in others if thread.is_alive()] == []
@@ -122,7 +123,7 @@ def test_the_batch_has_the_promised_form(server):
     assert moved.indices == batch.indices
 
 
-def test_only_the_asked_arrays_come(server):
+def test_only_the_requested_arrays_arrive(server):
     batch = next(iter(dataset(server, arrays=("voxels",))))
     assert "voxels" in batch
     assert "frames" not in batch
@@ -132,7 +133,7 @@ def test_only_the_asked_arrays_come(server):
     assert server.hellos[-1].arrays == ("voxels",)
 
 
-def test_arrival_in_any_order_and_twice_changes_nothing(server):
+def test_arrival_order_and_duplicates_do_not_change_batches(server):
     server.shuffled = True
     server.twice = {(0, index) for index in range(0, 23, 3)}
     batches = list(dataset(server))
@@ -230,13 +231,13 @@ def test_wrong_options_are_refused_at_once(options, word):
         V2VStreamDataset("tcp://127.0.0.1:1", **options)
 
 
-def test_what_only_the_servers_own_spec_can_tell_is_left_to_it():
-    """It may make clips of 80 voxels, and four samples of a decode."""
+def test_options_that_depend_on_the_servers_spec_are_checked_by_the_server():
+    """The server's own spec may have clips of 80 voxels, and four samples per decode."""
     for recipe in (None, {"bins": 3}):
         V2VStreamDataset("tcp://127.0.0.1:1", recipe=recipe, flow_from=60, sibling_spacing=48)
 
 
-def test_an_address_that_is_none_says_what_to_give():
+def test_a_malformed_address_says_what_to_give():
     with pytest.raises(UsageError, match="tcp://host:port"):
         next(iter(V2VStreamDataset("localhost")))
 
@@ -244,10 +245,10 @@ def test_an_address_that_is_none_says_what_to_give():
 # --- length and epochs ------------------------------------------------------------------------------------------------
 
 
-def test_length_is_that_of_an_epoch_and_asked_for_before_the_first_iteration(server):
+def test_length_is_that_of_an_epoch_and_known_before_the_first_iteration(server):
     stream = dataset(server)
     assert len(stream) == len(loader(stream, 2)) == 5
-    assert len(server.hellos) == 2  # one to learn the layout; whoever asks again is told what was said
+    assert len(server.hellos) == 2  # one to learn the layout; later calls use the first answer
     assert stream.stream is None  # how siblings are spaced depends on how many loader workers iterate
     first = next(iter(stream))
     assert len(stream) == 5
@@ -270,8 +271,8 @@ def test_leaving_early_and_iterating_again_repeats_the_epoch(server):
 
 
 @pytest.mark.parametrize("loaded", [False, True])
-def test_an_epoch_that_is_set_while_another_is_read_to_its_end_is_the_next(server, loaded):
-    """As a trainer does that says at the last batch which epoch follows, or reads ahead in a thread."""
+def test_an_epoch_set_while_another_is_finished_is_the_next_one(server, loaded):
+    """A trainer may set the next epoch at the last batch, or while a thread reads ahead."""
     stream = dataset(server)
     batches = iter(stream)
     state = next(batches).resume_state
@@ -321,7 +322,7 @@ def test_the_state_at_the_end_of_an_epoch_begins_the_next(server):
     assert places(again) == epoch_places(1)
 
 
-def test_a_rest_that_holds_no_batch_begins_the_next_epoch(server):
+def test_a_remainder_smaller_than_a_batch_starts_the_next_epoch(server):
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(4)][-1]
     again = dataset(server, batch_size=8)
@@ -330,8 +331,8 @@ def test_a_rest_that_holds_no_batch_begins_the_next_epoch(server):
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_set_epoch_to_a_loaded_epoch_whose_rest_holds_no_batch_repeats_nothing(server, workers):
-    """As every training loop over epochs has it: load_state_dict(state), then set_epoch(state["epoch"])."""
+def test_set_epoch_to_a_loaded_epoch_with_no_batch_left_repeats_no_samples(server, workers):
+    """Training loops over epochs call load_state_dict(state), then set_epoch(state["epoch"])."""
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(4)][-1]
     again = dataset(server, batch_size=8)
@@ -346,7 +347,7 @@ def test_set_epoch_to_a_loaded_epoch_whose_rest_holds_no_batch_repeats_nothing(s
         assert places(loader) == epoch_places(epoch, 0, 16)
 
 
-def test_an_epoch_whose_rest_was_left_out_comes_whole_once_the_next_has_begun(server):
+def test_an_epoch_whose_remainder_was_dropped_is_whole_when_set_again(server):
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(4)][-1]
     again = dataset(server, batch_size=8)
@@ -422,7 +423,7 @@ def test_another_catalogue_is_refused_naming_both_sides(server, change):
         next(iter(again))
 
 
-def test_a_dataset_of_one_catalogue_does_not_go_on_with_another(server):
+def test_a_dataset_of_one_catalogue_does_not_continue_with_another(server):
     stream = dataset(server)
     list(stream)
     server.catalogue = "catalogue-2"
@@ -433,7 +434,7 @@ def test_a_dataset_of_one_catalogue_does_not_go_on_with_another(server):
 # --- faults -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_restarted_server_is_greeted_again_and_nothing_is_lost_or_twice(server):
+def test_after_a_server_restart_no_sample_is_lost_or_repeated(server):
     server.shuffled = True
     stream = dataset(server)
     batches = iter(stream)
@@ -447,7 +448,7 @@ def test_a_restarted_server_is_greeted_again_and_nothing_is_lost_or_twice(server
     assert server.hellos[-1].spec == SPEC.to_dict()
 
 
-def test_a_forgotten_session_is_opened_again(server):
+def test_a_forgotten_session_is_reopened(server):
     batches = iter(dataset(server, batch_size=2))
     taken = [next(batches)]
     server.forget()
@@ -462,7 +463,7 @@ def test_a_restart_with_other_videos_is_refused(server):
         list(batches)
 
 
-def test_lost_messages_are_asked_for_again(server):
+def test_lost_samples_are_requested_again(server):
     server.drop = {(0, 2), (0, 3), (0, 17)}
     batches = list(dataset(server))
     assert places(batches) == epoch_places(0)
@@ -470,8 +471,8 @@ def test_lost_messages_are_asked_for_again(server):
 
 
 @pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
-def test_what_is_asked_again_names_no_memory(server):
-    """The worker that was asked first may be writing there still."""
+def test_repeated_requests_name_no_shared_memory(server):
+    """The first worker may still be writing there."""
     server.drop = {(0, 2), (0, 17)}
     assert places(dataset(server)) == epoch_places(0)
     named = {asked: slot for asked, slot in zip(server.wants, server.slots, strict=True) if slot != NO_SLOT}
@@ -481,22 +482,22 @@ def test_what_is_asked_again_names_no_memory(server):
     assert set(again) == {NO_SLOT}
 
 
-def test_a_refusal_for_credit_after_asking_again_is_made_good(server):
-    """A sample that was on its way when it was asked for again is made twice, and fills the server's account."""
+def test_a_denial_for_credit_after_repeated_requests_is_recovered(server):
+    """A sample that was on its way when it was requested again is made twice, and uses up credit at the server."""
     server.drop = {(0, 2)}
     server.refuse_repeat = True
     assert places(dataset(server)) == epoch_places(0)
     assert server.refused_for_credit == 1
 
 
-def test_any_other_refusal_for_credit_is_an_error(server):
+def test_any_other_denial_for_credit_is_an_error(server):
     server.overstated = 3
     server.held = True
     with pytest.raises(RemoteError, match=r"\[credit\]"):
         next(iter(dataset(server)))
 
 
-def test_asking_again_for_what_is_only_slow_is_harmless(server):
+def test_repeating_requests_for_slow_samples_is_harmless(server):
     server.held = True
     asked_again = threading.Event()
 
@@ -520,7 +521,7 @@ def test_asking_again_for_what_is_only_slow_is_harmless(server):
         watcher.join()
 
 
-def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
+def test_a_dead_server_raises_with_address_and_last_sample(server):
     stream = dataset(server, timeout_seconds=2.0)
     batches = iter(stream)
     next(batches)
@@ -529,12 +530,12 @@ def test_a_dead_server_is_given_up_naming_address_and_last_sample(server):
         list(batches)
 
 
-def test_nobody_there_is_given_up():
+def test_an_address_without_a_server_raises():
     with pytest.raises(ServerLost, match="no sample was received"):
         next(iter(V2VStreamDataset("tcp://127.0.0.1:9", timeout_seconds=0.3, patience=QUICK)))
 
 
-def test_a_refusal_says_what_the_server_said(server):
+def test_a_refusal_quotes_the_server(server):
     server.refusal = Denied("spec", "no video gives 5 frames")
     with pytest.raises(RemoteError, match="no video gives 5 frames") as caught:
         next(iter(dataset(server)))
@@ -574,7 +575,7 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("damage", GARBAGE.values(), ids=GARBAGE.keys())
-def test_what_no_server_of_ours_sends_is_refused(server, damage):
+def test_malformed_server_messages_are_refused(server, damage):
     server.alter, server.workers = damage, "elsewhere"
     with pytest.raises(ProtocolError):
         next(iter(dataset(server)))
@@ -628,7 +629,7 @@ def test_persistent_workers_advance_and_obey_set_epoch(server):
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2])
-def test_the_state_of_a_batch_holds_for_any_number_of_loader_workers(server, workers):
+def test_the_state_of_a_batch_is_valid_for_any_number_of_loader_workers(server, workers):
     state = [batch.resume_state for batch in loader(dataset(server), 2)][1]
     again = dataset(server)
     again.load_state_dict(state)
@@ -651,7 +652,7 @@ def test_the_parents_state_is_refused_after_loader_workers_and_names_the_remedy(
 
 
 @pytest.mark.slow  # PyTorch waits five seconds for a worker that failed
-def test_an_error_in_a_loader_worker_comes_out(server):
+def test_an_error_in_a_loader_worker_is_raised_in_the_parent(server):
     server.catalogue = "catalogue-2"
     state = next(iter(dataset(server))).resume_state
     server.catalogue = "catalogue-1"
@@ -662,8 +663,8 @@ def test_an_error_in_a_loader_worker_comes_out(server):
 
 
 @pytest.mark.parametrize("kind", [RemoteError, SampleUnavailable])
-def test_a_refusal_comes_out_of_a_loader_worker_with_its_code(kind):
-    """As PyTorch carries it: its kind, and its trace as a text."""
+def test_a_refusal_in_a_loader_worker_keeps_its_code(kind):
+    """PyTorch passes on its type, and its traceback as text."""
     try:
         raise kind("unknown-session", "the server refused [twice]: say Hello again")
     except kind:
@@ -685,7 +686,7 @@ def test_a_copy_is_a_dataset_of_its_own(server):
     assert places(other) == epoch_places(4)
 
 
-def test_a_dataset_leaves_no_file_however_its_process_ends(server, tmp_path, monkeypatch):
+def test_a_dataset_leaves_no_file_when_its_process_ends_in_any_way(server, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     stream = dataset(server)
     list(loader(stream, 1))
@@ -704,14 +705,14 @@ def test_no_batch_changes_while_a_view_of_it_lives(server):
         np.testing.assert_array_equal(view.numpy(), expected("voxels", SEED, epoch, index)[:, 0])
 
 
-def test_buffers_are_used_again_when_nothing_looks_at_them():
+def test_unreferenced_buffers_are_reused():
     with FakeServer(sequences=200, credit=4) as server:
         addresses = [batch.voxels.data_ptr() for batch in dataset(server, batch_size=2)]
     assert len(addresses) == 100
     assert len(set(addresses)) <= 4 // 2 + 3
 
 
-def test_buffers_are_handed_from_one_epoch_to_the_next(server):
+def test_buffers_are_reused_in_the_next_epoch(server):
     stream = dataset(server, shared_memory=False)
     used = {batch.voxels.data_ptr() for _ in range(4) for batch in stream}
     assert len(used) <= 8 // 4 + 3
@@ -719,7 +720,7 @@ def test_buffers_are_handed_from_one_epoch_to_the_next(server):
     pickle.dumps(stream)
 
 
-def test_arenas_are_handed_from_one_epoch_to_the_next(server):
+def test_arenas_are_reused_in_the_next_epoch(server):
     stream = dataset(server)
     for _ in range(4):
         assert sum(1 for _ in stream) == 5
@@ -729,7 +730,7 @@ def test_arenas_are_handed_from_one_epoch_to_the_next(server):
 
 @pytest.mark.parametrize("workers", ["here", "elsewhere", "many"])
 @pytest.mark.parametrize("shared_memory", [True, False])
-def test_wherever_workers_are_the_bytes_are_those_of_each_sample(server, workers, shared_memory):
+def test_local_and_remote_workers_give_the_same_bytes(server, workers, shared_memory):
     server.workers, server.shuffled = workers, True
     stream = dataset(server, shared_memory=shared_memory)
     kept = [batch for _ in range(3) for batch in stream]
@@ -739,7 +740,7 @@ def test_wherever_workers_are_the_bytes_are_those_of_each_sample(server, workers
     assert (set(server.slots) == {NO_SLOT}) is not shared_memory
 
 
-def test_memory_is_lent_no_more_once_a_whole_batch_came_in_messages(server):
+def test_slots_stop_once_a_whole_batch_came_in_messages(server):
     server.workers = "elsewhere"
     list(dataset(server, batch_size=2))
     lent = [slot != NO_SLOT for slot in server.slots]
@@ -747,8 +748,8 @@ def test_memory_is_lent_no_more_once_a_whole_batch_came_in_messages(server):
     assert 0 < sum(lent) <= 8 + 2 * 2
 
 
-def test_many_small_batches_leave_a_process_its_open_files(monkeypatch):
-    """The rest of them comes in messages, and memory is lent on as it comes back."""
+def test_many_small_batches_do_not_exhaust_open_files(monkeypatch):
+    """Samples without an arena come in messages; arenas are reused as they come back."""
     monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
     with FakeServer(sequences=160, credit=40) as server:
         before, most = len(os.listdir("/proc/self/fd")), 0
@@ -760,8 +761,8 @@ def test_many_small_batches_leave_a_process_its_open_files(monkeypatch):
         assert 1 in server.slots[-80:]
 
 
-def test_a_batch_does_not_change_when_a_given_up_worker_writes_late(server):
-    """Index 1 is lost with its worker, is asked for again, and comes from another one; then the first wakes."""
+def test_a_late_write_of_an_abandoned_worker_does_not_change_a_batch(server):
+    """Index 1 is lost with its worker, is requested again, and comes from another worker; then the first one wakes."""
     server.drop = {(0, 1)}
     stream = iter(dataset(server))
     batch = next(stream)
@@ -783,7 +784,7 @@ def test_recipes_may_be_given_as_objects(server):
     assert next(iter(dataset(server, recipe=recipe))).voxels.shape == (4, 1, 1, 2, 2)
 
 
-def test_a_recipe_that_is_changed_for_the_next_dataset_stays_that_of_the_first(server):
+def test_changing_a_recipe_mapping_does_not_affect_an_earlier_dataset(server):
     recipe = {"voxels_per_clip": 1, "gamma": 2.0, "threshold": [0.2, 0.5]}
     stream = dataset(server, recipe=MappingProxyType(recipe))
     recipe["gamma"] = 1.5
@@ -806,7 +807,7 @@ def test_repeating_an_iteration_that_was_left_early_warns_once(server):
     assert steps(stream, 2) == first
 
 
-def test_going_on_and_set_epochs_do_not_warn(server):
+def test_resuming_and_setting_epochs_do_not_warn(server):
     stream = dataset(server)
     for epoch in (0, 0, 1):
         stream.set_epoch(epoch)

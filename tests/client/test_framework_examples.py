@@ -1,4 +1,4 @@
-"""The examples of docs/guides/frameworks.md, as they stand there: each stops, resumes, and takes every sample once."""
+"""Run the examples of docs/guides/frameworks.md unchanged: each stops, resumes, and takes every sample once."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Crash(Exception):
 
 
 def of_two_bins(text: str) -> str:
-    """An example for the fake server's grids."""
+    """Adapt an example to the fake server's grids of two bins."""
     assert "Conv2d(5," in text
     return text.replace("Conv2d(5,", "Conv2d(2,")
 
 
-def test_there_are_examples() -> None:
+def test_the_page_has_examples() -> None:
     assert [name for name, _ in EXAMPLES] == ["A plain loop", "DataLoader", "StatefulDataLoader", *OTHERS]
 
 
@@ -82,8 +82,8 @@ def train(batch):
 
 @pytest.mark.slow
 def test_the_example_of_torchrun_resumes_where_it_was(tmp_path: Path) -> None:
-    """All ranks crash in their second batch; the same command goes on. 23 sequences, 2 ranks, batches of 4: two batches
-    for each rank."""
+    """All ranks crash in their second batch, and the same command resumes. 23 sequences, 2 ranks and batches of 4 make
+    two batches for each rank."""
     text = dict(EXAMPLES)["torchrun"]
     (command,) = re.findall(r"^ {4}torchrun (.*)$", PAGE.read_text(encoding="utf-8"), re.M)
     with FakeServer(sequences=23, credit=8) as server:
@@ -100,7 +100,7 @@ def test_the_example_of_torchrun_resumes_where_it_was(tmp_path: Path) -> None:
 
 
 def torchrun(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """The command as a shell would run it, but of this environment; SIGTERM of `timeout` ends its ranks, too."""
+    """Run the command as a shell would, in this environment. SIGTERM of `timeout` also ends its ranks."""
     return subprocess.run(
         ["timeout", "120", sys.executable, "-m", "torch.distributed.run", *command.split()],
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
@@ -129,7 +129,7 @@ def test_the_example_of_accelerate_resumes_where_it_was() -> None:
 @pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
 @pytest.mark.parametrize("workers", [None, 0, 2])
 def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, workers: int | None) -> None:
-    """The checkpoint is written after two batches; the crash comes in the fourth. Workers: of a StatefulDataLoader."""
+    """The checkpoint is written after two batches; the crash is in the fourth. The loader is a StatefulDataLoader."""
     lightning = importlib.import_module("lightning")
     callbacks = importlib.import_module("lightning.pytorch.callbacks")
     taken: list[int] = []

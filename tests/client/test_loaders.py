@@ -1,4 +1,4 @@
-"""A process that ends takes the batches in its queue's thread along."""
+"""Test that a loader worker sends its queued batches before it ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _the_end_has_come = threading.Event()
 
 
 class Ponderous:
-    """A batch whose pickling, as that of tensors may, goes on while its process ends."""
+    """Hold a batch whose pickling goes on while its process ends, as that of tensors may."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         _the_end_has_come.wait()
@@ -23,9 +23,9 @@ class Ponderous:
 
 
 def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
-    """As a loader worker does whose trainer left early (torch.utils.data._utils.worker)."""
-    # What is registered last is called first: the batch is pickled from the end's beginning on, and where nobody waits
-    # for that, the process is gone before another thread has its turn.
+    """Queue a batch and exit, as a loader worker does if its trainer leaves early (torch.utils.data._utils.worker)."""
+    # Exit functions run in reverse order. The batch is pickled from the first of them on, and if no function waits for
+    # that, the process ends before another thread runs.
     atexit.register(os._exit, 0)
     send_before_exit()
     send_before_exit()
@@ -35,7 +35,7 @@ def hand_over_and_leave(queue: multiprocessing.queues.Queue[Any]) -> None:
     queue.close()
 
 
-def test_a_spawned_process_sends_what_it_handed_over() -> None:
+def test_a_spawned_process_sends_its_queued_batches_before_it_exits() -> None:
     spawn = multiprocessing.get_context("spawn")
     queue = spawn.Queue()
     process = spawn.Process(target=hand_over_and_leave, args=(queue,))

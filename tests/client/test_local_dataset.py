@@ -1,4 +1,4 @@
-"""A dataset with a server of its own leaves nothing behind, however it ends."""
+"""Test that a dataset with a local server leaves no process behind, in whatever way it ends."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def servers() -> Iterator[set[psutil.Process]]:
-    """Processes that this process has started since."""
+    """Return the processes that this process has started since."""
     before = set(psutil.Process().children(recursive=True))
     started: set[psutil.Process] = set()
     yield started
@@ -59,7 +59,7 @@ def command(process: psutil.Process) -> list[str]:
         return []
 
 
-def test_it_streams_and_its_server_goes_with_it(clips: Path, servers: set[psutil.Process]) -> None:
+def test_a_local_dataset_streams_and_stops_its_server(clips: Path, servers: set[psutil.Process]) -> None:
     dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
     servers.update(psutil.Process().children(recursive=True))
     whole = [batch.voxels for batch in dataset]
@@ -76,7 +76,7 @@ def test_it_streams_and_its_server_goes_with_it(clips: Path, servers: set[psutil
 
 @pytest.mark.slow
 def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers: set[psutil.Process]) -> None:
-    """It is a fork, and has a copy of all that would stop it."""
+    """A loader worker is a fork, with copies of all objects that would stop the server."""
     dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
     for _ in range(2):
         assert sum(1 for _ in DataLoader(dataset, batch_size=None, num_workers=1)) == len(dataset)
@@ -84,7 +84,7 @@ def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers:
     gc.collect()
 
 
-def test_a_key_for_servers_elsewhere_is_not_used(
+def test_a_key_for_other_servers_is_not_used(
     clips: Path, servers: set[psutil.Process], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = KeyFolder(tmp_path / "keys")
@@ -98,7 +98,7 @@ def test_a_key_for_servers_elsewhere_is_not_used(
     gc.collect()
 
 
-def test_what_is_wrong_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:
+def test_an_error_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:
     with pytest.raises(UsageError, match="no video found"):
         V2VStreamDataset.local(tmp_path, recipe=RECIPE)
     del servers
@@ -139,7 +139,7 @@ def test_loader_workers_end_with_a_program_that_is_terminated(clips: Path, tmp_p
         ("os.kill(os.getpid(), signal.SIGKILL)", -signal.SIGKILL),
     ],
 )
-def test_nothing_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end: str, status: int) -> None:
+def test_no_process_is_left_when_the_program_ends(clips: Path, tmp_path: Path, end: str, status: int) -> None:
     memory = shared_memory()
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(recipe=RECIPE, end=end), encoding="utf-8")

@@ -21,7 +21,7 @@ DEAF = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """Replaces ``python -m v2v_server`` by a program of the test's own."""
+    """Replace ``python -m v2v_server`` by a program of the test."""
 
     def write(text):
         package = tmp_path / "v2v_server"
@@ -34,7 +34,7 @@ def program(tmp_path, monkeypatch):
     return write
 
 
-def test_it_is_up_inside_the_block_and_gone_after_it_with_its_children(program):
+def test_the_server_runs_inside_the_block_and_stops_with_its_children(program):
     program(CHILD + LISTEN + POLITE)
     with LocalServer("videos", workers=7) as server:
         assert server.address == "tcp://127.0.0.1:7"
@@ -50,7 +50,7 @@ def test_it_is_up_inside_the_block_and_gone_after_it_with_its_children(program):
     server.stop()
 
 
-def test_a_server_that_does_not_leave_is_killed(program):
+def test_a_server_that_does_not_stop_is_killed(program):
     program(DEAF + LISTEN + "while True: signal.pause()\n")
     with LocalServer("videos", stop_seconds=0.2) as server:
         process = psutil.Process(server.pid)
@@ -58,7 +58,7 @@ def test_a_server_that_does_not_leave_is_killed(program):
 
 
 @pytest.mark.parametrize(("status", "error"), [(2, UsageError), (3, ServerLost)])
-def test_a_server_that_dies_is_quoted(program, status, error):
+def test_the_error_quotes_the_output_of_a_dead_server(program, status, error):
     program(f"sys.stderr.write('v2v-serve: no such folder: ' + flags['--videos'] + '\\n'); sys.exit({status})")
     with pytest.raises(error, match=f"status {status} .*no such folder: videos"), LocalServer("videos"):
         pass
@@ -72,7 +72,7 @@ def test_a_server_that_does_not_listen_in_time_is_stopped(program):
     assert len(psutil.Process().children()) == before
 
 
-def test_a_server_that_says_how_far_it_is_has_longer(tmp_path, monkeypatch):
+def test_a_server_that_reports_progress_gets_more_time(tmp_path, monkeypatch):
     server, port_file = LocalServer("videos", start_seconds=60.0), tmp_path / "port"
     now, steps = 0.0, iter([*[b"probing videos\n"] * 20, b"", b""])
 
@@ -95,7 +95,7 @@ def test_flags_reach_the_server(program):
         assert server.address.endswith(":9")
 
 
-def test_what_a_server_writes_while_it_is_read_is_not_lost(program):
+def test_output_written_while_it_is_read_is_not_lost(program):
     program(
         LISTEN
         + "import time\n"

@@ -1,4 +1,4 @@
-"""What a notebook shows of batches, samples, provenance and datasets."""
+"""Test how a notebook displays batches, samples, provenance and datasets."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_simulated_result_shows_itself(tmp_path: Path) -> None:
     assert few.show().height < image.height
 
 
-def test_a_file_name_is_no_markup(dataset: V2VDataset) -> None:
+def test_file_names_are_escaped_in_html(dataset: V2VDataset) -> None:
     sample = dataset[0]
     for shown in (sample._repr_html_(), sample.provenance._repr_html_()):
         assert "<img src=x" not in shown

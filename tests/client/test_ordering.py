@@ -8,7 +8,7 @@ from v2v_protocol.errors import LimitExceeded
 
 
 class Arrivals(RuleBasedStateMachine):
-    """Samples come in any order, twice, or unasked; the model is the set of what is under way."""
+    """Deliver samples in any order, twice, or unrequested. The model is the set of samples under way."""
 
     @initialize(batch_size=st.integers(1, 5), batches=st.integers(0, 12), credit=st.integers(1, 14))
     def open(self, batch_size, batches, credit):
@@ -91,7 +91,7 @@ TestArrivals = Arrivals.TestCase
 TestArrivals.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_duplicates_and_strays_are_told_apart():
+def test_duplicates_and_strays_are_counted_separately():
     window = ReorderWindow([0], lambda _: (5, 6), 2, 4)
     assert window.ask() == (5, 6)
     assert window.receive(5) is not None

@@ -1,8 +1,8 @@
-"""What torchdata's StatefulDataLoader does to a dataset, done by hand.
+"""Test a dataset with the calls of torchdata's StatefulDataLoader, made by hand.
 
-In every loader worker it loads that worker's own state, makes an iterator, and asks for the state after each batch and
-after the end. A loader whose state says that its epoch was finished makes such workers, drops them unused, and makes
-fresh ones from the dataset of the main process.
+In every loader worker it loads that worker's own state, creates an iterator, and requests the state after each batch
+and after the end. If a loader's state says that its epoch was finished, the loader creates such workers, drops them
+unused, and creates new ones from the dataset of the main process.
 """
 
 import multiprocessing
@@ -22,7 +22,7 @@ FORK = multiprocessing.get_context("fork")
 
 @dataclass
 class Outcome:
-    """One loader worker: the indices of each batch with the state after it, and the state after the end."""
+    """Hold the outcome of one loader worker: each batch's indices and state, and the state after the end."""
 
     batches: list[tuple[int, tuple[int, ...], dict[str, Any]]]
     ended: dict[str, Any] | None
@@ -55,7 +55,7 @@ def _worker(dataset, worker, workers, seed, state, most, connection):
 
 
 def run(dataset, seed, states=(None, None), most=(99, 99)):
-    """One iteration of a loader: its workers' outcomes. They begin to read only when all have begun to iterate."""
+    """Run one iteration of a loader and return its workers' outcomes. All create their iterators before any reads."""
     started = []
     for worker in range(WORKERS):
         here, there = FORK.Pipe()
@@ -79,7 +79,7 @@ def run(dataset, seed, states=(None, None), most=(99, 99)):
 
 
 def in_order(outcomes):
-    """What the training loop sees: a batch of each worker in turn."""
+    """Return the batches in the training loop's order: one of each worker in turn."""
     rows = [[(epoch, indices) for epoch, indices, _ in outcome.batches] for outcome in outcomes]
     longest = max(len(row) for row in rows)
     return [row[turn] for turn in range(longest) for row in rows if turn < len(row)]
@@ -99,7 +99,7 @@ def dataset(server, **options):
     return V2VStreamDataset(server.address, **({"batch_size": 4, "timeout_seconds": 20.0} | options))
 
 
-def test_workers_go_on_where_each_of_them_was(server):
+def test_each_loader_worker_resumes_at_its_own_position(server):
     first = run(dataset(server), 100, most=(2, 1))
     states = [outcome.batches[-1][2] for outcome in first]
     rest = run(dataset(server), 200, states)
@@ -108,20 +108,20 @@ def test_workers_go_on_where_each_of_them_was(server):
     assert [row[:2] for row in rest[1].batches] == [whole(0)[3]]
 
 
-def test_the_initial_state_of_workers_begins_the_epoch(server):
+def test_the_initial_state_of_a_loader_worker_starts_the_epoch(server):
     stream = dataset(server)
     begun = run(stream, 100, most=(0, 0))
     assert in_order(run(stream, 200)) == whole(0)
     assert begun[0].batches == []
 
 
-def test_states_after_the_end_begin_a_full_next_epoch(server):
+def test_states_after_the_end_start_a_whole_next_epoch(server):
     first = run(dataset(server), 100)
     assert in_order(first) == whole(0)
     assert in_order(run(dataset(server), 200, [outcome.ended for outcome in first])) == whole(1)
 
 
-def test_a_finished_loader_restored_begins_a_full_next_epoch(server):
+def test_a_restored_finished_loader_starts_a_whole_next_epoch(server):
     first = run(dataset(server), 100)
     states = [outcome.batches[-1][2] for outcome in first]
     restored = dataset(server)
@@ -130,7 +130,7 @@ def test_a_finished_loader_restored_begins_a_full_next_epoch(server):
     assert in_order(run(restored, 300)) == whole(1)
 
 
-def test_the_end_of_an_epoch_that_was_not_seen_is_delivered_as_nothing(server):
+def test_a_restored_epoch_with_no_batches_left_yields_no_batches(server):
     first = run(dataset(server), 100)
     states = [outcome.batches[-1][2] for outcome in first]
     restored = dataset(server)
@@ -138,15 +138,15 @@ def test_the_end_of_an_epoch_that_was_not_seen_is_delivered_as_nothing(server):
     assert in_order(run(restored, 300)) == whole(1)
 
 
-def test_a_late_worker_begins_the_epoch_of_its_siblings(server):
-    """All workers of an iteration deliver one epoch, even where one has finished it before another begins."""
+def test_a_late_loader_worker_starts_the_epoch_of_the_others(server):
+    """All workers of an iteration deliver the same epoch, even if one finishes it before another starts."""
     stream = dataset(server, batch_size=20)  # one batch: worker 1 has none, and is done at once
     for epoch in (0, 1):
         outcomes = run(stream, 100 + epoch)
         assert in_order(outcomes) == [(epoch, tuple(range(20)))]
 
 
-def test_the_state_of_a_worker_is_refused_anywhere_else(server):
+def test_the_state_of_a_loader_worker_is_refused_elsewhere(server):
     state = run(dataset(server), 100, most=(1, 1))[1].batches[-1][2]
     with pytest.raises(UsageError, match=r"loader worker 1 of 2 .* Batch\.resume_state"):
         dataset(server).load_state_dict(state)
@@ -156,14 +156,14 @@ def test_the_state_of_a_worker_is_refused_anywhere_else(server):
     assert "batch_size 4" in other_batch[1].error
 
 
-def test_the_state_of_a_rank_is_taken_up_by_workers(server):
+def test_loader_workers_resume_from_the_state_of_a_rank(server):
     batches = iter(dataset(server))
     state = [next(batches).resume_state for _ in range(2)][-1]
     assert in_order(run(dataset(server), 100, [state, state])) == whole(0, first=2)
 
 
-def test_a_state_that_is_loaded_again_is_where_the_next_iteration_begins(server):
-    """As after two losses that are not finite. A loader's state has its seeds, so they are those of the first time."""
+def test_a_state_loaded_twice_starts_the_iteration_at_its_position(server):
+    """A trainer does this after two non-finite losses. The seeds are in the loader's state, so they are equal."""
     stream = dataset(server)
     states = [outcome.batches[-1][2] for outcome in run(stream, 100, most=(2, 1))]
     for _ in range(2):

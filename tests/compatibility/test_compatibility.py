@@ -25,6 +25,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue import refresh
 from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.catalogue.index.file import SCHEMA_VERSION
 from v2v_server.video.rows import Rows
 
 FIXTURES = sorted(Path(__file__).parent.glob("numerics-*"))
@@ -111,12 +112,13 @@ def test_a_checkpoint_is_resumed_or_refused_with_both_numbers(fixture: Path, tmp
     assert f"has {NUMERICS_VERSION}; serve with the release that the state was saved with" in done.stderr
 
 
-def test_an_index_is_taken_over(fixture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache, videos = fixture / "user-cache", fixture / "videos"
     index = refresh.index_path(videos.resolve(), cache)
     cache.mkdir()
     shutil.copy(fixture / "index.sqlite3", index)
     with closing(sqlite3.connect(index)) as database, database:
+        (version,) = database.execute("PRAGMA user_version").fetchone()
         # The copies have other times of modification than the files that were probed.
         for path in videos.iterdir():
             state = path.stat()
@@ -128,7 +130,10 @@ def test_an_index_is_taken_over(fixture: Path, monkeypatch: pytest.MonkeyPatch) 
     survey = refresh.survey
     monkeypatch.setattr(refresh, "survey", lambda root, ids, *rest: probed.extend(ids) or survey(root, ids, *rest))
     with closing(open_catalogue(videos, rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
-        assert probed == []
         assert [video.id for video in catalogue.videos] == ["a.mp4", "b.webm"]
+        if version == SCHEMA_VERSION:
+            assert probed == []
+        else:
+            assert f"(version {version}, this one has {SCHEMA_VERSION})" in catalogue.notes[0]
         if is_present(fixture):
             assert catalogue.digest == expected(fixture)["catalogue_digest"]

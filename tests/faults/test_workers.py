@@ -105,7 +105,7 @@ def test_a_worker_whose_host_lacks_the_videos_changes_nothing(
                 assert lacking.poll() is None
             finally:
                 lacking.terminate()
-        assert "Look at --videos on its host" in server.last_lines()
+        assert "Check --videos on its host" in server.last_lines()
 
 
 @pytest.mark.parametrize("stage", STAGES)

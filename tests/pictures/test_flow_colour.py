@@ -1,4 +1,4 @@
-"""The colour wheel: direction is hue, length is saturation."""
+"""Test the colour wheel: direction is hue, length is saturation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_directions_have_their_colours() -> None:
     assert red > 50
 
 
-def test_length_is_saturation_and_too_long_is_darker() -> None:
+def test_length_is_saturation_and_longer_is_darker() -> None:
     assert one(0, 0) == (255, 255, 255)
     assert one(0.5, 0) == (255, 128, 128)
     assert one(2, 0) == (191, 0, 0)
@@ -45,7 +45,7 @@ def test_full_colour_is_the_longest_or_one_pixel() -> None:
     assert draw_flow(np.zeros((2, 0, 5))).shape == (0, 5, 3)
 
 
-def test_hue_has_no_seam() -> None:
+def test_hue_is_continuous() -> None:
     angles = np.linspace(0, 2 * np.pi, 721)
     ring = draw_flow(np.stack([np.cos(angles), np.sin(angles)])[:, None], 1.0)[0].astype(int)
     assert np.abs(np.diff(ring, axis=0)).max() < 20

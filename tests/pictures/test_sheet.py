@@ -1,4 +1,4 @@
-"""Pages and films of cameras: what is known must be found at its place, in its colour."""
+"""Test pages and films of cameras: known content must be at its place, in its colour."""
 
 from __future__ import annotations
 
@@ -10,41 +10,24 @@ from typing import Any
 
 import av
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pictures
 
+from tests.pictures.cameras import camera, has, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import INK, MARK, PAUSED, Canvas, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
-from v2v_pictures.sheet import draw_sheet, flow_panel, whole_panel
+from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
+from v2v_pictures.sheet import draw_sheet, flow_panel
 from v2v_pictures.strip import draw_strip
 from v2v_protocol.errors import UsageError
 
 WHITE = (255, 255, 255)
-
-
-def camera(
-    voxels: npt.NDArray[Any],
-    *,
-    pauses: tuple[tuple[int, int], ...] = (),
-    flow: npt.NDArray[Any] | None = None,
-    lead: int = 0,
-) -> Camera:
-    provenance = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, pauses=pauses))
-    count, height, width = len(voxels), *voxels.shape[2:]
-    frames = np.full((count - lead, 1, height, width), 90, np.uint8)
-    arrays = {"voxels": voxels, "frames": frames} | ({} if flow is None else {"flow": flow})
-    return Camera.of(arrays, provenance, "paper")
-
-
-def has(image: npt.NDArray[np.uint8], colour: tuple[int, ...]) -> int:
-    return int((image == colour).all(axis=-1).sum())
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.int16, np.float32])
@@ -59,7 +42,7 @@ def test_colours_of_known_events(dtype: type[np.generic]) -> None:
     assert np.argmax(DARKER) == 2
 
 
-def test_a_single_event_is_seen_whatever_the_scale() -> None:
+def test_a_single_event_is_visible_at_any_scale() -> None:
     image = draw_events(np.array([[1, 0, -1]], np.int8), 1000.0).astype(int)
     assert (image[0, 1] == WHITE).all()
     assert np.abs(image[0, 0] - WHITE).max() > 80
@@ -67,7 +50,7 @@ def test_a_single_event_is_seen_whatever_the_scale() -> None:
 
 
 def test_the_least_count_of_int8_does_not_wrap() -> None:
-    """|-128| is no int8: its colour must not turn."""
+    """|-128| does not fit int8: its colour must not change to that of the other sign."""
     counts = np.full((12, 12), -128, np.int8)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -81,7 +64,7 @@ def test_more_events_are_never_paler(values: list[int]) -> None:
     assert (np.diff(green) <= 0).all()
 
 
-def test_full_colour_is_no_outliers() -> None:
+def test_full_colour_ignores_outliers() -> None:
     counts = np.full(1000, 3, np.int8)
     counts[0] = 127
     assert full_colour([counts, np.zeros(5, np.int8)]) == 3.0
@@ -94,84 +77,6 @@ def test_grey_is_shown_as_it_is() -> None:
     assert (draw_grey(frame)[..., 1] == frame).all()
     assert (draw_grey(frame / 255) == draw_grey(frame)).all()
     assert draw_grey(np.array([[-1.0, 2.0]])).tolist() == [[[0, 0, 0], [255, 255, 255]]]
-
-
-def test_rates_are_events_a_pixel_of_each_sign() -> None:
-    voxels = np.zeros((2, 3, 4, 5), np.int8)
-    voxels[1, 2, 0, :] = 2
-    voxels[0, 1, 0, 0] = -128
-    rates = camera(voxels).rates
-    assert rates.shape == (2, 6)
-    assert rates[0].tolist() == [0, 0, 0, 0, 0, 0.5]
-    assert rates[1].tolist() == [0, 6.4, 0, 0, 0, 0]
-
-
-@given(st.data())
-def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> None:
-    """Against the definition, frame by frame: what the draw says of each position."""
-    grids, bins, per_bin, lead = (data.draw(st.integers(low, 4)) for low in (1, 1, 1, 0))
-    steps = (grids + lead) * bins * per_bin
-    still = data.draw(st.lists(st.booleans(), min_size=steps, max_size=steps))
-    edges = np.flatnonzero(np.diff([False, *still, False]))
-    pauses = tuple((int(start) + 1, int(end - start)) for start, end in zip(edges[::2], edges[1::2], strict=True))
-    shown = dataclasses.replace(
-        camera(np.zeros((grids + lead, bins, 2, 2), np.int8), pauses=pauses, lead=lead), frames_per_bin=per_bin
-    )
-    source = shown.provenance.params.source_index(steps)
-    expected = [
-        all(source[step + 1] == source[step] for step in range(first, first + per_bin))
-        for first in range(lead * bins * per_bin, steps, per_bin)
-    ]
-    assert shown.paused.tolist() == expected
-
-
-def test_moments_are_active_and_not_paused() -> None:
-    voxels = np.ones((20, 5, 4, 4), np.int8)
-    voxels[0] = 100  # the beginning, when every pixel waits for its first event
-    voxels[7], voxels[12] = 50, 40
-    chosen = camera(voxels, pauses=((7 * 5 + 1, 5),)).moments(1)
-    assert chosen == [12]
-    assert camera(voxels).moments(2) == [7, 12]
-    assert camera(voxels[:1]).moments(3) == [0]
-
-
-def test_a_moment_that_is_half_paused_is_better_than_one_with_nothing_but_noise() -> None:
-    voxels = np.zeros((20, 5, 4, 4), np.int8)
-    voxels[:, :, 0, 0] = 1
-    voxels[9] = 30
-    assert camera(voxels, pauses=((9 * 5 + 1, 3), (15 * 5 + 1, 10))).moments(1) == [9]
-    voxels[12] = 30
-    assert camera(voxels, pauses=((9 * 5 + 1, 1),)).moments(1) == [12]
-
-
-def test_a_cut_is_no_moment() -> None:
-    voxels = np.zeros((20, 5, 4, 4), np.int8)
-    voxels[7, 4], voxels[12] = 100, 3
-    assert camera(voxels).moments(1) == [12]
-    assert camera(voxels[:, 4:]).moments(1) == [7]  # of one bin each: nothing else is known
-
-
-@given(st.integers(1, 30), st.integers(1, 8))
-def test_moments_are_in_order_and_different(grids: int, count: int) -> None:
-    chosen = camera(np.ones((grids, 2, 2, 2), np.int8)).moments(count)
-    assert chosen == sorted(set(chosen))
-    assert 1 <= len(chosen) <= count
-    assert all(0 <= moment < grids for moment in chosen)
-
-
-def test_lead_frames_and_voxels_stand_in_front() -> None:
-    frames = (10 * np.arange(5, dtype=np.uint8))[:, None, None, None] * np.ones((1, 1, 4, 4), np.uint8)
-    voxels = np.arange(5, dtype=np.int8)[:, None, None, None] * np.ones((1, 2, 4, 4), np.int8)
-    for arrays in ({"frames": frames, "voxels": voxels[1:]}, {"frames": frames[1:], "voxels": voxels}):
-        shown = Camera.of(arrays, PROVENANCE, "")
-        assert shown.frames[:, 0, 0].tolist() == [10, 20, 30, 40]
-        assert shown.voxels[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("name", ["voxels", "frames"])
-def test_both_arrays_are_needed(name: str) -> None:
-    with pytest.raises(UsageError, match="voxels,frames"):
-        Camera.of({name: np.zeros((2, 1, 8, 8), np.uint8)}, PROVENANCE, "")
 
 
 def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
@@ -196,12 +101,12 @@ def test_pauses_are_hatched_and_named() -> None:
 
 
 def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the middle to the edge, so half of the strip's height; higher rates are cut there, and the text says so."""
+    """A full bar is half of the strip's height, from middle to edge. Higher rates are clipped, and the text says so."""
     voxels = np.zeros((40, 5, 10, 10), np.int8)
     voxels[:, :, :5] = 1  # half an event a pixel in each bin
     voxels[10, 0] = 1  # twice as many
     voxels[20, 0, :5] = 0
-    voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5
+    voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5: a bar of the square root of 0.4
     written: list[str] = []
     write = Canvas.text
 
@@ -215,12 +120,12 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
     assert "full bar: 0.5 or more a pixel and bin" in written
     image = page.image()
     bars = [has(image[40:121, 50 + 5 * number + 2][None], BRIGHTER) for number in (0, 50, 100)]
-    assert bars == pytest.approx([40, 40, 16], abs=2)
+    assert bars == pytest.approx([40, 40, 25], abs=2)
 
 
 @pytest.mark.parametrize("draw", [draw_sheet, lambda cameras, title: list(draw_film(cameras, title))])
 def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera that sees next to nothing must not look as busy as one that sees motion."""
+    """A camera with hardly any events must not look as active as one with motion."""
     busy, quiet = np.ones((4, 2, 16, 16), np.int8), np.zeros((4, 2, 16, 16), np.int8)
     quiet[:, :, 0, 0] = 1
     written: list[str] = []
@@ -235,20 +140,15 @@ def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.Monk
     assert {text for text in written if text.startswith("full bar")} == {"full bar: 1 or more a pixel and bin"}
 
 
-def test_a_drawn_dark_floor_is_described() -> None:
-    """It is all in which the preset `sensor` differs from `paper`."""
-    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
-    params = dataclasses.replace(PARAMS, log_eps=0.125)
-    floor = dataclasses.replace(shown, provenance=dataclasses.replace(PROVENANCE, params=params))
-    assert "dark floor" not in shown.describe()
-    assert "dark floor 0.125" in floor.describe()
-
-
-def test_a_camera_of_mostly_noise_says_so() -> None:
-    shown = camera(np.zeros((2, 2, 16, 16), np.int8))
-    assert "mostly noise" not in shown.describe()
-    assert "mostly noise: 83% of the events" in dataclasses.replace(shown, noise_share=0.83).describe()
-    assert "mostly noise" not in dataclasses.replace(shown, noise_share=0.4).describe()
+def test_bars_of_noise_are_pale() -> None:
+    loud, quiet = np.ones((4, 2, 8, 8), np.int8), np.zeros((4, 2, 8, 8), np.int8)
+    quiet[:2] = 1
+    page = Canvas(500, 160)
+    draw_strip(page, without_noise(camera(loud), quiet), 50, 40, 400, 80, 1.0)
+    image = page.image()[60]
+    assert tuple(image[60]) == BRIGHTER
+    assert tuple(image[440]) not in (BRIGHTER, WHITE)
+    assert image[440, 0] > image[440, 1]  # reddish
 
 
 def test_the_whole_picture_has_a_box_around_the_crop() -> None:
@@ -266,8 +166,30 @@ def test_the_whole_picture_has_a_box_around_the_crop() -> None:
     assert np.array_equal(page.image(), before)
 
 
+def test_the_overview_marks_the_cameras_of_its_clip_only() -> None:
+    voxels = np.zeros((2, 2, 30, 40), np.int8)
+    whole = dataclasses.replace(camera(voxels), title="all of it")
+    params = dataclasses.replace(PARAMS, scale=1.0, crop_left_px=10, crop_top_px=5)
+    seen = dataclasses.replace(PROVENANCE, params=params)
+    looks = dataclasses.replace(camera(voxels[..., :16, :16]), provenance=seen, whole=np.zeros((30, 40), np.uint8))
+    other = dataclasses.replace(looks, provenance=dataclasses.replace(seen, start_frame=seen.start_frame + 1))
+
+    def marked(cameras: list[Camera]) -> tuple[int, int]:
+        page = Canvas(overview_width(80), 300)
+        draw_overview(page, whole, cameras, 10, 80, 1.0, 1.0)
+        image = page.image()
+        return has(image[:, :190], MARK), has(image[:, 200:370], MARK)
+
+    nothing, _ = marked([other])
+    assert nothing == 0
+    frame, events = marked([looks])
+    assert frame > events > 0  # the number stands in one of both
+    sheet = draw_sheet([looks, other], "t", whole=whole)
+    assert sheet.shape[0] - draw_sheet([looks, other], "t").shape[0] == overview_height(whole, 192)
+
+
 def test_arrows_of_flow_point_where_pixels_move() -> None:
-    """Flow to the right in the upper half, none below: dark tips lie right of the light rims' beginnings, above."""
+    """Flow is to the right in the upper half and zero below: only above are dark tips, right of the light rims."""
     flow = np.zeros((2, 32, 32), np.float32)
     flow[0, :16] = 3.0
     page = Canvas(128, 128)
@@ -299,6 +221,32 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
     assert len({picture.shape for picture in film}) == 1
     busiest = [has(picture, BRIGHTER) for picture in film]
     assert busiest.index(max(busiest)) == 3
+
+
+def test_a_camera_of_mostly_noise_says_so_in_a_film_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    loud, quiet = np.ones((3, 2, 16, 16), np.int8), np.zeros((3, 2, 16, 16), np.int8)
+    quiet[:, :, :4] = 1
+    written: list[str] = []
+    write = Canvas.text
+
+    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
+        written.append(text)
+        return write(page, x, y, text, **style)
+
+    monkeypatch.setattr(Canvas, "text", listen)
+    next(draw_film([without_noise(camera(loud), quiet)], "t"))
+    assert "mostly noise: 75% of the events" in written
+
+
+def test_a_film_begins_with_the_whole_picture() -> None:
+    quiet = camera(np.zeros((3, 2, 16, 16), np.int8))
+    voxels = np.zeros((3, 2, 30, 40), np.int8)
+    voxels[2, 0] = 1
+    film = list(draw_film([quiet], "t", tile_px=32, whole=camera(voxels)))
+    assert len(film) == 6
+    red = [has(picture, BRIGHTER) for picture in film]
+    assert red.index(max(red)) == 4
+    assert film[0].shape[0] > next(draw_film([quiet], "t", tile_px=32)).shape[0]
 
 
 def test_nothing_at_all_is_drawn_without_a_warning() -> None:

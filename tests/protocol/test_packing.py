@@ -51,7 +51,7 @@ def test_what_lies_in_a_slot_is_not_packed() -> None:
 
 def test_who_cannot_unpack_refuses() -> None:
     header, frames = message(np.zeros(8, np.int8))
-    with pytest.raises(ProtocolError, match="not asked for"):
+    with pytest.raises(ProtocolError, match="compression was not requested"):
         decode_sample(header, frames)
 
 

@@ -62,7 +62,7 @@ def test_keys_may_be_written_as_the_flags_are(tmp_path: Path) -> None:
     config = load(tmp_path, text)
     assert (config.worker_bind, config.lease_deadline_seconds) == ("tcp://127.0.0.1:5556", 5)
     assert config.spec.voxel_dtype == "int16"
-    with pytest.raises(UsageError, match="port_file is there twice, with dashes and with underscores"):
+    with pytest.raises(UsageError, match="port_file appears twice, with dashes and with underscores"):
         load(tmp_path, "videos: a\nport-file: a\nport_file: b\n")
     with pytest.raises(UsageError, match=r"unknown key in --config .*: 'worker_bin' \(did you mean 'worker_bind'\?\)"):
         load(tmp_path, "videos: a\nworker-bin: a\n")
@@ -132,8 +132,8 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("5: 6", "expected keys and values, found dict"),
         ("a: [", "--config .*: not YAML"),
         ("a: 2001-99-99", "--config .*: not YAML"),
-        ("workers: 3\nworkers: 4", "--config .*: not YAML: 'workers' is there twice in .*, line 2"),
-        ("recipe: {gamma: 2, bins: 3, gamma: 1}", "'gamma' is there twice"),
+        ("workers: 3\nworkers: 4", "--config .*: not YAML: 'workers' appears twice in .*, line 2"),
+        ("recipe: {gamma: 2, bins: 3, gamma: 1}", "'gamma' appears twice"),
         ("[a]: 1", "not YAML: .* unhashable key"),
         ("workers: two", "--workers = 'two': give a whole number, or LEAST:MOST, from 0 to 4096"),
         ("workers: true", "--workers = True: give a whole number"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from tests.server.peers import peers
 from tests.server.queues import Queues, ToySupervisor
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoChanged
-from v2v_protocol.messages import Pong, Stop
+from v2v_protocol.messages import Pong, Stop, WorkerHello
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
@@ -37,7 +38,9 @@ RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
 class Scripted:
     """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
 
-    def __init__(self, first: Sequence[Action] = (), after_record: Sequence[Action] = ()) -> None:
+    def __init__(
+        self, first: Sequence[Action] = (), after_record: Sequence[Action] = (), workers: Sequence[bytes] = ()
+    ) -> None:
         self.first: list[Action] = list(first)
         self.after_record = after_record
         self.told: list[tuple[Any, ...]] = []
@@ -45,6 +48,8 @@ class Scripted:
         self.blocked_reason = ""
         self.counters = Counters()
         self._there = peers().dispatcher
+        for worker in workers:
+            self._there.registry.add(worker, WorkerHello(worker.decode(), NUMERICS_VERSION, 2), 0.0)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._there, name)  # what there is to look at
@@ -120,7 +125,25 @@ def test_a_record_that_cannot_be_written_is_said_and_the_server_goes_on(
     dispatcher = Scripted([RECORD])
     served(dispatcher, tmp_path)
     assert dispatcher.told == [("recorded", RECORD, [])]
-    assert "v.mp4 from frame 0: crash; it is passed over this once and comes again" in capsys.readouterr().err
+    assert "v.mp4 from frame 0: crash; the sequence is skipped once and will be tried again" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("is_freed", [True, False])
+def test_a_record_waits_for_another_writer_and_the_server_does_not(is_freed: bool, tmp_path: Path) -> None:
+    file, times = tmp_path / "quarantine.jsonl", [0.0]
+    dispatcher = Scripted([RECORD])
+    with file.open("wb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        server = served(dispatcher, tmp_path, clock=lambda: times[0])
+        times[0] = 1.0
+        server.turn(0.0)
+        assert dispatcher.told == []
+        if not is_freed:
+            times[0] = 2.0
+            server.turn(0.0)
+    times[0] = 3.0
+    server.turn(0.0)
+    assert dispatcher.told == [("recorded", RECORD, [replace(VERDICT, snapshot=1)] if is_freed else [])]
 
 
 @pytest.mark.parametrize("found", [True, False])
@@ -130,12 +153,12 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
             raise VideoChanged("a.mp4", None, "another file")
 
     missing = CheckVideo("a.mp4", "f", b"w", None, "cannot be read", Request(b"c", 0, 0))
-    dispatcher = Scripted([missing, missing])
+    dispatcher = Scripted([missing, missing], workers=[b"w"])
     server = served(dispatcher, tmp_path, check=check)
     assert dispatcher.told == [("looked for", missing, found)] * 2
     assert cast(Any, server)._catalogue.stale == ([] if found else ["a.mp4"] * 2)
     said = capsys.readouterr().err
-    assert said.count("worker w failed on a.mp4, which is on this host as it was catalogued: cannot be read") == found
+    assert said.count("worker w failed on a.mp4, which is on this host as catalogued: cannot be read") == found
 
 
 def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,14 +169,14 @@ def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.Cap
         dispatcher.blocked_reason = reason
         now[0] += seconds
         server.turn(0.0)
-    assert capsys.readouterr().err.count("no sample is begun: locked") == 1
+    assert capsys.readouterr().err.count("no samples are started: locked") == 1
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:
     supervisor = ToySupervisor(lambda name, address: None)
     supervisor.scale(1)
     supervisor.watch(0.0, 0)
-    dispatcher = Scripted([GiveUp(b"toy1", "slept"), GiveUp(b"elsewhere", "slept")])
+    dispatcher = Scripted([GiveUp(b"toy1", "slept"), GiveUp(b"elsewhere", "slept")], workers=[b"toy1", b"elsewhere"])
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == [
         ("lost", b"toy1", Loss(Cause.HUNG, "slept")),
@@ -166,11 +189,11 @@ def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.Captu
     supervisor.scale(2)
     supervisor.watch(0.0, 0)
     supervisor.kill(b"toy1", Cause.CRASHED)
-    dispatcher = Scripted()
+    dispatcher = Scripted(workers=[b"toy1"])
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == [("lost", b"toy1", Loss(Cause.CRASHED, "died"))]
     assert supervisor.workers == [b"toy2", b"toy3"]
-    assert "worker toy1 died; its work is given to others" in capsys.readouterr().err
+    assert "worker toy1 died; its leases go to other workers" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("watched", [True, False])
@@ -179,7 +202,7 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool,
     supervisor = ToySupervisor(lambda name, address: None)
     supervisor.scale(int(watched))
     supervisor.watch(0.0, 0)
-    dispatcher = Scripted([ToWorker(b"toy1", encode(Stop()))])
+    dispatcher = Scripted([ToWorker(b"toy1", encode(Stop()))], workers=[b"toy1"])
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == ([] if watched else [("unreachable", b"toy1")])
 

@@ -158,7 +158,7 @@ def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path:
         [sys.executable, "-m", "v2v_server.commands.quarantine", "--videos", URL],
         capture_output=True, text=True, check=True, timeout=60,
     )  # fmt: skip
-    assert "holds 0 verdicts" in shown.stdout
+    assert "holds 0 entries" in shown.stdout
     with LocalServer(URL, workers=0, flags=[*SMALL_FLAGS, "--list-refused"]) as server:
         assert "6 videos in s3://corpus/videos" in server.last_lines()
 

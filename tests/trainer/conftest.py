@@ -1,4 +1,4 @@
-"""Shared by the tests of the trainer: one thread, and the published weights where they are at hand."""
+"""Define fixtures for the trainer's tests: one thread, and the published weights if they are available."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def published() -> Path:
-    """The folder of published weight files: ``$V2V_TEST_WEIGHTS``, or ``../shared/data/weights``."""
+    """Return the folder of published weight files: ``$V2V_TEST_WEIGHTS``, or ``../shared/data/weights``."""
     if not WEIGHTS.is_dir():
         pytest.skip(f"no folder {WEIGHTS}: set V2V_TEST_WEIGHTS to one with the published weight files")
     return WEIGHTS

@@ -137,7 +137,7 @@ def test_a_captured_step_is_the_step(tmp_path: Path, network: str, settings: lis
         torch.testing.assert_close(captured.trained.state_dict()[name], tensor, rtol=1e-4, atol=1e-5, msg=name)
 
 
-def test_another_shape_or_share_of_the_guide_is_recorded_anew(tmp_path: Path) -> None:
+def test_another_shape_or_guide_share_is_recorded_again(tmp_path: Path) -> None:
     trained = learner(tmp_path, "hypere2vid")
     graphs: list[FakeGraph] = []
 
@@ -162,7 +162,7 @@ def test_losses_of_one_step_stay_when_the_next_is_replayed(tmp_path: Path) -> No
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_or_with_several_ranks_it_is_refused(tmp_path: Path) -> None:
     config = load_config(configured(tmp_path), ["compute.cuda_graph=true"])
-    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: there is no GPU here"):
+    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: PyTorch sees no GPU here"):
         build(config, ALONE)
-    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: on one rank only"):
+    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: 2 ranks exchange gradients"):
         build(config, Ranks(0, 2, torch.device("cuda")))

@@ -43,13 +43,13 @@ class Installing(V2VStreamDataset):
 
 
 @pytest.mark.parametrize("before", [signal.SIG_DFL, signal.default_int_handler], ids=["none", "one"])
-def test_the_handler_of_before_is_in_place_while_a_step_is_made(before: signal.Handlers) -> None:
+def test_the_previous_handler_is_active_during_a_step(before: signal.Handlers) -> None:
     signal.signal(signal.SIGCHLD, before)
     for _ in Feed(Installing("tcp://127.0.0.1:1"), CPU).epochs(0, 2):
         assert signal.getsignal(signal.SIGCHLD) is before
 
 
-def test_the_handler_of_before_is_back_where_an_iteration_could_not_begin() -> None:
+def test_the_previous_handler_is_restored_if_iterating_fails() -> None:
     dataset = Installing("tcp://127.0.0.1:1")
     dataset.fails = True
     with pytest.raises(KeyboardInterrupt):
@@ -85,7 +85,7 @@ def until_ended(child: psutil.Process) -> None:
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 
-def test_bringing_a_batch_to_a_gpu_is_counted_as_transfer_and_not_as_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moving_a_batch_to_a_gpu_counts_as_transfer_not_as_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in takes a quarter of a second for it, by a clock that nothing else moves."""
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])

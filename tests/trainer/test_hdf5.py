@@ -1,4 +1,4 @@
-"""HDF5 files that name other files are refused before anything of those is read."""
+"""Test that HDF5 files which refer to other files are refused before those are read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def secret(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_file_of_its_own_is_read(recording: Path) -> None:
+def test_a_self_contained_file_is_read(recording: Path) -> None:
     with h5py.File(recording, "a") as file:
         file["events/again"] = file["/"]  # a group within itself
         file["soft"] = h5py.SoftLink("/events/ts")

@@ -17,6 +17,7 @@ from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import Work
+from trainer.weights import SHIPPED, load_network
 from v2v_protocol.errors import UsageError
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -39,10 +40,18 @@ def step(trained: Learner) -> None:
     trained.optimizer.step()
 
 
+def test_a_training_begins_with_the_shipped_weights() -> None:
+    """By their name, which means the same on every host and in every folder."""
+    network = build(obeying_weights(load_config("finetune-cpu")), ALONE).network
+    shipped, _ = load_network(SHIPPED)
+    for name, tensor in shipped.state_dict().items():
+        assert torch.equal(network.state_dict()[name], tensor)
+
+
 @pytest.mark.parametrize("fused", [False, True], ids=["to a CPU", "to a GPU"])
 @pytest.mark.parametrize("was_fused", [False, True], ids=["from a CPU", "from a GPU"])
 @pytest.mark.parametrize("channels_last", [False, True])
-def test_the_optimiser_goes_on_in_another_memory_format(
+def test_the_optimiser_resumes_in_another_memory_format(
     tmp_path: Path, channels_last: bool, was_fused: bool, fused: bool
 ) -> None:
     before = learner(tmp_path, channels_last=not channels_last, fused=was_fused)
@@ -61,7 +70,7 @@ def test_the_optimiser_goes_on_in_another_memory_format(
         assert torch.allclose(after.network.state_dict()[name], tensor, rtol=0, atol=1e-5), name
 
 
-def test_weights_say_how_their_network_is_built_and_the_configuration_may_say_otherwise(tmp_path: Path) -> None:
+def test_weights_determine_the_network_and_the_configuration_overrides(tmp_path: Path) -> None:
     first = build(load_config(configured(tmp_path)), ALONE)
     torch.save({"state_dict": first.network.state_dict(), "data_loader": {"normalize": True}}, tmp_path / "small.pth")
     weights = f"network.weights={tmp_path / 'small.pth'}"
@@ -141,6 +150,6 @@ def test_dropout_differs_between_ranks_and_steps_and_not_between_runs(tmp_path: 
     assert found[0] == found[3]
 
 
-def test_a_batch_is_cut_into_equal_pieces(tmp_path: Path) -> None:
+def test_a_batch_is_split_into_equal_pieces(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"compute\.pieces = 3: give a divisor of stream\.batch_size = 4"):
         build(load_config(configured(tmp_path), ["compute.pieces=3"]), ALONE)

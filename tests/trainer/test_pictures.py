@@ -1,4 +1,4 @@
-"""Colours of events and flow, sizes, and files."""
+"""Test colours of events and flow, sizes, and files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_events_are_red_blue_and_white() -> None:
     assert (draw_events(np.zeros((1, 2, 2, 3), np.int8)) == 255).all()
 
 
-def test_what_rounding_leaves_of_events_that_cancel_is_white() -> None:
+def test_rounding_errors_of_cancelling_events_are_white() -> None:
     voxels = np.array([0.3, 0.4, -0.7], np.float32).reshape(3, 1, 1)
     assert voxels.sum(axis=-3) != 0
     assert (draw_events(voxels) == 255).all()
@@ -68,7 +68,7 @@ def test_a_film_is_large_enough_to_see() -> None:
     assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
 
 
-def test_a_headed_picture_keeps_its_pixels_and_names_its_columns() -> None:
+def test_a_header_keeps_the_pixels_and_names_the_columns() -> None:
     picture = np.random.default_rng(0).integers(0, 255, (60, 390, 3)).astype(np.uint8)
     page = add_header(picture, ("events", "target", "reconstruction"), "step 7", time_runs_down=True)
     assert np.array_equal(page[-60:, -390:], picture)
@@ -81,7 +81,7 @@ def test_a_headed_picture_keeps_its_pixels_and_names_its_columns() -> None:
     assert add_header(picture, ()) is picture
 
 
-def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file"):
         write_png(tmp_path / "file" / "a.png", np.zeros((2, 2, 3), np.uint8))
@@ -89,7 +89,7 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fps", [1.0, 65.5354, 149.993, 1000.123])
 def test_a_video_of_any_rate_is_written(tmp_path: Path, fps: float) -> None:
-    """EVAID has 150 pictures a second, and time stamps of microseconds make an odd number of them."""
+    """EVAID has 150 pictures per second, and time stamps in microseconds make the rate fractional."""
     with Video(tmp_path / "a.mp4", fps) as video:
         video.add(np.zeros((17, 24, 3), np.uint8))
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-2)

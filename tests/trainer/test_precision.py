@@ -58,14 +58,14 @@ def used_often(share: bool, *, view: bool) -> tuple[Tensor, int]:
 
 @pytest.mark.parametrize("view", [False, True])
 @pytest.mark.parametrize(("share", "most"), [(True, 1), (False, USES)])
-def test_gradients_are_added_up_in_float32(share: bool, most: int, view: bool) -> None:
+def test_gradients_are_summed_in_float32(share: bool, most: int, view: bool) -> None:
     gradient, casts = used_often(share, view=view)
     assert gradient.dtype == torch.float32
     assert gradient[0, -1] == USES
     assert casts == most
 
 
-def test_autocast_by_itself_adds_up_in_bfloat16() -> None:
+def test_autocast_alone_sums_in_bfloat16() -> None:
     weight = nn.Parameter(torch.ones(1, 2))
     with torch.autocast("cpu", torch.bfloat16):
         total = torch.stack([F.linear(torch.ones(1, 2), weight).float() for _ in range(USES)]).sum()
@@ -74,7 +74,7 @@ def test_autocast_by_itself_adds_up_in_bfloat16() -> None:
     assert weight.grad[0, 0] < USES
 
 
-def test_switched_off_changes_nothing() -> None:
+def test_disabled_casting_leaves_layers_unchanged() -> None:
     layer = nn.Linear(3, 3)
     x = torch.rand(2, 3)
     with bfloat16_products(CPU, enabled=False):

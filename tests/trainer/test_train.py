@@ -24,7 +24,7 @@ from trainer.train import main
 from trainer.weights import load_into, load_network
 
 
-def test_it_trains(whole: Path) -> None:
+def test_training_reduces_the_loss(whole: Path) -> None:
     readings = losses(whole)
     assert [record["step"] for record in readings] == list(range(1, 13))
     assert [record["epoch"] for record in readings] == [0] * 5 + [1] * 5 + [2] * 2
@@ -81,7 +81,7 @@ def test_every_network_resumes_exactly(
     assert same(load_checkpoint(resumed / LAST).model, load_checkpoint(whole / LAST).model)
 
 
-def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+def test_resuming_drops_readings_of_later_steps(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     """As after a crash: the last checkpoint is older than the last reading."""
     run = trained(tmp_path, server.address, "run", run__steps=7, run__save_every=4)
     early = trained(tmp_path, server.address, "early", run__steps=4)
@@ -90,7 +90,7 @@ def test_resuming_drops_what_was_said_of_later_steps(server: FakeServer, whole: 
     assert losses(run) == losses(whole)
 
 
-def test_a_run_begun_anew_drops_what_an_ended_one_said(server: FakeServer, tmp_path: Path) -> None:
+def test_a_restarted_run_drops_readings_of_the_ended_one(server: FakeServer, tmp_path: Path) -> None:
     """One that ended before its first checkpoint, in the same folder."""
     run = trained(tmp_path, server.address, "run", run__steps=3)
     (run / LAST).unlink()
@@ -100,7 +100,7 @@ def test_a_run_begun_anew_drops_what_an_ended_one_said(server: FakeServer, tmp_p
     assert [record["step"] for record in losses(run)] == [1, 2]
 
 
-def test_a_reading_that_a_crash_cut_off_hinders_nobody(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+def test_a_truncated_reading_is_ignored(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=3)
     with (run / METRICS).open("a", encoding="utf-8") as file:
         file.write('{"step": 4, "epo')
@@ -108,7 +108,7 @@ def test_a_reading_that_a_crash_cut_off_hinders_nobody(server: FakeServer, whole
     assert losses(run) == losses(whole)[:4]
 
 
-def test_a_larger_batch_does_not_repeat_an_epoch_of_which_less_is_left(tmp_path: Path) -> None:
+def test_a_larger_batch_does_not_repeat_a_nearly_finished_epoch(tmp_path: Path) -> None:
     """16 of 23 samples are trained on, and 7 are no batch of 8: the next epoch begins, with its learning rate."""
     with FakeServer(sequences=23) as server:
         run = trained(tmp_path, server.address, "run", run__steps=4)
@@ -124,7 +124,7 @@ def test_a_larger_batch_does_not_repeat_an_epoch_of_which_less_is_left(tmp_path:
     assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] * 2 + [0.0025]
 
 
-def test_a_finished_run_has_nothing_left(server: FakeServer, tmp_path: Path) -> None:
+def test_a_finished_run_takes_no_more_steps(server: FakeServer, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__epochs=1)
     before = load_checkpoint(run / LAST)
     assert (before.step, before.epoch) == (5, 1)
@@ -164,7 +164,7 @@ def test_a_preview_does_not_change_the_training(server: FakeServer, whole: Path,
 
 
 @pytest.mark.parametrize(("processor", "slow"), [("AVX2", True), ("AVX512", False)])
-def test_bfloat16_in_software_is_said(
+def test_bfloat16_in_software_is_reported(
     server: FakeServer,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -177,9 +177,7 @@ def test_bfloat16_in_software_is_said(
     assert ("bfloat16 in software" in said) == slow
 
 
-def test_the_configuration_of_a_run_is_beside_it(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_stores_its_configuration(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=1)
     assert main([*arguments(tmp_path, server.address, "run", run__steps=1), "--show-config"]) == 0
     assert capsys.readouterr().out.endswith((run / "config.yaml").read_text())
@@ -224,7 +222,7 @@ def test_a_network_touches_its_own_file_and_one_line_of_the_registry(
     assert isinstance(load_network(tmp_path / "bare.pth")[0], Toy)
 
 
-def test_flow_is_judged_and_shown_as_well(server: FakeServer, tmp_path: Path) -> None:
+def test_flow_is_scored_and_drawn_as_well(server: FakeServer, tmp_path: Path) -> None:
     run = trained(
         tmp_path, server.address, "run", run__steps=2, run__preview_every=2, run__judge_every=1,
         network__name="evflownet", network__options={"base_channels": 2},
@@ -249,7 +247,7 @@ def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> No
     assert [path.name for path in (run / "previews").glob("*.png")] == ["step-0000001-0.png"]
 
 
-def test_too_large_a_batch_is_said_with_its_own_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_large_a_batch_is_reported_with_its_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeServer(sequences=1) as server:
         told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
     assert "no global batch of 1 x 4 = 4 samples" in told

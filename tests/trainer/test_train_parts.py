@@ -27,7 +27,7 @@ from v2v_protocol.recipe import Recipe
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
-def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
+def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:
     recipe = Recipe.from_dict({"preset": "clean", "bins": 3})
     plain = server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
     assert plain[:2] == ["--rows", "top:0.5"]
@@ -38,7 +38,7 @@ def test_a_server_of_its_own_is_told_what_it_has_to_know_at_its_start() -> None:
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
 
 
-def test_it_says_what_server_it_starts_before_that_takes_its_time(
+def test_the_started_server_is_announced_before_it_is_ready(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def never(*_: object, **__: object) -> None:
@@ -129,7 +129,7 @@ def test_a_signal_within_a_step_lets_it_finish() -> None:
     assert finished == [0, 1, 2, 3, 4]
 
 
-def test_without_a_signal_everything_comes_and_the_handlers_are_put_back() -> None:
+def test_without_a_signal_all_items_come_and_handlers_are_restored() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with StopRequest() as stop:
         assert list(stop.until(range(5))) == [0, 1, 2, 3, 4]
@@ -137,7 +137,7 @@ def test_without_a_signal_everything_comes_and_the_handlers_are_put_back() -> No
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
-def test_the_third_signal_is_not_held_back() -> None:
+def test_the_third_signal_takes_effect_immediately() -> None:
     def steps() -> None:
         with StopRequest() as stop:
             for _ in stop.until(range(10)):
@@ -151,14 +151,14 @@ def test_the_third_signal_is_not_held_back() -> None:
             steps()
 
 
-def test_any_rank_ends_all_of_them_before_the_next_step() -> None:
+def test_any_rank_stops_all_ranks_before_the_next_step() -> None:
     votes = iter([False, False, True])
     with StopRequest(agree=lambda mine: next(votes) or mine) as stop:
         assert list(stop.until(range(10))) == [0, 1]
     assert not stop.wanted
 
 
-def test_every_round_is_voted_on_also_the_last() -> None:
+def test_ranks_vote_in_every_round_including_the_last() -> None:
     """Ranks that end and ranks that stop meet in the same vote, or one would wait for ever."""
     votes: list[bool] = []
 
@@ -188,7 +188,7 @@ def test_a_time_limit_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("error", [ServerLost("gone"), StateMismatch("other videos"), WorkerCrashLoop("no worker")])
-def test_why_the_data_ended_is_kept_for_later(error: V2VError) -> None:
+def test_the_reason_why_the_data_ended_is_kept(error: V2VError) -> None:
     def items() -> Iterator[int]:
         yield 0
         raise error
@@ -201,7 +201,7 @@ def test_why_the_data_ended_is_kept_for_later(error: V2VError) -> None:
 @pytest.mark.parametrize(
     "error", [RuntimeError("DataLoader worker (pid 7) exited unexpectedly"), EOFError(), ConnectionResetError("gone")]
 )
-def test_workers_that_the_signal_ended_as_well_are_no_error(error: Exception) -> None:
+def test_loader_workers_ended_by_the_same_signal_are_not_an_error(error: Exception) -> None:
     def items(number: int) -> Iterator[int]:
         yield 0
         try:
@@ -220,7 +220,7 @@ def test_workers_that_the_signal_ended_as_well_are_no_error(error: Exception) ->
 # --- ranks -----------------------------------------------------------------------------------------------------------
 
 
-def test_one_process_is_a_rank_by_itself() -> None:
+def test_one_process_is_a_single_rank() -> None:
     with ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
         assert mine.any(True)
@@ -246,7 +246,7 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
     assert left == ([] if error else [True])
 
 
-def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_process_group_is_destroyed_after_training(monkeypatch: pytest.MonkeyPatch) -> None:
     """A model of several ranks knows its group, and lies in a circle of references."""
 
     class Model:
@@ -272,6 +272,6 @@ def test_the_group_is_left_when_nothing_knows_it_any_more(monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_said() -> None:
+def test_a_missing_gpu_is_reported() -> None:
     with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda", 60.0):
         pass

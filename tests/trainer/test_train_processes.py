@@ -146,7 +146,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_on_a_server_of_its_own_a_resumed_run_is_the_uninterrupted_one(clips: Path, tmp_path: Path) -> None:
+def test_with_a_local_server_a_resumed_run_equals_the_uninterrupted_one(clips: Path, tmp_path: Path) -> None:
     """The server of the second half is another process, with another number of workers."""
 
     def run(out: str, steps: int, *more: str) -> Path:
@@ -167,7 +167,7 @@ def test_on_a_server_of_its_own_a_resumed_run_is_the_uninterrupted_one(clips: Pa
 
 
 @pytest.mark.slow
-def test_a_run_is_judged_on_videos_that_it_does_not_train_on(
+def test_a_run_is_scored_on_videos_it_does_not_train_on(
     server: FakeServer, clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The held-out batch comes from a server of its own, which is gone when training begins."""

@@ -1,1 +1,1 @@
-"""How well a network reconstructs real recordings: readers, voxel grids, metrics, tables, pictures."""
+"""Evaluate networks on real recordings: readers, voxel grids, metrics, tables, pictures."""

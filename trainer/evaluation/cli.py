@@ -154,7 +154,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise
     if not scores:
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
-        raise UsageError(f"--data {data} holds no sequence of {wanted}; v2v-convert makes the files")
+        raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
     if arguments.per_frame is not None:
         write_frames(Path(arguments.per_frame), scores)

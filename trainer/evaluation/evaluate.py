@@ -7,13 +7,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from trainer import pictures
 from trainer.evaluation import layout
 from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.metrics import Metric
-from trainer.evaluation.pictures import choose_steps, draw_step
+from trainer.evaluation.pictures import choose_steps, draw_recording, draw_step
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.reconstruct import Stretch, reconstruct
 from trainer.evaluation.score import SequenceScore, SequenceScorer
@@ -162,7 +160,9 @@ def evaluate_sequence(
                         video.add(image)
                 advance(recording.name, number + 1, len(windows))
         if run.drawing.folder is not None:
-            pictures.write_png(run.drawing.folder / data_set.name / f"{recording.name}.png", np.vstack(rows))
+            seconds = [window.end - window.begin for window in windows]
+            sheet = draw_recording(rows, recording.name, seconds, with_camera=bool(recording.images))
+            pictures.write_png(run.drawing.folder / data_set.name / f"{recording.name}.png", sheet)
         return scorer.score(data_set.name, recording.name, recording.repaired_images)
 
 

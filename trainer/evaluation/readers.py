@@ -184,7 +184,7 @@ class Recording:
             raise self._clock_error(times)
         times = self._repair_times(times)
         for time, index in zip(times, stored, strict=True):
-            # The picture's time is outside the events' times, but its index is not: for instance, one clock is in us.
+            # The time is outside the events' times, but its index has events on both sides: one clock may be in us.
             if (time < first - CLOCK_SLACK_SECONDS and index > 1) or (
                 time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
             ):

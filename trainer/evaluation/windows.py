@@ -100,11 +100,11 @@ def regular_windows(recording: Recording, fps: float) -> list[EventWindow]:
         UsageError: ``fps`` is not above 0, or the recording is shorter than one window.
     """
     if not fps > 0:
-        raise UsageError(f"{fps:g} windows a second: give more than 0")
+        raise UsageError(f"{fps:g} windows per second: give more than 0")
     first, last = recording.span
     count = int((last - first) * fps + 1e-9)
     if count < 1:
-        raise UsageError(f"{recording.path} lasts {last - first:.3f} s, less than one window at {fps:g} a second")
+        raise UsageError(f"{recording.path} lasts {last - first:.3f} s, less than one window at {fps:g} per second")
     edges = [first + step / fps for step in range(count + 1)]
     indices = [bisect.bisect_left(recording.times, edge) for edge in edges]
     return [EventWindow(indices[i], indices[i + 1], edges[i], edges[i + 1], None) for i in range(count)]

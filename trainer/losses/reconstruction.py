@@ -79,7 +79,7 @@ class ReconstructionLoss(nn.Module):
             terms["l1"] = self.l1_weight * l1_loss(prediction, target)
         if self.temporal is not None and self.temporal_weight:
             if flow is None:
-                raise UsageError("temporal consistency needs the flow between target frames; none was given")
+                raise UsageError("flow is missing: temporal consistency needs the flow between target frames")
             terms["temporal"] = self.temporal_weight * self.temporal(prediction, target, flow)
         total = torch.stack(list(terms.values())).sum()
         return {name: term.detach() for name, term in terms.items()} | {"total": total}

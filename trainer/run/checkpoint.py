@@ -1,11 +1,11 @@
-"""Checkpoints of a training run: everything that decides its next losses, and nothing that needs code to be read.
+"""Checkpoints of a training run: all that determines its next losses, readable without executing code.
 
 A checkpoint holds tensors and plain values only, so it loads with ``weights_only=True``: state dicts of the network and
-the optimiser (never the object), the position in the stream after the last batch that was trained on
-(``Batch.resume_state``), the counters and the configuration.
+the optimiser (never the object), the position in the stream after the last batch trained on (``Batch.resume_state``),
+the counters and the configuration.
 
-Writing is atomic: a reader, or the next start after a power cut, sees the old file or the new one, whole. Which run a
-checkpoint belongs to, and which folder a run may write to, is decided here as well.
+Writing is atomic: a reader, or the next start after a power cut, sees the whole old file or the whole new one. This
+module also checks that a checkpoint belongs to a run, and that a run may write to a folder.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ MAY_DIFFER = (
     *("stream.loader_workers", "stream.timeout_seconds"),
     *("loss.lpips_backbone", "loss.lpips_heads", "loss.raft_weights", "network.weights", "compute.seed"),
 )
-"""Where things lie and how fast they come. What the videos hold is compared by the stream itself."""
+"""Keys of places and of speed. The stream itself compares the content of the videos."""
 
 MAY_CHANGE = ("run.", "compute.", "stream.batch_size")
-"""Said aloud, but allowed: how long to train and on what. Losses are then no longer those of an uninterrupted run."""
+"""Keys of length and device: a change is allowed and reported. It may change the losses."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One moment of a training run, between two steps.
+    """The state of a training run between two steps.
 
     Attributes:
         step: optimiser steps taken so far, over all epochs.
@@ -52,7 +52,7 @@ class Checkpoint:
         optimizer: its state dict.
         ema: state dict of the averaged network, or None without one.
         stream: ``resume_state`` of the last batch trained on; None before the first.
-        config: the run's configuration as plain values.
+        config: configuration of the run as plain values.
     """
 
     step: int
@@ -65,10 +65,10 @@ class Checkpoint:
 
 
 def _plain(value: Any, place: str) -> Any:
-    """``value`` with every mapping as a dict, checked to be readable without code.
+    """Return ``value`` with every mapping as a dict, and check that it is readable without code.
 
     Raises:
-        UsageError: something else than a tensor or a plain value, and where it is.
+        UsageError: a part of it is neither a tensor nor a plain value.
     """
     if isinstance(value, Mapping):
         return {key: _plain(item, f"{place}[{key!r}]") for key, item in value.items()}
@@ -81,22 +81,30 @@ def _plain(value: Any, place: str) -> Any:
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint, replacing ``path`` only once all of it is on the disk.
+    """Write a checkpoint with :func:`save_atomically`.
 
     Raises:
-        UsageError: a part of it is neither tensor nor plain.
-        OSError: the disk refused; ``path`` is as it was.
+        UsageError: a part of it is neither a tensor nor a plain value.
+        OSError: it cannot be written; an earlier file is intact.
     """
-    path = Path(path)
     content = {"format": FORMAT}
     for item in dataclasses.fields(checkpoint):
         content[item.name] = _plain(getattr(checkpoint, item.name), item.name)
+    save_atomically(Path(path), content)
+
+
+def save_atomically(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file with ``torch.save``, and replace ``path`` only when all of it is on the disk.
+
+    Raises:
+        OSError: it cannot be written; an earlier file is intact.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         try:
             torch.save(content, file)
         except RuntimeError as error:
-            # PyTorch closes its archive on the way out of the disk's error, and complains that bytes are missing.
+            # PyTorch closes its archive while it handles the OSError, and raises that bytes are missing.
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise
@@ -123,17 +131,17 @@ def epoch_name(epoch: int) -> str:
 
 
 def prune_epochs(out: Path, keep: int) -> None:
-    """Removes checkpoints of epochs in the folder of a run, the oldest first, until ``keep`` are left."""
+    """Remove the oldest checkpoints of epochs in the folder of a run, except the last ``keep``."""
     for path in sorted(out.glob("epoch-*.pt"))[:-keep]:
         path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which takes the place of ``path`` once the block has ended and all of it is on the disk.
+    """Yield a file that replaces ``path`` at the end of the block, when all of it is on the disk.
 
     Raises:
-        OSError: the disk refused; ``path`` is as it was, as it is after an error in the block.
+        OSError: it cannot be written. ``path`` is then unchanged, as after an error in the block.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -154,14 +162,15 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
-    """
+    """Check that a configuration continues the run of a checkpoint.
+
     Returns:
-        what differs although it may, one line each.
+        The differences that are allowed, one line each.
 
     Raises:
-        UsageError: a setting that would make it another run differs; the message names all of them with both values.
+        UsageError: a setting differs that makes it another run; the message names all of these with both values.
     """
-    # Keys that are newer than the checkpoint had their default in its run.
+    # A key that is newer than the checkpoint had its default in that run.
     saved = {
         section: {**dataclasses.asdict(type(getattr(config, section))()), **checkpoint.config.get(section, {})}
         for section in config.to_dict()
@@ -180,9 +189,10 @@ def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
 
 
 def require_fresh(out: Path) -> None:
-    """
+    """Check that a new run would not overwrite another one.
+
     Raises:
-        UsageError: the folder holds a run, which a new one would write over; or it may not be entered.
+        UsageError: the folder holds a run, or cannot be entered.
     """
     try:
         holds_run = (out / LAST).exists()
@@ -193,10 +203,10 @@ def require_fresh(out: Path) -> None:
 
 
 def require_writable(out: Path) -> None:
-    """Makes the folder where it is missing, before anything is started for nothing.
+    """Create the folder of a run if it is missing, and check that it is writable.
 
     Raises:
-        UsageError: it cannot be made, or nothing can be written there.
+        UsageError: it cannot be created or written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

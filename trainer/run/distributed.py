@@ -1,7 +1,7 @@
-"""Ranks of one training run: started by torchrun, or one alone.
+"""Ranks of one training run: started by torchrun, or a single one.
 
-A process group of two backends: NCCL moves gradients between GPUs, gloo moves the small words that only the CPU knows
-(does any rank want to stop?), so that agreeing never waits for a GPU.
+The process group has two backends: NCCL exchanges gradients between GPUs, gloo exchanges what only the CPU knows (does
+any rank want to stop?), so that agreeing never waits for a GPU.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from datetime import timedelta
 from typing import Any
 
 import torch
-import torch.distributed.nn.functional  # before there is a group: its functions keep the one of then as their default
+import torch.distributed.nn.functional  # before a group exists: its functions keep the group of that time as default
 from torch import Tensor, distributed
 
 from v2v_protocol.errors import UsageError
@@ -23,12 +23,11 @@ from v2v_protocol.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class Ranks:
-    """This process among its siblings.
+    """This rank and the number of ranks.
 
     Attributes:
-        rank, world_size: which of how many.
         device: what this rank computes on.
-        hosts: on how many machines they run.
+        hosts: number of machines with ranks.
     """
 
     rank: int
@@ -38,11 +37,11 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """The rank that writes files and speaks."""
+        """Whether this rank writes files and prints."""
         return self.rank == 0
 
     def any(self, wish: bool) -> bool:
-        """Whether any rank wishes it; all must ask."""
+        """Return whether ``wish`` is true on any rank; all ranks call it."""
         if self.world_size == 1:
             return wish
         votes = torch.tensor([int(wish)])
@@ -50,7 +49,7 @@ class Ranks:
         return bool(votes.item())
 
     def mean(self, values: Tensor) -> Tensor:
-        """The mean over the ranks; all must ask."""
+        """Return the mean over the ranks; all ranks call it."""
         if self.world_size == 1:
             return values
         values = values.clone()
@@ -58,7 +57,7 @@ class Ranks:
         return values / self.world_size
 
     def from_first(self, value: Any) -> Any:
-        """What the first rank gave (a plain value); all must ask."""
+        """Return the value (a plain one) of the first rank; all ranks call it."""
         if self.world_size == 1:
             return value
         carrier = [value]
@@ -83,16 +82,16 @@ class Ranks:
 
 
 def on_gpu(device: str) -> bool:
-    """Whether ``compute.device`` = ``device`` is a GPU here."""
+    """Return whether ``compute.device`` = ``device`` is a GPU here."""
     return device != "cpu" and torch.cuda.is_available() and torch.cuda.device_count() > 0
 
 
 @contextmanager
 def ranks(device: str, timeout_seconds: float) -> Iterator[Ranks]:
-    """This process's place, from the variables that torchrun sets.
+    """Yield this process's rank, from the variables that torchrun sets.
 
-    Whatever knows the group (a DistributedDataParallel above all) must be out of scope at the end of the block: the
-    group ends with the last that knows it, not before.
+    All references to the group, such as a DistributedDataParallel, must be out of scope at the end of the block,
+    because they keep it alive.
 
     Args:
         device: "auto", "cpu" or "cuda".
@@ -120,10 +119,10 @@ def ranks(device: str, timeout_seconds: float) -> Iterator[Ranks]:
         "cpu:gloo,cuda:nccl" if with_gpu else "gloo", timeout=timedelta(seconds=timeout_seconds)
     )
     yield Ranks(distributed.get_rank(), world_size, mine, hosts=-(-world_size // here))
-    # The group's threads free the tensors of the last exchange, for which they need the interpreter. One that is late
-    # and finds it ending aborts the process ("terminate called without an active exception"). So the group must be
-    # gone, and its threads joined, before that: models lie in reference cycles, which only a collection ends.
+    # The group's threads need the interpreter to free the tensors of the last exchange. A thread that does so while the
+    # interpreter exits aborts the process ("terminate called without an active exception"). So the group must be gone,
+    # and its threads joined, before that. Models are in reference cycles, which only a collection frees.
     gc.collect()
-    # Not on the way out of an error: NCCL would wait for ranks that wait for this one, and nobody would read the error.
-    # A process that ends leaves the group by itself, at worst by the abort of above, after its error was said.
+    # Not after an error: NCCL would wait for ranks that wait for this one, before the error is printed. A process that
+    # exits leaves the group by itself, at worst with the abort above, after its error is printed.
     distributed.destroy_process_group()

@@ -1,8 +1,8 @@
-"""The weights of a checkpoint alone, to be given to others: a small file that v2v-eval and ``network.weights`` take.
+"""Export the weights of a checkpoint to a small file for v2v-eval and ``network.weights``.
 
     python -m trainer.run.export runs/firenet-cpu/last.pt firenet.pt
 
-The averaged weights where the run has them.
+If the run has averaged weights, it exports these.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
-from trainer.run.checkpoint import load_checkpoint, replacing
+from trainer.run.checkpoint import load_checkpoint, save_atomically
 from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import UsageError
 
 
 def export(checkpoint: Path, file: Path) -> int:
-    """Writes ``file``; returns the steps that its weights were trained for.
+    """Write ``file``; return the number of steps that its weights were trained for.
 
     Raises:
-        UsageError: no such checkpoint, or none of a training run.
-        OSError: the disk refused.
+        UsageError: no such checkpoint, not one of a training run, or ``file`` cannot be written.
     """
     found = load_checkpoint(checkpoint)
     network = {key: found.config["network"][key] for key in ("name", "options")}
-    with replacing(file) as out:
-        torch.save({"state_dict": dict(found.ema or found.model), "config": {"network": network}}, out)
+    try:
+        save_atomically(file, {"state_dict": dict(found.ema or found.model), "config": {"network": network}})
+    except OSError as error:
+        raise UsageError(f"{file}: {error.strerror or error}; give another FILE, or free space there") from error
     return found.step
 
 
@@ -39,7 +39,7 @@ def _run(asked: argparse.Namespace) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line; return the exit status."""
     name = "python -m trainer.run.export"
     parser = Parser(name, "CHECKPOINT FILE", "Write the weights of a checkpoint alone.", [f"{name} last.pt firenet.pt"])
     parser.add_argument("checkpoint", type=Path)

@@ -1,7 +1,7 @@
-"""A clean end on Ctrl-C, on SIGTERM, at a time limit or without data: between two steps, on all ranks the same.
+"""A clean end on Ctrl-C, on SIGTERM, at a time limit or without data: after the same step on all ranks.
 
-The signal's handler only leaves a note, so no step is cut in half; but while the loop waits for data, which may take
-for ever (the same Ctrl-C reaches a server in the same terminal), the handler ends the wait.
+The signal handler only sets a flag, so a step is never interrupted. While the loop waits for data, which may never come
+(the same Ctrl-C reaches a server in the same terminal), the handler ends the wait.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from v2v_protocol.errors import V2VError
 Item = TypeVar("Item")
 
 _PATIENT_SIGNALS = 2
-"""torchrun passes on the Ctrl-C that its processes had from the terminal already; the next one is meant."""
+"""torchrun forwards the Ctrl-C that its processes already had from the terminal, so two signals may be one Ctrl-C."""
 
 
 class _StopWaiting(BaseException):
-    """Leaves the wait for data. Not an Exception, so that nothing on the way takes it for an error."""
+    """Ends the wait for data. Not an Exception, so that no handler of errors catches it."""
 
 
 class StopRequest:
-    """Whether the run shall end, from ``with`` on (in the main thread).
+    """A request to end the run, from ``with`` on (in the main thread).
 
     The third signal ends the process as if there were no handler.
 
     Args:
         seconds: end after this time; 0: no limit.
-        agree: turns the wish of this rank into that of any; called once per step by all ranks.
+        agree: returns whether any rank wants to end; all ranks call it once per step.
 
     Attributes:
-        signal: number of the first signal that came; 0 without one.
-        failure: why the data ended, where it did not end by itself; to be raised once everything is saved.
+        signal: number of the first signal; 0 without one.
+        failure: the error that ended the data, to be raised when everything is saved; None without one.
     """
 
     def __init__(self, seconds: float = 0.0, agree: Callable[[bool], bool] = bool) -> None:
@@ -66,13 +66,13 @@ class StopRequest:
 
     @property
     def wanted(self) -> bool:
-        """This rank wants to end."""
+        """Whether this rank wants to end."""
         if self.signal or self.failure is not None:
             return True
         return self._deadline is not None and time.monotonic() >= self._deadline
 
     def next(self, items: Iterator[Item]) -> Item | None:
-        """The next item; None at the end, or when a signal came while waiting for it."""
+        """Return the next item; None at the end, or if a signal came while waiting for it."""
         try:
             try:
                 self._waiting = True
@@ -83,9 +83,9 @@ class StopRequest:
             return None
 
     def until(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items, up to the end or to the first one before which any rank wants to stop or has no data.
+        """Yield the items until the end, or until any rank wants to end or has no data.
 
-        All ranks must have equally many.
+        All ranks must have the same number of items.
         """
         iterator = iter(items)
         while True:
@@ -95,8 +95,7 @@ class StopRequest:
             except V2VError as error:
                 self.failure = error
             except (RuntimeError, EOFError, OSError):
-                # What reached this process reached its loader workers too: PyTorch says that one is gone, or its pipe
-                # ended in the middle of a batch.
+                # The signal reached the loader workers too: PyTorch raises that one exited, or that its pipe ended.
                 if not self.signal:
                     raise
             if self._agree(self.wanted) or item is None:

@@ -1,4 +1,4 @@
-"""What a run says of itself: a progress bar, ``metrics.jsonl``, TensorBoard scalars, pictures and videos."""
+"""Reports of a run: a progress bar, ``metrics.jsonl``, TensorBoard scalars, pictures and videos."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FRAMES_PER_SECOND = 8
 
 
 class Meter:
-    """Means over the steps since the last reading, summed up on the device: only :meth:`read` waits for it."""
+    """Means over the steps since the last reading, summed on the device; only :meth:`read` waits for it."""
 
     def __init__(self, ranks: Ranks) -> None:
         self._ranks = ranks
@@ -43,22 +43,22 @@ class Meter:
         self._waited = self._transferred = 0.0
 
     def add(self, values: Mapping[str, Tensor]) -> None:
-        """The scalars of one step; the same names each time."""
+        """Add the scalars of one step; the names are the same each time."""
         self._names = tuple(values)
         stacked = torch.stack([value.detach().float() for value in values.values()])
         self._sum = stacked if self._sum is None else self._sum + stacked
         self._steps += 1
 
     def read(self, wait_seconds: float, transfer_seconds: float = 0.0) -> dict[str, float]:
-        """Means over steps and ranks, and the speed; then starts anew.
+        """Return means over steps and ranks, and the speed, and reset. All ranks call it.
 
         Args:
             wait_seconds, transfer_seconds: time spent waiting for data, and bringing it to the device, since the run
                 began.
 
         Returns:
-            the scalars by name; ``steps_per_second``; ``data_wait_seconds``, ``transfer_seconds`` and the rest,
-            ``compute_seconds``, per step.
+            The scalars by name; ``steps_per_second``; ``data_wait_seconds``, ``transfer_seconds`` and the rest,
+            ``compute_seconds``, per step. Empty without a step.
         """
         if self._sum is None:
             return {}
@@ -78,16 +78,16 @@ class Meter:
 
 
 class Reporter:
-    """Says it, on the first rank; the others are silent.
+    """Writes and prints the reports on the first rank; does nothing on the others.
 
     Args:
         out: folder of the run.
-        speaks: this is the first rank.
-        step: where the run goes on; what an earlier one wrote of later steps is dropped, with 0 all of it.
+        speaks: whether this is the first rank.
+        step: step at which the run continues. Readings of later steps are dropped; with 0, all of them.
 
     Raises:
-        UsageError: the folder cannot be written, by this and every method; or what an earlier run wrote is damaged, and
-            not merely torn at its end.
+        UsageError: the folder cannot be written (every method raises this too), or readings of an earlier run are
+            damaged, other than by a cut at their end.
     """
 
     def __init__(self, out: Path, *, speaks: bool, step: int = 0) -> None:
@@ -141,7 +141,7 @@ class Reporter:
             raise unwritable(self._out, name, error) from error
 
     def advance(self, step: int, dataset: V2VStreamDataset, config: TrainConfig) -> None:
-        """One more step was queued; the first one tells how many there will be."""
+        """Update the progress after a step was queued; the first call computes the number of steps."""
         self._step = step
         if not self._planned:
             self._planned, self._seconds, self._total = True, config.run.seconds, _planned_steps(dataset, config)
@@ -240,12 +240,12 @@ _GROUPS = {
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The records of a ``metrics.jsonl``.
+    """Return the records of a ``metrics.jsonl``.
 
-    A last line that has no end is left out: it is still being written, or whoever wrote it was killed.
+    An incomplete last line is left out: it is still being written, or its writer was killed.
 
     Raises:
-        UsageError: another line is no record; the message says which.
+        UsageError: another line is not a record; the message gives its number.
     """
     *lines, torn = path.read_text(encoding="utf-8", errors="replace").split("\n")
     records = [_record(line) for line in [*lines, torn]]
@@ -253,7 +253,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         del records[-1]
     for number, record in enumerate(records, start=1):
         if record is None:
-            raise UsageError(f"{path}, line {number}, is no record of a run: take the line out, or the file away")
+            raise UsageError(f"{path}, line {number}, is no record of a run: remove the line, or the file")
     return [record for record in records if record is not None]
 
 
@@ -266,7 +266,7 @@ def _record(line: str) -> dict[str, Any] | None:
 
 
 def _planned_steps(dataset: V2VStreamDataset, config: TrainConfig) -> int | None:
-    """Steps from the beginning of the run to its end; None where only the clock ends it."""
+    """Return the number of steps of the whole run; None if only a time limit ends it."""
     if config.run.seconds and not config.run.steps:
         return None
     sequences = 0 if dataset.stream is None else dataset.stream.sequences

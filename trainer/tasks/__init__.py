@@ -1,7 +1,6 @@
-"""What networks are trained for. A task owns what it needs of the stream, its losses, its films and its metrics.
+"""The tasks of networks. A task owns its arrays of the stream, its losses, its films and its scores.
 
-The training loop knows none of them by name: a network says its task (``VoxelNetwork.task``), and a task that is added
-here is one more name for the networks to say.
+The training loop knows no task by name: a network names its task (``VoxelNetwork.task``), which is registered here.
 """
 
 from trainer.tasks.flow import Flow
@@ -9,6 +8,6 @@ from trainer.tasks.reconstruction import Reconstruction
 from trainer.tasks.task import Asked, Task, Work
 
 TASKS: dict[str, type[Task]] = {"reconstruction": Reconstruction, "flow": Flow}
-"""Tasks by the name that networks give them."""
+"""Tasks by name."""
 
 __all__ = ["TASKS", "Asked", "Flow", "Reconstruction", "Task", "Work"]

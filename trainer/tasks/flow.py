@@ -1,7 +1,7 @@
-"""Optical flow from events, judged by the L1 distance to flow between the frames.
+"""Optical flow from events, trained with the L1 distance to flow between the frames.
 
-True flow of ordinary video is not known. What stands in for it is estimated: by the server's workers, or by RAFT on
-this device. Both lie on the grid of a step's earlier frame, [2, H, W] (x, y) in px over one voxel grid.
+Ordinary video has no true flow, so the target is an estimate: of the server's workers, or of RAFT on this device. Both
+are on the grid of a step's earlier frame, [2, H, W] (x, y) in px over one voxel grid.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from v2v_client import Batch
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlowTaskSettings:
-    """What is minimised.
+    """The loss.
 
     Attributes:
         flow: "raft" on this device, or "stream": estimated by the server's workers.
         raft_size, raft_weights: "small" or "large", and its weight file.
-        valid: which pixels count: "all" (published), or those where the flow is "consistent": there, forward and
-            backward flow of the stream agree.
-        gamma: of a network that improves its estimate step by step, update i of n weighs gamma^(n - 1 - i); 0: only the
-            last one counts (published).
+        valid: which pixels count: "all" (published), or "consistent": those where forward and backward flow of the
+            stream agree.
+        gamma: for a network that refines its estimate, update i of n has weight gamma^(n - 1 - i); 0: only the last
+            one counts (published).
     """
 
     flow: Literal["raft", "stream"] = "raft"
@@ -46,7 +46,7 @@ class FlowTaskSettings:
 
 
 def flow_loss(prediction: Tensor, truth: Tensor, valid: Tensor | None, gamma: float) -> Tensor:
-    """Mean absolute difference over both components and all pixels that count.
+    """Return the mean absolute difference over both components and all pixels that count.
 
     Args:
         prediction: [B, T, 2, H, W], or [updates, B, T, 2, H, W]: see :class:`FlowTaskSettings`.
@@ -72,8 +72,9 @@ def flow_loss(prediction: Tensor, truth: Tensor, valid: Tensor | None, gamma: fl
 
 
 class Flow(Task):
-    """See :class:`trainer.tasks.task.Task`. Truth: ``flow`` [B, T, 2, H, W], and ``valid`` [B, T, 1, H, W] where a mask
-    is asked for.
+    """See :class:`trainer.tasks.task.Task`.
+
+    Truth: ``flow`` [B, T, 2, H, W], and ``valid`` [B, T, 1, H, W] with ``loss.valid`` "consistent".
     """
 
     Settings = FlowTaskSettings
@@ -93,7 +94,7 @@ class Flow(Task):
 
     @property
     def asked(self) -> Asked:
-        """Flow, or the frames to estimate it from: the one in front of the first voxel grid included."""
+        """Flow, or the frames to estimate it from, including the one before the first voxel grid."""
         masks = ("flow_valid",) if self.settings.valid == "consistent" else ()
         if self._raft is None:
             return Asked(arrays=("voxels", "flow", *masks), lead_voxels=self._lead_voxels)
@@ -114,7 +115,7 @@ class Flow(Task):
         return Work(voxels=arrays["voxels"], truth=truth)
 
     def losses(self, prediction: Tensor, work: Work) -> dict[str, Tensor]:
-        """The distance, and, to be read, the mean end-point error of the last estimate in px."""
+        """See :meth:`Task.losses`: the distance, and for reports the mean end-point error of the last estimate, px."""
         truth, valid = work.truth["flow"], work.truth.get("valid")
         with torch.autocast(prediction.device.type, enabled=False):
             total = flow_loss(prediction, truth, valid, self.settings.gamma)
@@ -127,7 +128,7 @@ class Flow(Task):
         return FlowScorer(FlowRun(network, voxels, str(self.device)))
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
-        """Events, flow to be found, flow found; both in the colours of one scale."""
+        """Draw events, target and estimate; both flows in the colours of one scale."""
         truth, found = (x[sample].cpu().numpy() for x in (work.truth["flow"], prediction))
         events = pictures.draw_events(voxels[sample, -len(truth) :].cpu().numpy())
         scale = pictures.flow_scale(truth)

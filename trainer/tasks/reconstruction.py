@@ -1,4 +1,4 @@
-"""Reconstruction: pictures from events, judged by LPIPS, L1 and temporal consistency."""
+"""Reconstruction: pictures from events, trained with LPIPS, L1 and temporal consistency."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from v2v_protocol.recipe import Recipe
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructionSettings:
-    """What is minimised: a weighted sum; a term of weight 0 costs nothing and needs no file.
+    """The loss: a weighted sum; a term of weight 0 costs nothing and needs no file.
 
     Attributes:
-        l1_weight, lpips_weight, temporal_weight: of the terms.
+        l1_weight, lpips_weight, temporal_weight: weights of the terms.
         lpips_network: "vgg", "alex" or "squeeze".
         lpips_backbone, lpips_heads: its weight files.
         temporal_first_step, temporal_rule, temporal_as_published: see
             :class:`trainer.losses.temporal.TemporalConsistency`.
         flow: "raft" on this device, or "stream": estimated by the server's workers.
         raft_size, raft_weights: "small" or "large", and its weight file.
-        guide_epochs: epochs in which a network that sees its own last picture (HyperE2VID) is shown a mixture of that
-            and the true one; the share of the true one falls linearly, from all to nothing. 0: never.
-        guide_as_published: the true picture shown at step t is that of t, which is the very target; else that of t-1.
+        guide_epochs: epochs in which a network that sees its own last picture (HyperE2VID) gets a mixture of that and
+            the true one; the share of the true one falls linearly from 1 to 0. 0: it never gets the true one.
+        guide_as_published: the true picture at step t is that of t, which is the target itself; else that of t-1.
     """
 
     l1_weight: float = limited(1.0, 0, 1e6)
@@ -60,8 +60,9 @@ class ReconstructionSettings:
 
 
 class Reconstruction(Task):
-    """See :class:`trainer.tasks.task.Task`. Truth: ``frames`` [B, T, 1, H, W] in 0 .. 1, and ``flow`` where the
-    temporal loss wants it, [B, T - first_step, 2, H, W].
+    """See :class:`trainer.tasks.task.Task`.
+
+    Truth: ``frames`` [B, T, 1, H, W] in 0 .. 1, and for the temporal loss ``flow`` [B, T - first_step, 2, H, W].
     """
 
     Settings = ReconstructionSettings
@@ -92,10 +93,10 @@ class Reconstruction(Task):
 
     @property
     def asked(self) -> Asked:
-        """Frames, and flow where the stream shall estimate it."""
+        """Frames, and flow if the stream estimates it."""
         if not self.settings.temporal_weight or self._raft is not None:
             return Asked(arrays=("voxels", "frames"))
-        # The loss wants to know where each pixel was; the released code takes negated forward flow for that.
+        # The loss needs to know where each pixel was; the released code takes negated forward flow for that.
         direction = "forward" if self.settings.temporal_as_published else "backward"
         return Asked(
             arrays=("voxels", "frames", "flow"),
@@ -135,17 +136,17 @@ class Reconstruction(Task):
         if epoch is None or epoch >= self.settings.guide_epochs:
             return None
         if not self.settings.guide_as_published:
-            # Nothing is before the first step, as after a reset.
+            # The first step has no earlier picture, as after a reset.
             frames = torch.cat([torch.zeros_like(frames[:, :1]), frames[:, :-1]], dim=1)
         return Guide(frames, 1 - epoch / self.settings.guide_epochs)
 
     def losses(self, prediction: Tensor, work: Work) -> dict[str, Tensor]:
-        """Terms "lpips", "l1", "temporal", as far as they are on."""
+        """See :meth:`Task.losses`: terms "lpips", "l1", "temporal" with a weight above 0."""
         losses: dict[str, Tensor] = self._loss(prediction, work.truth["frames"], work.truth.get("flow"))
         return losses
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
-        """Events, target, reconstruction."""
+        """Draw events, target and reconstruction."""
         panels = [
             pictures.draw_events(voxels[sample].cpu().numpy()),
             *(pictures.draw_grey(x[sample, :, 0].cpu().numpy()) for x in (work.truth["frames"], prediction)),

@@ -1,4 +1,4 @@
-"""What the training loop asks of a task."""
+"""The interface between the training loop and a task."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from v2v_protocol.settings import number, whole, word
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
-    """What a task needs of the stream.
+    """What a task needs from the stream.
 
     Attributes:
-        arrays: of each sample.
+        arrays: names of the arrays of each sample.
         lead_frames, lead_voxels: see :class:`v2v_protocol.recipe.Recipe`.
         flow_direction, flow_from: see :class:`v2v_protocol.spec.StreamSpec`.
     """
@@ -39,7 +39,7 @@ class Asked:
     flow_from: int = 0
 
     def recipe(self, configured: Recipe) -> Recipe:
-        """The configured one with this task's leads."""
+        """Return the configured recipe with this task's leads."""
         return configured.replace(lead_frames=self.lead_frames, lead_voxels=self.lead_voxels)
 
 
@@ -48,9 +48,9 @@ class Work:
     """One batch, ready for the network and for the loss.
 
     Attributes:
-        voxels: [B, T + lead_voxels, bins, H, W]: what the network takes.
-        guide: what it takes beside them in training, or None.
-        truth: what its outputs are compared with, each [B, ...]; the task knows their names.
+        voxels: [B, T + lead_voxels, bins, H, W], input of the network.
+        guide: second input of the network in training, or None.
+        truth: targets of the loss by a name of the task, each [B, ...].
     """
 
     voxels: Tensor
@@ -58,7 +58,7 @@ class Work:
     guide: Guide | None = None
 
     def pieces(self, count: int) -> list[Work]:
-        """Itself in ``count`` pieces of equally many samples: less memory, the same gradients."""
+        """Return the batch in ``count`` pieces of equal size: less memory, the same gradients."""
         if count == 1:
             return [self]
         voxels = self.voxels.chunk(count)
@@ -99,13 +99,12 @@ class Task(abc.ABC):
 
     A subclass has as class attribute:
         Settings: frozen dataclass of the keys of section ``loss``.
-        panels: names of what its films show side by side; none: they have no headings.
+        panels: names of the columns of its films; empty: no headings.
 
     Args:
-        settings: an instance of it.
-        network: that is trained.
-        device: where it computes.
-        bfloat16: networks that only judge or estimate run under autocast as well.
+        settings: an instance of ``Settings``.
+        network: the network to train.
+        bfloat16: also run networks of the loss, such as RAFT, under autocast.
 
     Raises:
         UsageError: a weight file is missing or wrong; the message names the key.
@@ -119,44 +118,44 @@ class Task(abc.ABC):
 
     @classmethod
     def check(cls, settings: Any, recipe: Recipe) -> None:
-        """
+        """Check the settings against each other and against the recipe.
+
         Raises:
-            UsageError: settings that conflict with each other or with the recipe; the message names the keys.
+            UsageError: they conflict; the message names the keys.
         """
         del settings, recipe
 
     @property
     @abc.abstractmethod
     def asked(self) -> Asked:
-        """What the stream must give."""
+        """What the stream must deliver."""
 
     @abc.abstractmethod
     def prepare(self, batch: Batch, epoch: int | None) -> Work:
-        """A batch on the device as the network takes it, estimates that the loss needs included.
+        """Move a batch to the device and estimate what the loss needs, such as flow.
 
         Args:
-            batch: of a stream as :attr:`asked`.
+            batch: from a stream as in :attr:`asked`.
             epoch: of the training; None outside it.
         """
 
     @abc.abstractmethod
     def losses(self, prediction: Tensor, work: Work) -> dict[str, Tensor]:
-        """
+        """Compute the loss without copying anything to the host.
+
         Args:
-            prediction: what the network made of the voxels of ``work``.
-            work: of :meth:`prepare`.
+            prediction: output of the network for the voxels of ``work``.
 
         Returns:
-            The weighted terms by name, detached, and their sum as "total", which is what to differentiate. Nothing is
-            copied to the host.
+            The weighted terms by name, detached, and their sum as "total", which is not detached.
         """
 
     @abc.abstractmethod
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> Image:
-        """What the network saw of one sample, made of it, and should have made: [T, height, width, 3] uint8 RGB."""
+        """Draw input, target and output of one sample: [T, height, width, 3] uint8 RGB."""
 
     def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> RecordingScorer:
-        """Return what scores ``network``, as it is at each call, on recordings in voxel grids of that kind.
+        """Return a scorer of recordings; each call scores the weights that ``network`` has then.
 
         Raises:
             UsageError: this task has no such scores.
@@ -167,7 +166,7 @@ class Task(abc.ABC):
     @torch.no_grad()
     @ieee_products()
     def judge(self, network: VoxelNetwork, batch: Batch, films: int) -> tuple[dict[str, float], list[Image]]:
-        """Losses of a network on a batch that it is not trained on, and films of the first samples."""
+        """Return the losses of a network on a held-out batch, and films of its first ``films`` samples."""
         training = network.training
         network.eval()
         work = self.prepare(batch, None)
@@ -179,7 +178,7 @@ class Task(abc.ABC):
 
 
 def required_file(settings: Any, key: str, why: str, origin: str) -> str | Path:
-    """The path of a weight file that a setting needs.
+    """Return the path of a weight file that a setting needs.
 
     Raises:
         UsageError: the key is empty.
@@ -191,10 +190,10 @@ def required_file(settings: Any, key: str, why: str, origin: str) -> str | Path:
 
 
 def limited(default: float, low: float, high: float) -> Any:
-    """A field of settings that is a number from ``low`` to ``high``, a whole one where ``default`` is."""
+    """Make a field for a number from ``low`` to ``high``, for a whole number if ``default`` is one."""
     return whole(default, int(low), int(high), "") if isinstance(default, int) else number(default, low, high, "")
 
 
 def chosen(default: str, words: Mapping[str, Any]) -> Any:
-    """A field of settings that is one of ``words``."""
+    """Make a field for one of ``words``."""
     return word(default, words, "")

@@ -168,7 +168,9 @@ class ResumeState:
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(StreamIdentity)}
         if values.keys() != known:
-            raise UsageError(f"not a state of V2VStreamDataset: keys {sorted(values)}, expected {sorted(known)}")
+            raise UsageError(
+                f"not a state of V2VStreamDataset: keys {sorted(map(str, values))!r:.400}, expected {sorted(known)}"
+            )
         share, quarantine = values["loader_worker"], values["quarantine"]
         return cls(
             stream=_stream(values),
@@ -201,7 +203,7 @@ def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
 
 def _share(values: Any) -> LoaderShare:
     names = [field.name for field in dataclasses.fields(LoaderShare)]
-    if not isinstance(values, Mapping) or sorted(values) != sorted(names):
+    if not isinstance(values, Mapping) or values.keys() != set(names):
         raise UsageError(f"state: loader_worker = {values!r:.200}, expected {', '.join(names)}")
     return LoaderShare(**{name: _whole(values, name, 0, LARGEST_INDEX) for name in names})
 

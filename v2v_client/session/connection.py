@@ -223,7 +223,7 @@ class Connection:
         now, waited = self._now(), self._now() - self._last_sample
         if self._moves >= len(self._brokers) - 1 and waited >= self._patience.timeout_seconds:
             raise ServerLost(
-                f"none of {', '.join(self._brokers)} gave a sample for {waited:.0f} s; the last one: {reason}; start "
+                f"{', '.join(self._brokers)}: no sample for {waited:.0f} s; the last broker: {reason}; start "
                 f"v2v-serve there, or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
             )
         self._moves += 1

@@ -299,8 +299,8 @@ class Conversation:
         self._slots.offer(slots)
         if self.state is not State.WELCOMED:
             return
-        room = self.credit - len(self._asked)
-        now = [self._queued.popleft() for _ in range(min(room, len(self._queued)))]
+        allowed = self.credit - len(self._asked)
+        now = [self._queued.popleft() for _ in range(min(allowed, len(self._queued)))]
         if now:
             self._asked.update(dict.fromkeys(now))
             # In one message: siblings are decoded together only if they are requested together.

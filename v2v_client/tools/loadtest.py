@@ -231,7 +231,12 @@ def _parser() -> Parser:
     measuring.add_argument(
         "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulate a training step of this length (default 0)"
     )
-    stream.add_argument("--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME", help="arrays to receive")
+    stream.add_argument(
+        "--arrays",
+        default=",".join(DEFAULT_ARRAYS),
+        metavar="NAME,NAME",
+        help="arrays to receive (default %(default)s)",
+    )
     stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
     stream.add_argument(
         "--samples-per-decode", type=int, metavar="K", help="samples per decoded clip (default: the preset's)"
@@ -310,7 +315,10 @@ def run(arguments: argparse.Namespace) -> int:
         V2VError: wrong usage, or no server.
     """
     if arguments.seconds <= 0 or arguments.warmup_batches < 0 or arguments.trainer_ms < 0:
-        raise UsageError("give --seconds above 0, and --warmup-batches and --trainer-ms of 0 or more")
+        raise UsageError(
+            f"--seconds {arguments.seconds:g}, --warmup-batches {arguments.warmup_batches}, --trainer-ms "
+            f"{arguments.trainer_ms:g}: give --seconds above 0, and 0 or more of the others"
+        )
     if arguments.connect and (arguments.workers or arguments.rows):
         raise UsageError("--workers and --rows need a local server: use them with --videos")
     options = {

@@ -64,7 +64,7 @@ class AddToQuarantine:
 
 @dataclass(frozen=True, slots=True)
 class CheckVideo:
-    """Check whether this host has a video as it was catalogued, because a worker cannot read it on its own host.
+    """Check whether this host has a video as catalogued, because a worker cannot read it on its own host.
 
     Attributes:
         video, fingerprint: of the file.

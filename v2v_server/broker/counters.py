@@ -59,6 +59,7 @@ class Counters:
         bytes: size of the arrays of those samples.
         in_slots: samples written to memory shared with their consumer; the others travelled in messages.
         work: time that the workers took for them.
+        queued_seconds: total time that the server's own workers waited for a core.
         waited_seconds: total time that consumers have waited for samples, as they report.
         refused_candidates: videos passed over because they could not be used.
         unavailable: samples without a usable candidate.
@@ -79,6 +80,7 @@ class Counters:
     bytes: int = 0
     in_slots: int = 0
     work: WorkDone = field(default_factory=WorkDone)
+    queued_seconds: float = 0.0
     waited_seconds: float = 0.0
     refused_candidates: int = 0
     unavailable: int = 0

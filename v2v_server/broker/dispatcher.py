@@ -63,11 +63,12 @@ from v2v_server.broker.leases import LeaseBook, Request, Stall
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.terms import check_result, lease_for, work_seconds
-from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers
+from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
 from v2v_server.catalogue.catalogue import Catalogue
 
 MOST_SESSIONS = 4096
 _LONGEST_SECRET_BYTES = 64
+_LONGEST_NAME_BYTES = 255
 MOST_FAULTS = 16
 """Malformed messages after which a consumer is disconnected: answering one costs as much as a sample."""
 
@@ -224,10 +225,10 @@ class Dispatcher:
         self._lone = deque(request for request in self._lone if request.session != identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float, user: str) -> Action:
-        if len(hello.secret) > _LONGEST_SECRET_BYTES:
-            text = f"the secret has {len(hello.secret)} bytes; the limit is {_LONGEST_SECRET_BYTES}"
-            return _deny(identity, ErrorCode.MALFORMED, text)
-        owner = _owner(user, hello.secret)
+        try:
+            owner = _owner(user, hello.secret)
+        except LimitExceeded as error:
+            return _deny(identity, ErrorCode.MALFORMED, str(error))
         present = self.sessions.get(identity)
         if present is not None and (present.owner, present.user) != (owner, user):
             text = "this routing id belongs to the session of another consumer: connect with a random one"
@@ -279,14 +280,21 @@ class Dispatcher:
 
     # --- workers -----------------------------------------------------------------------------------------------------
 
-    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float) -> list[Action]:
-        """Handle a message from the workers' side. The frames behind a Result are passed on unchanged."""
+    def from_worker(self, identity: bytes, frames: Sequence[Any], now: float, user: str = "") -> list[Action]:
+        """Handle a message from the workers' side. The frames behind a Result are passed on unchanged.
+
+        Args:
+            identity: routing id of the connection.
+            frames: the message.
+            now: the time.
+            user: name of the key that the connection has; empty without keys, and for a worker of this host.
+        """
         try:
             message = decode(frames[0]) if frames else _only(frames)
         except ProtocolError as error:
             return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
-            return self._worker_hello(identity, message, now)
+            return self._worker_hello(identity, message, now, user)
         if isinstance(message, See):
             return [Show(identity, is_worker_side=True)]
         if isinstance(message, Hello):
@@ -317,6 +325,7 @@ class Dispatcher:
 
     def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
         """Extend the deadlines of a worker by the time in which it could not run."""
+        self.counters.queued_seconds += stalled.queued_seconds
         self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
@@ -350,7 +359,7 @@ class Dispatcher:
 
         Args:
             missing: the action.
-            found: whether this host has the video as it was catalogued.
+            found: whether this host has the video as catalogued.
             now: monotonic time, seconds.
         """
         if not found:
@@ -385,17 +394,42 @@ class Dispatcher:
         """Tell every worker to finish and leave."""
         return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
 
-    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float) -> list[Action]:
+    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float, user: str) -> list[Action]:
+        try:
+            owner = _owner(user, hello.secret)
+            before = self._replaced_by(identity, hello.name, owner, user)
+        except LimitExceeded as error:
+            return [ToWorker(identity, self._malformed(error))]
         again = Loss(Cause.KILLED, "started again")
-        actions = self._take_back(identity, again, now) if identity in self.registry else []
+        actions = [action for each in before for action in self._take_back(each, again, now)]
         if hello.numerics_version != NUMERICS_VERSION:
             text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
             return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *actions]
         if len(self.registry) >= MOST_WORKERS:
             text = f"this server has {MOST_WORKERS} workers, its limit"
             return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
-        self.registry.add(identity, hello.credit, now, hello.host)
+        self.registry.add(identity, hello, now, user, owner)
         return actions + self._assign(now)
+
+    def _replaced_by(self, identity: bytes, name: str, owner: bytes, user: str) -> list[bytes]:
+        """Return the connections that a worker's hello replaces: its own ones.
+
+        Raises:
+            LimitExceeded: one of them is another worker's, or the name is too long.
+        """
+        if len(name.encode()) > _LONGEST_NAME_BYTES:
+            raise LimitExceeded(f"the name has {len(name.encode())} bytes; the limit is {_LONGEST_NAME_BYTES}")
+        members = self.registry.members()
+        before = [each for each in {identity, self.registry.named(name)} if each is not None and each in members]
+        for each in before:
+            is_own = members[each].owner == owner and (bool(owner) or each == identity)
+            # A worker of this host needs no key. Its supervisor knows it by its name, so no key can hold that.
+            if not is_own and (user or not members[each].user):
+                raise LimitExceeded(
+                    f"a worker with the name or routing id of {clean_name(name)!r} is connected; both must be unique: "
+                    "start this one with another --name"
+                )
+        return before
 
     def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Action]:
         request = self.leases.request(result.lease, identity)
@@ -562,7 +596,13 @@ def _slots(want: Want) -> list[Slot | None]:
 
 
 def _owner(user: str, secret: bytes) -> bytes:
-    """Return a digest of who may take a session over: a key, if there are keys, and a secret."""
+    """Name who may take a session or a worker's name over: a key, if there are keys, and a secret.
+
+    Raises:
+        LimitExceeded: the secret is too long.
+    """
+    if len(secret) > _LONGEST_SECRET_BYTES:
+        raise LimitExceeded(f"the secret has {len(secret)} bytes; the limit is {_LONGEST_SECRET_BYTES}")
     return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""
 
 

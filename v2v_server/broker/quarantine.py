@@ -30,9 +30,10 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.safe_json import parse_json
 from v2v_server.catalogue.refresh import index_path
+from v2v_server.system.private import open_private
 
 VERDICTS_PER_VIDEO = 2
-_LONGEST_LOCK_SECONDS = 2.0
+_LOCK_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,24 +170,29 @@ def read_quarantine(file: Path) -> Quarantine:
         raise CorpusError(f"quarantine file {file} cannot be read: {error.strerror}; give read access") from error
 
 
-def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[QuarantineEntry]:
+def write_entry(
+    file: Path, entry: QuarantineEntry, known: Quarantine, wait_seconds: float = _LOCK_SECONDS
+) -> list[QuarantineEntry]:
     """Write an entry under the next number. It is on disk before any sample is made under the new snapshot.
 
     Args:
         file: the quarantine file; created if it is missing.
         entry: the entry; its number is ignored.
         known: the lines that the caller has read or written so far.
+        wait_seconds: how long to try to lock the file.
 
     Returns:
         every line that ``known`` lacks: those of other processes first, then this one.
 
     Raises:
+        BlockingIOError: another process has locked the file.
         OSError: the file cannot be written.
         CorpusError: the file is damaged, or is not the file that ``known`` came from.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    with open(file, "a+b", buffering=0) as out:
-        _lock(out.fileno(), file)  # until the file is closed
+    descriptor = open_private(file, os.O_RDWR | os.O_APPEND | os.O_CREAT)
+    with open(descriptor, "a+b", buffering=0) as out:
+        _lock(descriptor, file, wait_seconds)  # until the file is closed
         out.seek(0)
         whole = out.readall()
         lines = _parse(file, whole).lines
@@ -211,19 +217,19 @@ def write_entry(file: Path, entry: QuarantineEntry, known: Quarantine) -> list[Q
     return [*lines[known.latest :], numbered]
 
 
-def _lock(descriptor: int, file: Path) -> None:
-    """Lock the file. Writers hold the lock briefly; a reader that holds it for longer must not stop a server."""
-    until = time.monotonic() + _LONGEST_LOCK_SECONDS
+def _lock(descriptor: int, file: Path, wait_seconds: float) -> None:
+    """Lock the file. Writers hold the lock for a moment, a process that was stopped for longer.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+    """
+    until = time.monotonic() + wait_seconds
     while True:
         try:
             return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= until:
-                raise BlockingIOError(
-                    errno.EAGAIN,
-                    f"another process has locked it for {_LONGEST_LOCK_SECONDS:g} s; end that process",
-                    file,
-                ) from None
+                raise BlockingIOError(errno.EAGAIN, "another process keeps it locked; end that process", file) from None
             time.sleep(0.01)
 
 

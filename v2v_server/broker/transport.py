@@ -57,10 +57,17 @@ class FromConsumer:
 
 @dataclass(frozen=True, slots=True)
 class FromWorker:
-    """A message that a worker sent."""
+    """A message that a worker sent.
+
+    Attributes:
+        identity: routing id of its connection.
+        frames: the message.
+        user: name of the key of its connection; empty without keys, and for a worker of this host.
+    """
 
     identity: bytes
     frames: Sequence[Any]
+    user: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +160,8 @@ class Sockets:
     ) -> None:
         self.waited_seconds = 0.0
         self._context = zmq.Context()
-        # A consumer that connects again has a new routing id, so a second connection with one in use is not its own.
-        self._consumers = self._router(LARGEST_REQUEST_BYTES, handover=False)
-        self._workers = self._router(LARGEST_ARRAY_BYTES, handover=True)
+        self._consumers = self._router(LARGEST_REQUEST_BYTES)
+        self._workers = self._router(LARGEST_ARRAY_BYTES)
         try:
             self._gate = None if keys is None else Gate(self._context, keys)
         except BaseException:
@@ -194,16 +200,17 @@ class Sockets:
         if self._gate is not None and not address.startswith("ipc:"):
             self._gate.guard(router, side)
 
-    def _router(self, largest_bytes: int, *, handover: bool) -> zmq.Socket[bytes]:
+    def _router(self, largest_bytes: int) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
         router.setsockopt(zmq.MAXMSGSIZE, largest_bytes)
         router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
-        # Unroutable messages raise instead of vanishing; with handover, a peer that reconnects takes its name back.
+        # Unroutable messages raise instead of vanishing.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        router.setsockopt(zmq.ROUTER_HANDOVER, int(handover))
+        # Our peers take a new routing id to replace a connection, so a second connection with one in use is a stranger.
+        router.setsockopt(zmq.ROUTER_HANDOVER, 0)
         if sys.platform.startswith("linux"):
             # An ipc:// address is open to every user of this host; the system says whose process connects.
             router.setsockopt(zmq.IPC_FILTER_UID, os.getuid())
@@ -220,7 +227,7 @@ class Sockets:
         self.waited_seconds += time.monotonic() - began
         arrivals: list[Arrival] = []
         if self._workers in ready and (message := self._receive(self._workers, "worker")) is not None:
-            arrivals.append(FromWorker(*message))
+            arrivals.append(FromWorker(*message, self._users.get(("worker", message[0]), "")))
         if self._consumers in ready and (message := self._receive(self._consumers, "consumer")) is not None:
             arrivals.append(FromConsumer(*message, self._users.get(("consumer", message[0]), "")))
         gone = self._door.take_ended()

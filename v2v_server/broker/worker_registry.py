@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.messages import Result
+from v2v_protocol.messages import Result, WorkerHello
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.counters import WorkDone
 from v2v_server.broker.leases import LeaseBook
@@ -29,18 +29,24 @@ class Member:
     """A worker that said hello.
 
     Attributes:
+        name: name from its hello, by which its supervisor knows it.
         credit: number of leases that it accepts at a time.
         liveness: when it was last heard.
         host: the host that it names.
+        user: name of the key of its connection; empty without keys, and for a worker of this host.
+        owner: digest of user and secret of its hello; empty without a secret.
         given_up: whether it hangs or is silent; then it gets no more work.
         unreadable: why its host could not read the last video; empty once it has made a sample since.
         work: totals of its samples that were wanted.
         memory_bytes: memory of its process as last reported; 0: not known.
     """
 
+    name: str
     credit: int
     liveness: Liveness
     host: str = ""
+    user: str = ""
+    owner: bytes = b""
     given_up: bool = False
     unreadable: str = ""
     work: WorkDone = field(default_factory=WorkDone)
@@ -62,6 +68,7 @@ class Workers:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._workers: dict[bytes, Member] = {}
+        self._names: dict[str, bytes] = {}
         self._resting: dict[bytes, float] = {}  # time at which their rest ends
         # With a thousand workers, only those whose load has changed are examined; the heap gives the least loaded one.
         self._changed: set[bytes] = set()
@@ -83,19 +90,32 @@ class Workers:
         """Return all workers by routing id."""
         return self._workers
 
+    def name_of(self, identity: bytes) -> str:
+        """Return the name of a worker; empty if it has not said hello."""
+        worker = self._workers.get(identity)
+        return "" if worker is None else worker.name
+
+    def named(self, name: str) -> bytes | None:
+        """Return the routing id of the worker of that name; None if there is none."""
+        return self._names.get(name)
+
     def is_resting(self, identity: bytes) -> bool:
         """Return whether a worker gets no work for a while."""
         return identity in self._resting
 
-    def add(self, identity: bytes, credit: int, now: float, host: str = "") -> None:
-        """Add a worker that said hello."""
-        room = max(1, min(credit, MOST_WORKER_CREDIT))
-        self._workers[identity] = Member(room, Liveness(now, gone_seconds=SILENCE_SECONDS), clean_name(host))
+    def add(self, identity: bytes, hello: WorkerHello, now: float, user: str = "", owner: bytes = b"") -> None:
+        """Add a worker that said hello; none of that routing id or name is there."""
+        room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
+        liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
+        self._workers[identity] = Member(hello.name, room, liveness, clean_name(hello.host), user, owner)
+        self._names[hello.name] = identity
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
         """Remove a worker that is gone."""
-        self._workers.pop(identity, None)
+        worker = self._workers.pop(identity, None)
+        if worker is not None:
+            del self._names[worker.name]
         self._resting.pop(identity, None)
         self._changed.add(identity)
 

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 from base64 import b64decode
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.safe_json import parse_json
@@ -32,6 +32,7 @@ from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
+_Record = TypeVar("_Record", "Header", "PreparedVideo")
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +277,7 @@ def _header(line: bytes) -> Header:
     data = _object(line)
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
-    header = Header(**data)
+    header = _record(Header, data)
     header.encoding  # noqa: B018 - refuses what cannot be
     Rows.parse(header.rows)
     if not _whole(header.videos, 1, math.inf):
@@ -288,10 +289,7 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     """The record, and whether it is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
-    unknown = data.keys() - {field.name for field in fields(PreparedVideo)}
-    if unknown:
-        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
-    video = PreparedVideo(**data)
+    video = _record(PreparedVideo, data)
     path = PurePosixPath(video.id)
     if printable(video.id) != video.id:
         raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
@@ -308,6 +306,24 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     return video, aside
 
 
+def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
+    """Return the record with these fields.
+
+    Raises:
+        ValueError: a field is unknown, missing or of another type.
+    """
+    known = {each.name: each for each in fields(kind)}
+    if unknown := data.keys() - known.keys():
+        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
+    for name, each in known.items():
+        if name not in data:
+            if each.default is MISSING:
+                raise ValueError(f"field {name!r} is missing")
+        elif not _FIELD_CHECKS[str(each.type)](data[name]):
+            raise ValueError(f"{name} = {data[name]!r:.80}: expected {each.type}")
+    return kind(**data)
+
+
 def _object(line: bytes) -> dict[str, Any]:
     data = parse_json(line)
     if not isinstance(data, dict):
@@ -317,3 +333,20 @@ def _object(line: bytes) -> dict[str, Any]:
 
 def _whole(value: object, least: float, most: float) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_rate(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
+
+
+_FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
+    # Annotations are text here, as in the wire's checks.
+    "int": lambda value: _whole(value, 0, 2**63 - 1),
+    "str": _is_text,
+    "str | None": lambda value: value is None or _is_text(value),
+    "float | None": lambda value: value is None or _is_rate(value),
+}

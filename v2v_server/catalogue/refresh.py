@@ -18,7 +18,7 @@ from v2v_server.catalogue.changed import changed
 from v2v_server.catalogue.files import Notice, by_parts
 from v2v_server.catalogue.index.columns import CHUNK, Records, merged
 from v2v_server.catalogue.index.copy import NoCopy, Part, copied, read_copy
-from v2v_server.catalogue.index.file import IndexRow, Store
+from v2v_server.catalogue.index.file import SCHEMA_VERSION, IndexRow, Store
 from v2v_server.catalogue.index.parts import Shard
 from v2v_server.catalogue.scenes import Looking
 from v2v_server.catalogue.survey import survey
@@ -67,14 +67,21 @@ def up_to_date(
         processes, progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
     """
     try:
-        return *_refreshed(path, root, ids, looking, processes, progress, notice), []
-    except (sqlite3.Error, OSError) as error:
+        store, records = _refreshed(path, root, ids, looking, processes, progress, notice)
+    except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
         return *_refreshed(None, root, ids, looking, processes, progress, notice), [note]
+    if store.replaced_version is None:
+        return store, records, []
+    note = (
+        f"the catalogue's index {path} was written by another release (version {store.replaced_version}, this one has "
+        f"{SCHEMA_VERSION}): every video was probed again"
+    )
+    return store, records, [note]
 
 
 def _refreshed(
@@ -138,7 +145,7 @@ def _parts(store: Store, mark: str) -> Iterator[Part]:
 
 def _copy(store: Store, mark: str) -> None:
     """Leaves a copy behind of what the index has now, if that is not what it had."""
-    with suppress(sqlite3.Error, OSError), store.reading() as now:
+    with suppress(sqlite3.Error, OSError, UnicodeDecodeError), store.reading() as now:
         if now != mark:
             deque(_parts(store, now), maxlen=0)
 

@@ -74,6 +74,7 @@ class Videos(Sequence[VideoEntry]):
         usable = slice(None) if self._places is None else self._places
         self.frames, self.interlaced = records.frames[usable], records.interlaced[usable]
         self.width_px, self.height_px = records.width_px[usable], records.height_px[usable]
+        self._frames_per_second = records.frames_per_second[usable]
 
     def find(self, id: str) -> int | None:
         """The number of the video of that id; None if there is none."""
@@ -88,8 +89,11 @@ class Videos(Sequence[VideoEntry]):
         return self._records.fingerprints[self._place(number)]
 
     def digest(self, rows: Rows) -> str:
-        """32 hexadecimal digits that name these videos with these rows."""
-        sha = hashlib.sha256(f"v2v catalogue 1\n{rows}\n".encode())
+        """32 hexadecimal digits that name these videos with these rows.
+
+        Fingerprints cover the track and its orientation.
+        """
+        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
         for start in range(0, len(self), CHUNK):
             numbers = range(start, min(start + CHUNK, len(self)))
             first, last = self._place(numbers[0]), self._place(numbers[-1])
@@ -97,11 +101,12 @@ class Videos(Sequence[VideoEntry]):
             if self._places is not None:
                 those = (self._places[start : numbers.stop] - first).tolist()
                 texts = [[part[at] for at in those] for part in texts]
-            columns = [column[start : numbers.stop].tolist() for column in (self.frames, self.width_px, self.height_px)]
+            columns = (self.frames, self.width_px, self.height_px, self._frames_per_second)
+            values = [column[start : numbers.stop].tolist() for column in columns]
             lines = []
-            for number, id, mark, frames, width, height in zip(numbers, *texts, *columns, strict=True):
+            for number, id, mark, frames, width, height, rate in zip(numbers, *texts, *values, strict=True):
                 pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-                lines.append(f"{id}\0{mark}\0{frames}\0{width}\0{height}\0{pos}\0{neg}\n")
+                lines.append(f"{id}\0{mark}\0{frames}\0{width}\0{height}\0{rate}\0{pos}\0{neg}\n")
             sha.update("".join(lines).encode())
         return sha.hexdigest()[:32]
 

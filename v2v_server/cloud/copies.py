@@ -9,6 +9,7 @@ when there is no room, those go that were not read for longest.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -22,6 +23,7 @@ from typing import IO
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoUnreadable
 from v2v_server.cloud.bucket import TRIES, AccessDenied, Bucket, ObjectGone, ObjectState, StoreFault, is_url
 from v2v_server.store.used import PARTIAL, locked_use
+from v2v_server.system.private import make_private, open_private
 from v2v_server.system.process import cache_folder
 from v2v_server.video.fingerprint import fingerprint as fingerprint_of
 from v2v_server.video.fingerprint import is_same_file
@@ -34,6 +36,10 @@ _KEPT_SHARE = 0.9
 """Of the room, after eviction: it looks at every file, so it makes room for more than one."""
 _LOCK_SECONDS = 30.0
 """How long to wait for another process that makes room. No lease has begun yet, so no video is blamed for it."""
+_SLOT_SECONDS = 20.0
+"""How long to wait for another process that fetches a video of the same slot. After that the next free slot is used:
+the process may be stopped, and one video fetched twice costs less than a worker that waits."""
+_POLL_SECONDS = 0.05
 _ROOM_SECONDS = 2.0
 """Until it is tried again where all copies are being read."""
 
@@ -169,11 +175,8 @@ class Copies:
 
     def _get(self, id: str, fingerprint: str) -> IO[bytes]:
         """Fetches a video; returns the held copy."""
-        slot = self.folder / PARTIAL / f"{int(hashlib.sha256(id.encode()).hexdigest(), 16) % _SLOTS:02}"
         try:
-            lock_file = os.open(slot.with_suffix(".lock"), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            with open(lock_file, "wb") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
+            with self._locked_slot(int(hashlib.sha256(id.encode()).hexdigest(), 16)) as slot:
                 held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
                 return held or self._fetch(id, fingerprint, slot)
         except ObjectGone as error:
@@ -186,16 +189,36 @@ class Copies:
             why = f"cannot be copied to {self.folder}: {error.strerror or error}"
             raise VideoUnreadable(id, None, why) from error
 
+    @contextlib.contextmanager
+    def _locked_slot(self, number: int) -> Iterator[Path]:
+        """Lend a file to fetch into: that of the number, or the next one where another process keeps it.
+
+        Raises:
+            OSError: none can be had.
+        """
+        end = time.monotonic() + _SLOT_SECONDS
+        for other in range(_SLOTS):
+            slot = self.folder / PARTIAL / f"{(number + other) % _SLOTS:02}"
+            with open(open_private(slot.with_suffix(".lock"), os.O_WRONLY | os.O_CREAT), "wb") as lock:
+                if _lock(lock, end):
+                    yield slot
+                    return
+        raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
+
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
         try:
+            make_private(slot)
             self.bucket.fetch(id, slot)
+            slot.chmod(0o600)  # where the store's own tools put another file there
             found = fingerprint_of(slot)
             if fingerprint and not is_same_file(found, fingerprint):
                 why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
                 raise VideoChanged(id, None, why)
             path = self._path(id, found)
             with slot.open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_SH)  # of the file under whatever name: nobody evicts it meanwhile
+                fcntl.flock(
+                    file, fcntl.LOCK_SH | fcntl.LOCK_NB
+                )  # of the file under whatever name: nobody evicts it meanwhile
                 self._place(id, slot, path)
                 held = self._hold(path)
             if held is None:
@@ -259,6 +282,18 @@ def open_local(root: Path | Copies, id: str, fingerprint: str) -> AbstractContex
         VideoUnreadable, VideoChanged: as of :meth:`Copies.open_local`; of a folder, whoever opens the file finds out.
     """
     return root.open_local(id, fingerprint) if isinstance(root, Copies) else nullcontext(root / id)
+
+
+def _lock(file: IO[bytes], end: float) -> bool:
+    """Try to lock a file until then, once at least; return whether it is."""
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                return False
+        time.sleep(_POLL_SECONDS)
 
 
 def _oldest_first(folder: Path) -> list[Path]:

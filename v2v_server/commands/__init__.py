@@ -4,12 +4,12 @@ serve       v2v-serve
 worker      v2v-worker
 simulate    v2v-simulate
 preview     v2v-preview
-catalogue   a corpus looked at ahead (v2v-catalogue)
+catalogue   catalogue a corpus in advance (v2v-catalogue)
 prepare     v2v-prepare
 tradeoff    speed against disk space, accuracy and diversity (v2v-tradeoff)
-top         what a server is at, on a terminal (v2v-top)
-doctor      what is in the way on this machine (v2v-doctor)
-keys        who may talk to a server (v2v-keys)
+top         the state of a server on a terminal (v2v-top)
+doctor      check this machine and a corpus (v2v-doctor)
+keys        manage the keys of a server (v2v-keys)
 quarantine  v2v-quarantine
-spec_flags  the flags for what a stream is made of
+spec_flags  the flags of a stream's spec
 """

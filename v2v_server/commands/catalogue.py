@@ -1,4 +1,4 @@
-"""The command line of `v2v-catalogue`: a corpus catalogued ahead, on one host or in shards on many."""
+"""The command line of `v2v-catalogue`: catalogue a corpus in advance, on one host or in shards on many."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _SHOWN = 5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-catalogue", "--videos DIR [flags]",
-        "Look at every video ahead, so that v2v-serve starts at once. Goes on where it was interrupted. On many hosts "
-        "each does a shard, and one puts the parts together.",
+        "Catalogue every video in advance, so that v2v-serve starts at once. Continues where it was interrupted. On "
+        "many hosts each one catalogues a shard, and one of them merges the parts.",
         [
             "v2v-catalogue --videos webvid10k/ --rows top:0.54 --scene auto",
             "v2v-catalogue --videos /data/webvid --shard 3/16 --out /data/parts",
@@ -41,21 +41,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--videos", required=True, metavar="DIR", help="folder, video, list file, or s3://bucket/prefix"
     )
     videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts --videos")
-    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to look at with --scene (default full)")
-    videos.add_argument("--scene", choices=SCENES, default="off", help="auto: also take what --scene auto needs")
+    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to analyse with --scene (default full)")
+    videos.add_argument(
+        "--scene", choices=SCENES, default="off", help="auto: also compute the statistics that --scene auto needs"
+    )
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     videos.add_argument("--copies", metavar="DIR", help="folder that videos are fetched to from object storage")
     videos.add_argument(
-        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help=f"at most so much there ({COPIES_GIB:g})"
+        "--copies-gib",
+        type=float,
+        default=COPIES_GIB,
+        metavar="N",
+        help=f"size limit of --copies, GiB (default {COPIES_GIB:g})",
     )
     run = parser.group("Run")
     run.add_argument(
-        "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core it may use)"
+        "--workers",
+        type=int,
+        default=usable_cores(),
+        metavar="N",
+        help="number of processes (default: one per available core)",
     )
     run.add_argument("--shard", metavar="K/N", help="only part K of N; needs --out")
-    run.add_argument("--out", metavar="DIR", help="folder for the part, which the host that merges sees")
-    run.add_argument("--merge", metavar="DIR", help="take up the parts in that folder first")
-    interrupted = "interrupted; the same command goes on from here"
+    run.add_argument("--out", metavar="DIR", help="folder for the part; the host that merges must see it")
+    run.add_argument("--merge", metavar="DIR", help="first merge the parts in this folder")
+    interrupted = "interrupted; run the same command to continue"
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 
 
@@ -63,9 +73,9 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     if (arguments.shard is None) != (arguments.out is None):
-        raise UsageError("--shard K/N and --out DIR go together: a part that nobody finds is of no use")
+        raise UsageError("--shard K/N needs --out DIR, and --out needs --shard: give both or neither")
     if arguments.shard is not None and arguments.merge is not None:
-        raise UsageError("--shard makes a part, --merge takes up all of them: one at a time")
+        raise UsageError("--shard makes a part, --merge combines all of them: give one of them")
     asked = Ahead(
         videos=arguments.videos,
         list_file=arguments.list,
@@ -86,12 +96,12 @@ def _run(arguments: argparse.Namespace) -> None:
             parts = None if arguments.merge is None else Path(arguments.merge)
             catalogue = catalogue_ahead(asked, parts, probed, shown.notice)
     lines = _of_part(part, shard) if shard is not None else _of_all(catalogue)
-    for line in [*lines, f"looked into {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
+    for line in [*lines, f"probed {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
         print(line)
 
 
 class _Probed:
-    """Counts what is shown."""
+    """Count the files that are probed, and show the progress."""
 
     def __init__(self, shown: CatalogueProgress) -> None:
         self._shown, self.files = shown, 0
@@ -115,7 +125,7 @@ def _of_all(catalogue: Catalogue) -> list[str]:
             lines.append(f"{len(catalogue.refusals)} files cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]
             if len(catalogue.refusals) > _SHOWN:
-                lines.append(f"  ... and {len(catalogue.refusals) - _SHOWN} more: v2v-serve --list-refused names all")
+                lines.append(f"  ... and {len(catalogue.refusals) - _SHOWN} more: v2v-serve --list-refused lists all")
         lines.append(f"digest: {catalogue.digest}")
         if catalogue.scene_digest is not None:
             lines.append(f"with scenes: {catalogue.scene_digest}")

@@ -12,19 +12,21 @@ from v2v_server.offline.doctor import BAD, look_around
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-doctor", "[--videos DIR] [flags]",
-        "Look at this machine, this installation and a corpus, and say what to change.",
+        "Check this machine, this installation and a corpus, and say what to change.",
         ["v2v-doctor --videos webvid10k/", "v2v-doctor --videos webvid10k/ --recipe davis346 --port 6000"],
-        "Exit status: 0 nothing is in the way, 1 something is.",
+        "Exit status: 0 no problems found, 1 problems found.",
     )  # fmt: skip
-    what = parser.group("What to look at")
-    what.add_argument("--videos", metavar="DIR", help="also a folder of videos, a video or a list file")
-    what.add_argument("--recipe", metavar="NAME", default="paper", help="the videos shall suit it (default paper)")
+    what = parser.group("What to check")
+    what.add_argument("--videos", metavar="DIR", help="also check a folder of videos, a video or a list file")
+    what.add_argument(
+        "--recipe", metavar="NAME", default="paper", help="recipe to check the videos against (default paper)"
+    )
     what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    what.add_argument("--port", type=int, default=5555, metavar="N", help="that a server would take (default 5555)")
+    what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 
@@ -37,7 +39,7 @@ def _run(arguments: argparse.Namespace) -> int:
         print(f"{finding.level:4}  {finding.about:12}  {finding.text}", flush=True)
         if finding.change:
             print(f"{'':20}-> {finding.change}", flush=True)
-    print("something is in the way: see the lines that begin with bad" if found_bad else "nothing is in the way")
+    print("problems found: see the lines that begin with bad" if found_bad else "no problems found")
     return FAILED if found_bad else 0
 
 

@@ -1,7 +1,7 @@
 """The command line of `v2v-prepare`: arguments -> settings -> call.
 
-Exit status: 0 every video file of the source was prepared, 1 some were not, fall below a floor or lack the statistics
-that were asked for, 2 wrong usage or input, 130 interrupted. Errors are one line on stderr; `--debug` shows the trace.
+Exit status: 0 every video file of the source was prepared; 1 some were not, fall below a floor or lack requested
+statistics; 2 wrong usage or input; 130 interrupted. Errors are one line on stderr; `--debug` shows the traceback.
 """
 
 from __future__ import annotations
@@ -45,34 +45,39 @@ _SHOWN = 20
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-prepare", "SRC DST [flags]",
-        "Decode a corpus once: its luma, bit for bit, in blocks that are read at once; or as small H.264.",
+        "Decode a corpus once, and store its luma bit for bit in blocks that read fast, or as small H.264 files.",
         [
             "v2v-prepare webvid10k/ store/ --rows top:0.54",
             "v2v-prepare clips/ store/ --size fast --scene auto",
         ],
-        "Exit status: 1 where some videos were not prepared, fall below a floor or lack the statistics asked for.",
+        "Exit status: 1 if some videos were not prepared, fall below a floor or lack requested statistics.",
     )  # fmt: skip
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
-    videos.add_argument("destination", metavar="DST", help="folder to make, or to go on with after an interruption")
+    videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
     videos.add_argument(
         "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
     )
     videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts SRC")
     videos.add_argument(
-        "--scene", choices=SCENES, default="off", help="auto: also take the statistics that v2v-serve --scene auto uses"
+        "--scene",
+        choices=SCENES,
+        default="off",
+        help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     encoding = parser.group("Encoding")
     encoding.add_argument(
         "--codec", choices=(LOSSLESS, H264), default=LOSSLESS,
-        help="lossless (default): the samples of SRC, at some 9 times its size; h264: smaller than SRC, and not exact",
+        help="lossless (default): the same samples as SRC, about 9 times its size; h264: smaller than SRC, but lossy",
     )  # fmt: skip
     encoding.add_argument(
-        "--size", choices=tuple(SIZES), help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, read sooner"
+        "--size",
+        choices=tuple(SIZES),
+        help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, reads faster",
     )
     encoding.add_argument(
         "--quality", type=int, metavar="Q", help=f"h264: rate factor, lower is better and larger ({DEFAULT_QUALITY})"
@@ -81,19 +86,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     run = parser.group("Run")
     run.add_argument(
         "--workers", type=int, default=usable_cores(), metavar="N",
-        help="processes (default: one a core that it may use)",
+        help="number of processes (default: one per available core)",
     )  # fmt: skip
     run.add_argument(
         "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
-        help=f"report clips of a lower PSNR, and end with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
+        help=f"report clips with a lower PSNR, dB, and exit with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
     )  # fmt: skip
     run.add_argument(
         "--frame-floor", type=float, metavar="DB",
-        help="the same for the worst frame of a clip, which the clip's PSNR hides "
+        help="the same for the worst frame of a clip, dB "
         f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
     )  # fmt: skip
     run.add_argument("--json", metavar="FILE", help="also write a record of each video")
-    interrupted = "interrupted; the same command goes on from here"
+    interrupted = "interrupted; run the same command to continue"
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 
 
@@ -140,18 +145,18 @@ def _is_video(source: Path) -> bool:
 
 
 def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
-    """Lines that say what was made, what it saved, what failed and why."""
+    """Return lines that state what was made, what it saved, and what failed and why."""
     prepared = report.prepared
     lines = [
         f"{len(prepared)} of {len(report.videos)} videos prepared as {encoding} ({report.kept} of them earlier) "
         f"in {seconds:.0f} s"
     ]
     if report.looked_at:
-        lines.append(f"{report.looked_at} were prepared earlier: only the statistics of their scenes were added")
+        lines.append(f"{report.looked_at} were prepared earlier; only statistics of their scenes were added")
     if report.aside:
         lines.append(
-            f"{report.aside} others that were prepared earlier are set aside: not served, and not made again when a "
-            "run asks for them"
+            f"{report.aside} others that were prepared earlier are set aside: not served, and not prepared again if a "
+            "later run includes them"
         )
     if prepared:
         before, after = report.source_bytes, report.prepared_bytes
@@ -161,7 +166,7 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
             f"{change} {abs(before - after) / 1e6:.1f} MB"
         )
         if encoding.is_lossless:
-            lines.append("every frame was read back and is the source's, bit for bit")
+            lines.append("every frame was read back and equals the source's, bit for bit")
     if prepared and not encoding.is_lossless:
         quality = {video.id: video.psnr_db or 0.0 for video in prepared}
         worst = min(quality, key=lambda id: quality[id])
@@ -177,7 +182,7 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
         )
     lines += _listed(
         f"below the floor of {report.floor_db:g} dB, or a frame below {report.frame_floor_db:g} dB (kept; a lower "
-        "--quality makes them better):",
+        "--quality improves them):",
         [
             (video.id, f"{video.psnr_db:.1f} dB, worst frame {video.worst_psnr_db:.1f} dB")
             for video in report.below_floor
@@ -185,10 +190,10 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
     )
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
-        "have no statistics of their scenes (their files stay):",
+        "lack statistics of their scenes (their files stay):",
         [(problem.video, problem.reason) for problem in report.not_looked_at],
     )
-    lines += _listed("cannot be used at all:", [(problem.video, problem.reason) for problem in report.unusable])
+    lines += _listed("cannot be used:", [(problem.video, problem.reason) for problem in report.unusable])
     return lines
 
 
@@ -197,13 +202,13 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
         return []
     lines = [f"{len(items)} {title}", *(f"  {id}: {why}" for id, why in items[:_SHOWN])]
     if len(items) > _SHOWN:
-        lines.append(f"  ... and {len(items) - _SHOWN} more; --json FILE has them all")
+        lines.append(f"  ... and {len(items) - _SHOWN} more; --json FILE lists them all")
     return lines
 
 
 class _FrameRate(ProgressColumn):
     def render(self, task: Task) -> Text:
-        """Frames a second."""
+        """Format frames per second."""
         return Text("" if task.speed is None else f"{task.speed:.0f} frames/s")
 
 

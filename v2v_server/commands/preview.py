@@ -16,10 +16,10 @@ _MOST_CAMERAS = 32
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-preview", "VIDEO|DIR --out FILE [flags]",
-        "Show what a recipe makes of your videos: frames, events, flow, activity.",
+        "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
             "v2v-preview clips/ --out sheet.png --recipe davis346",
             "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
@@ -29,9 +29,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
     cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
     cameras.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
-    cameras.add_argument("--seed", type=int, default=0, metavar="S", help="of the first camera (default 0)")
     cameras.add_argument(
-        "--compare", nargs="+", metavar="NAME", help="the same clip under these recipes instead, one camera each"
+        "--seed", type=int, metavar="S",
+        help="seed of the first camera; the others count on (default: seeds whose crops show motion)",
+    )  # fmt: skip
+    cameras.add_argument(
+        "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
     )
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
@@ -40,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     out = parser.group("Output")
     out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
-    out.add_argument("--moments", type=int, default=1, metavar="N", help="voxel grids of each camera (default 1)")
+    out.add_argument(
+        "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
+    )
     out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
 
@@ -49,17 +54,18 @@ def _run(arguments: argparse.Namespace) -> None:
     for flag, value in (("--seeds", arguments.seeds), ("--moments", arguments.moments)):
         if not 1 <= value <= _MOST_CAMERAS:
             raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
+    first = arguments.seed or 0
     if arguments.compare:
         if arguments.recipe is not None:
             raise UsageError("--compare names the recipes: leave --recipe out")
-        looks = [
-            Shot(Path(name).stem, recipe_setting(name, arguments.set), arguments.seed) for name in arguments.compare
-        ]
+        looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
         what = "the same clip under " + ", ".join(look.title for look in looks)
     else:
         recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
-        looks = [Shot(f"seed {seed}", recipe, seed) for seed in range(arguments.seed, arguments.seed + arguments.seeds)]
+        looks = [Shot("", recipe, seed) for seed in range(first, first + arguments.seeds)]
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
+    if arguments.seed is None:
+        what += ", chosen where something moves"
     preview(
         arguments.source,
         Path(arguments.out),
@@ -67,6 +73,7 @@ def _run(arguments: argparse.Namespace) -> None:
         # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
         {"shuffle": False} if arguments.compare else {},
         title=f"{Path(arguments.source).name}: {what}",
+        find_motion=arguments.seed is None,
         list_file=arguments.list,
         rows=arguments.rows,
         with_flow=not arguments.no_flow,

@@ -1,7 +1,7 @@
-"""`v2v-quarantine`: shows what of a corpus is in quarantine, and clears it into a new snapshot.
+"""`v2v-quarantine`: list what is in quarantine, or clear it into a new snapshot.
 
-Servers may run meanwhile: the file gives every snapshot its number under a lock. A running server goes on under what it
-has read, and takes up a clearing with its next verdict or its next start.
+Servers may run meanwhile: the file numbers every snapshot under a lock. A running server continues under the lines that
+it has read. It learns of a clearing with its next entry or at its next start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from v2v_server.cloud.bucket import is_url
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-quarantine", "--videos DIR [flags]",
         "List the sequences and videos that crashed or hung workers, or clear the list.",
@@ -31,8 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = parser.group("Quarantine")
     what.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    what.add_argument("--clear", action="store_true", help="begin a new, empty snapshot; old ones can still be asked")
-    what.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it holds")
+    what.add_argument("--clear", action="store_true", help="start a new, empty snapshot; old ones stay available")
+    what.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it is in force")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
 
@@ -45,7 +45,7 @@ def _run(arguments: argparse.Namespace) -> None:
     in_force = quarantine.entries(quarantine.latest)
     for line in quarantine.lines:
         print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
-    print(f"snapshot {quarantine.latest} holds {len(in_force)} verdicts ({file})")
+    print(f"snapshot {quarantine.latest} holds {len(in_force)} entries ({file})")
     if arguments.json is not None:
         records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
         write_json(arguments.json, records)

@@ -11,11 +11,11 @@ from v2v_protocol.errors import V2VError
 from v2v_server.commands.spec_flags import add_spec
 from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
 from v2v_server.serve import serve
-from v2v_server.system.log import Log
+from v2v_server.system.log import report_errors
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-serve", "--videos DIR [flags]", "Decode videos, simulate event voxels, stream samples to trainers.",
         [
@@ -33,17 +33,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
-    # Without --recipe the fields of --set are changed in what the file says.
+    # Without --recipe, --set changes fields of the file's recipe.
     settings = arguments.set if arguments.recipe is None else []
     if arguments.recipe is not None:
         flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
-    config = ServeConfig.load(arguments.config, flags, settings)
-    try:
+    with report_errors(lambda: arguments.log_format):
+        config = ServeConfig.load(arguments.config, flags, settings)
+        arguments.log_format = config.log_format  # the file may ask for JSON
         serve(config)
-    except V2VError as error:
-        if config.log_format == "json":  # besides the last line, which every command has for people
-            Log(is_json=True).say(str(error), "error")
-        raise
 
 
 if __name__ == "__main__":

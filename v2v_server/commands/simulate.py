@@ -17,7 +17,7 @@ from v2v_server.offline.remake import simulate_to_file
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-simulate", "VIDEO --out FILE.npz [flags]",
         "Make one sample in this process: the same bytes a server would stream.",
@@ -28,18 +28,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     which = parser.group("Which sample")
     which.add_argument("video", metavar="VIDEO", help="a video; or a folder or list file, to remake a streamed sample")
-    which.add_argument("--seed", type=int, default=0, metavar="N", help="of the stream (default 0)")
+    which.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the stream (default 0)")
     which.add_argument("--epoch", type=int, default=0, metavar="N", help="default 0")
     which.add_argument("--index", type=int, default=0, metavar="N", help="global index in the epoch (default 0)")
     which.add_argument(
-        "--quarantine", type=int, default=0, metavar="N", help="snapshot that it was made under (its provenance says)"
+        "--quarantine",
+        type=int,
+        default=0,
+        metavar="N",
+        help="quarantine snapshot that it was made under (see its provenance)",
     )
-    which.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as the server's")
+    which.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as for the server")
     which.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     which.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     out = parser.group("Output")
-    out.add_argument("--out", required=True, metavar="FILE.npz", help="receives the arrays and the provenance (JSON)")
-    out.add_argument("--picture", metavar="FILE.png", help="also draw frames and voxels")
+    out.add_argument(
+        "--out", required=True, metavar="FILE.npz", help="output file for the arrays and the provenance (JSON)"
+    )
+    out.add_argument("--picture", metavar="FILE.png", help="also write a picture of frames and voxels")
     out.add_argument(
         "--events", metavar="FILE",
         help=f"also write events, their times within a bin invented: {', '.join(FORMS)}",
@@ -49,7 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         help=f"of {', '.join(ARRAYS)} (default {','.join(DEFAULT_ARRAYS)})",
     )  # fmt: skip
     add_spec(parser)
-    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted before all was written")
+    return run_command(
+        parser, _run, argv, failures=(V2VError,), interrupted="interrupted before all files were written"
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:

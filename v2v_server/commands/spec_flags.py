@@ -1,4 +1,4 @@
-"""The flags for what a stream is made of: the same for a server's defaults and for remaking one of its samples."""
+"""Flags of a stream's spec, used for a server's defaults and for remaking one of its samples."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
 
 
 def add_spec(parser: Parser) -> None:
-    """``--preset``, ``--recipe``, ``--set``, and a flag for each field of a StreamSpec."""
+    """Add ``--preset``, ``--recipe``, ``--set``, and a flag for each field of a StreamSpec."""
     stream = parser.group("Stream")
-    stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed against accuracy (default exact)")
+    stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="trade accuracy for speed (default exact)")
     stream.add_argument(
         "--recipe", metavar="NAME", help=f"virtual cameras: a preset ({', '.join(PRESETS)}) or a YAML file of fields"
     )
@@ -25,5 +25,5 @@ def add_spec(parser: Parser) -> None:
 
 
 def spec_fields(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say, without ``--recipe`` and ``--set``; None where nothing was given."""
+    """Return the values of these flags, without ``--recipe`` and ``--set``; None for a flag that was not given."""
     return {name: getattr(arguments, name) for name in ("preset", *settings_of(StreamSpec))}

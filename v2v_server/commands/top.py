@@ -1,4 +1,4 @@
-"""`v2v-top`: what a server, its workers and its consumers are at, on a terminal."""
+"""`v2v-top`: the state of a server, its workers and its consumers on a terminal."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _LIVE_SECONDS, _LINE_SECONDS = 1.0, 10.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-top", "[flags]",
-        "Show who waits for whom at a running server, and what its workers and consumers are at. Ctrl-C ends it.",
+        "Show the state of a running server: its bottleneck, its workers and its consumers. Ctrl-C ends it.",
         ["v2v-top --connect tcp://node7:5555 --keys gpu.key", "v2v-top --once"],
     )  # fmt: skip
     what = parser.group("Watching")
@@ -35,16 +35,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     what.add_argument("--keys", metavar="FILE", help="a consumer's key (default: what V2V_KEYS names)")
     what.add_argument(
-        "--once", action="store_true", help="show the state of now, and end; status 1 where nobody answers"
+        "--once", action="store_true", help="show the current state and exit; status 1 if the server does not answer"
     )
-    what.add_argument("--timeout-seconds", type=float, default=10.0, metavar="S", help="for an answer (default 10)")
+    what.add_argument(
+        "--timeout-seconds", type=float, default=10.0, metavar="S", help="wait for an answer, seconds (default 10)"
+    )
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
 
 def _run(arguments: argparse.Namespace) -> None:
     console = Console()
     with Looker(arguments.connect, arguments.keys) as looker:
-        state = looker.look(arguments.timeout_seconds)  # who is not there at all is said at once
+        state = looker.look(arguments.timeout_seconds)  # report an absent server at once
         if not console.is_terminal:
             _lines(looker, state, arguments)
         elif arguments.once:
@@ -67,8 +69,8 @@ def _live(console: Console, looker: Looker, state: dict[str, Any], timeout_secon
             note = ""
             try:
                 state = looker.look(timeout_seconds)
-            except ServerLost as error:  # it may come back
-                note = f"{error} What is shown is old."
+            except ServerLost as error:  # the server may come back
+                note = f"{error} The state shown is old."
             live.update(draw(state, note), refresh=True)
 
 

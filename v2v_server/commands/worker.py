@@ -12,12 +12,12 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.catalogue.files import corpus_root
 from v2v_server.cloud.copies import COPIES_GIB, copies_of
 from v2v_server.store.cache import GIB, Cache, make_cache
-from v2v_server.system.log import LOG_FORMATS, Log
+from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.worker.process import run_worker, unshared_name
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-worker", "--connect ADDRESS --videos DIR [flags]", "Work for a server: take leases, make samples.",
         ["v2v-worker --connect tcp://10.0.0.5:5556 --videos /data/webvid"],
@@ -25,22 +25,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     work = parser.group("Work")
     work.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
     work.add_argument(
-        "--videos", required=True, metavar="DIR", help="the corpus on this host: what the server's is, or s3://..."
+        "--videos", required=True, metavar="DIR", help="the corpus on this host, the same as the server's, or s3://..."
     )
-    work.add_argument("--name", help="how its name begins in logs (default: host and process id)")
-    work.add_argument("--cache", metavar="DIR", help="folder of this host that keeps what was decoded for later epochs")
-    work.add_argument("--cache-gib", type=float, default=100.0, metavar="N", help="at most so much lies there (100)")
+    work.add_argument("--name", help="prefix of its name in logs (default: host and process id)")
+    work.add_argument("--cache", metavar="DIR", help="folder of this host that caches decoded frames for later epochs")
+    work.add_argument(
+        "--cache-gib", type=float, default=100.0, metavar="N", help="size limit of --cache, GiB (default 100)"
+    )
     work.add_argument(
         "--copies",
         metavar="DIR",
-        help="folder of this host that videos are fetched to from s3:// (default: in the user's cache)",
+        help="folder of this host for videos fetched from s3:// (default: in the user's cache folder)",
     )
     work.add_argument(
-        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help="at most so much lies there (100)"
+        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help="size limit of --copies, GiB (default 100)"
     )
-    work.add_argument("--keys", metavar="FILE", help="its key, see v2v-keys (default: what V2V_KEYS names)")
     work.add_argument(
-        "--log-format", choices=LOG_FORMATS, default="text", help="text for people, or json, an object a line (text)"
+        "--keys", metavar="FILE", help="its key file, see v2v-keys (default: the file that V2V_KEYS names)"
+    )
+    work.add_argument(
+        "--log-format",
+        choices=LOG_FORMATS,
+        default="text",
+        help="log format: text for people, or json, one object per line (default text)",
     )
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
@@ -48,7 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    # Its own workers a server names itself, and knows them by it.
+    with report_errors(lambda: arguments.log_format):
+        _work(arguments)
+
+
+def _work(arguments: argparse.Namespace) -> None:
+    # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     copies = copies_of(arguments.videos, arguments.copies, arguments.copies_gib)
     root = copies or corpus_root(Path(arguments.videos))
@@ -57,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> None:
         if not arguments.cache_gib >= 0:
             raise UsageError(f"--cache-gib {arguments.cache_gib:g}: give 0 or more")
         folder = Path(arguments.cache)
-        if arguments.logbook_fd is None:  # for its own workers a server has made it
+        if arguments.logbook_fd is None:  # a server has already made the name of its own workers unique
             make_cache(folder)
         cache = Cache(folder, int(arguments.cache_gib * GIB))
     log = Log(is_json=arguments.log_format == "json")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from contextlib import suppress
@@ -14,6 +13,7 @@ import zmq
 from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Denied, See, Seen
+from v2v_protocol.safe_json import parse_json
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
 
 _AGAIN_SECONDS = 2.0
@@ -100,7 +100,7 @@ class Looker:
         if newest is None:
             return None
         try:
-            state = json.loads(newest.json)
+            state = parse_json(newest.json)
         except ValueError as error:
             raise ProtocolError(f"{self._address} sent a state that is no JSON") from error
         if not isinstance(state, dict) or not isinstance(state.get("version"), int):

@@ -22,6 +22,8 @@ class Moment:
         now: the time.
         samples, batches, array_bytes, decodes: handed over; see :class:`v2v_server.broker.counters.Counters`.
         decode_seconds, simulate_seconds, handover_seconds: of all workers together.
+        queued_seconds: of the server's own workers, in which they waited for a core.
+        cpu_seconds: processor time of all workers together.
         attended_seconds: in which there was a consumer; only in these the next three are counted: that nobody has work
             while nobody wants any says nothing.
         broker_seconds: that the server's loop did not wait for a message.
@@ -44,6 +46,8 @@ class Moment:
     decode_seconds: float = 0.0
     simulate_seconds: float = 0.0
     handover_seconds: float = 0.0
+    queued_seconds: float = 0.0
+    cpu_seconds: float = 0.0
     attended_seconds: float = 0.0
     broker_seconds: float = 0.0
     worker_seconds: float = 0.0
@@ -118,14 +122,16 @@ class History:
             work.decode_seconds,
             work.simulate_seconds,
             work.handover_seconds,
+            counters.queued_seconds,
+            work.cpu_seconds,
             self._attended_seconds,
             self._broker_seconds,
             self._worker_seconds,
             self._idle_seconds,
             self._consumer_seconds,
             counters.waited_seconds,
-            {name: member.work.cpu_seconds for name, member in members.items()},
-            {name: member.work.busy_seconds for name, member in members.items()},
+            {identity: member.work.cpu_seconds for identity, member in members.items()},
+            {identity: member.work.busy_seconds for identity, member in members.items()},
             {session.identity: session.waited_seconds for session in dispatcher.sessions},
             {session.identity: session.served for session in dispatcher.sessions},
             {session.identity: (session.epoch, session.position) for session in dispatcher.sessions},

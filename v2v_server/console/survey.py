@@ -17,7 +17,7 @@ from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
-from v2v_server.broker.worker_registry import Member
+from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.history import History, Moment
@@ -186,40 +186,40 @@ def _workers(service: Service, now: float, before: Moment, last: Moment) -> tupl
     seconds = last.now - before.now
     return tuple(
         _worker(
-            service.dispatcher, name, member, now, restarts.get(name),
-            _rate(last.busy[name] - before.busy.get(name, 0.0), seconds),
-            _rate(last.cpu[name] - before.cpu.get(name, 0.0), seconds),
+            service.dispatcher, identity, member, now, restarts.get(member.name.encode()),
+            _rate(last.busy[identity] - before.busy.get(identity, 0.0), seconds),
+            _rate(last.cpu[identity] - before.cpu.get(identity, 0.0), seconds),
         )
-        for name, member in members
+        for identity, member in members
     )  # fmt: skip
 
 
 def _worker(
     dispatcher: Dispatcher,
-    name: bytes,
+    identity: bytes,
     member: Member,
     now: float,
     restarts: int | None,
     busy_share: float,
     cpu_share: float,
 ) -> WorkerState:
-    at = dispatcher.leases.in_work(name)
+    at = dispatcher.leases.in_work(identity)
     request, since = (None, now) if at is None else at
     clip = None if request is None else dispatcher.clip_of(request)
     if member.given_up:
         state = "lost"
-    elif dispatcher.registry.is_resting(name):
+    elif dispatcher.registry.is_resting(identity):
         state = "resting"
     else:
-        state = "working" if dispatcher.leases.holds(name) else "idle"
+        state = "working" if dispatcher.leases.holds(identity) else "idle"
     return WorkerState(
-        name=name.decode(errors="replace"),
+        name=clean_name(member.name),
         host=member.host,
         state=state,
         clip="" if clip is None else clip[0][:_LONGEST_TEXT],
         frame=None if clip is None else clip[1],
         clip_seconds=now - since,
-        leases=dispatcher.leases.held_by(name),
+        leases=dispatcher.leases.held_by(identity),
         samples=member.work.samples,
         busy_share=min(1.0, busy_share),
         cpu_share=cpu_share,

@@ -31,6 +31,7 @@ _SHARES = (
     ("decode", "decode"),
     ("simulate", "simulate"),
     ("hand over", "handover"),
+    ("no core", "queued"),
     ("server busy", "broker"),
 )
 

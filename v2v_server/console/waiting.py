@@ -2,6 +2,7 @@
 
     consumers wait     they say so themselves: time in which they stood still for want of a batch
     workers wait       time in which they held nothing to make
+    workers queue      time in which they could have worked and got no core
     workers work       decoding, simulating, handing over: each result says how long
     the broker works   time in which its loop did not wait for a message
 
@@ -23,6 +24,8 @@ _FULL_SHARE = 0.85
 """Of the broker's time: with so little to spare it is."""
 _LEAST_SECONDS = 2.0
 """Of a window that says anything."""
+_QUEUED_SHARE = 0.4
+"""Of the workers' time, in which they wait for a core: with more, the host has more to do than cores for it."""
 _SPARE_SHARE = 0.5
 """Of the workers' time, in which they are idle, for fewer of them to do."""
 
@@ -37,6 +40,8 @@ class Shares:
         idle: of all workers' time, in which they held nothing to make.
         broker: of the server's loop, in which it did not wait for a message.
         decode, simulate, handover: of all workers' time.
+        queued: of all workers' time, in which those of this server waited for a core.
+        cores: processor time of all workers by their time, which is cores for each.
     """
 
     seconds: float = 0.0
@@ -46,6 +51,8 @@ class Shares:
     decode: float = 0.0
     simulate: float = 0.0
     handover: float = 0.0
+    queued: float = 0.0
+    cores: float = 0.0
 
     @classmethod
     def of(cls, before: Moment, last: Moment) -> Shares:
@@ -62,6 +69,8 @@ class Shares:
             decode=_share(last.decode_seconds - before.decode_seconds, workers),
             simulate=_share(last.simulate_seconds - before.simulate_seconds, workers),
             handover=_share(last.handover_seconds - before.handover_seconds, workers),
+            queued=_share(last.queued_seconds - before.queued_seconds, workers),
+            cores=_share(last.cpu_seconds - before.cpu_seconds, workers),
         )
 
 
@@ -70,9 +79,9 @@ class Waiting:
     """The verdict.
 
     Attributes:
-        part: the slow one: "nobody" is there to take anything, "start" (too early to say), "workers" (none that can
-            work), "consumers", "decode", "simulate", "handover", "broker", "way" (neither: what is asked and what is
-            made is on its way for long), "even" (nobody waits to speak of).
+        part: the slow one: "nobody" (no consumer is connected), "start" (too early to say), "workers" (none can
+            work), "consumers", "cores" (the workers' host has too few of them), "decode", "simulate", "handover",
+            "broker", "way" (requests and samples are on their way for long), "even" (no wait to speak of).
         sentence: who waits for whom.
         remedy: what to do about it; empty where nothing need be done.
         shares: that it follows from.
@@ -143,6 +152,13 @@ def _verdict(
             "on their way for long, or too few are asked ahead.",
             "look at the network between them, and raise --max-credit-bytes or --expect-workers so that more is asked "
             "ahead",
+        )
+    if shares.queued >= _QUEUED_SHARE:
+        return (
+            "cores",
+            f"The workers' host is overloaded: consumers wait {wait} of their time for workers, which wait "
+            f"{shares.queued:.0%} of theirs for a core and get {shares.cores:.2f} of a core each.",
+            "more workers on this host would not help: stop other programs there, or start v2v-worker on other hosts",
         )
     part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
     doing, remedy = {

@@ -1,7 +1,7 @@
-"""The flow of a clip: which pictures, on which part, in which order, transformed together with the frames.
+"""Estimate the flow of a clip: which pictures, which part, in which order, transformed together with the frames.
 
 Order: resize the picture, estimate on the crop with its margin, crop, flip. The contrast of a degraded view is left
-out: it moves nothing and clips what could be matched.
+out: it moves nothing, and clips values that are needed for matching.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
 
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
-    """How the flow of a clip is made: the flow fields of a ``StreamSpec``, which checks them.
+    """Settings of the flow of a clip: the flow fields of a ``StreamSpec``, which checks them.
 
     Attributes:
-        method: a name of :data:`v2v_server.flow.methods.METHODS`, or "auto": each pair's own motion decides.
+        method: a name of :data:`v2v_server.flow.methods.METHODS`, or "auto": chosen for each pair by its motion.
         direction: "forward", on the grid of the earlier frame, or "backward", on that of the later one.
-        first_voxel: flow of the voxels before this one is not computed but zero (20: the half rule of the temporal
-            consistency loss).
-        margin_px: estimated on the crop and this much of the picture around it; None: on the whole picture.
+        first_voxel: index of the first voxel with computed flow; earlier flow is zero (20: the half rule of the
+            temporal consistency loss).
+        margin_px: margin around the crop in which flow is also estimated; None: the whole picture.
     """
 
     method: str = AUTO
@@ -46,19 +46,19 @@ class FlowSettings:
 
     @classmethod
     def of(cls, spec: StreamSpec) -> FlowSettings:
-        """The settings that a stream's spec states."""
+        """Return the settings that a stream's spec states."""
         margin_px = None if spec.flow_margin_px < 0 else spec.flow_margin_px
         return cls(spec.flow_method, spec.flow_direction, spec.flow_from, margin_px)
 
 
 @dataclass(frozen=True, slots=True)
 class FlowClip:
-    """The flow of one sample.
+    """Flow of one sample.
 
     Attributes:
         flow: [T, 2, H, W] float16, (x, y), px; flow[t] belongs to voxel t of the target sequence.
-        valid: [T, 1, H, W] uint8, 1 where the forward-backward check holds; None where it was not asked for.
-        methods: what made each flow[t]: a method's name, "paused" or "skipped".
+        valid: [T, 1, H, W] uint8, 1 where the forward-backward check holds; None if it was not requested.
+        methods: method of each flow[t]: its name, "paused" or "skipped".
     """
 
     flow: npt.NDArray[np.float16]
@@ -74,7 +74,7 @@ def flow_window(
     picture_height_px: int,
     picture_width_px: int,
 ) -> Window:
-    """The part of the video picture that :func:`flow_for` needs; it holds what the view needs.
+    """Return the part of the video picture that :func:`flow_for` needs; it contains the part that the view needs.
 
     Args:
         params, recipe: the draw and its recipe.
@@ -89,7 +89,7 @@ def flow_window(
 
 
 def view_part(frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None) -> Frames:
-    """The part of the frames of a :func:`flow_window` that ``apply_view`` takes, as a view of them."""
+    """Return the part of the frames of a :func:`flow_window` that ``apply_view`` takes, as a view of them."""
     if params.scale != 1.0:
         return frames
     top, left = _offset(params, margin_px)
@@ -105,19 +105,20 @@ def flow_for(
     validity: bool = False,
     plan: Sequence[str] = (),
 ) -> FlowClip:
-    """Flow between the ends of each voxel of one drawn sample.
+    """Estimate flow between the ends of each voxel of one drawn sample.
 
     A voxel whose two ends are the same frame of the video (the camera pauses) has exactly zero flow.
 
     Args:
         frames: [n, h, w] uint8, the decoded frames in the window of :func:`flow_window`.
         params, recipe: the draw and its recipe.
-        settings: how.
-        validity: also make the mask, which takes a second estimate of each pair.
-        plan: the method of each voxel, in place of the one of the settings; "zero" is not even looked at.
+        settings: method, direction, first voxel and margin.
+        validity: also compute the mask, which takes a second estimate of each pair.
+        plan: the method of each voxel, instead of that of the settings; "zero" reads no pixel.
 
     Raises:
-        UsageError: the frames do not hold the crop or what the draw shows, or there is no voxel to begin at.
+        UsageError: the frames do not hold the crop or the frames that the draw shows, or ``first_voxel`` is out of
+            range.
     """
     count, height, width = recipe.voxels_per_clip, recipe.crop_height_px, recipe.crop_width_px
     if settings.first_voxel > count:
@@ -156,12 +157,12 @@ def flow_for(
 
 
 def consistent(field: Field, opposite: Field) -> npt.NDArray[np.bool_]:
-    """Where following a field and then its opposite leads back to the start:
+    """Return where following a field and then its opposite leads back to the start:
 
         |f(x) + g(x + f(x))|^2 < 0.01 (|f(x)|^2 + |g(x + f(x))|^2) + 0.5
 
     (Sundaram, Brox and Keutzer, "Dense Point Trajectories by GPU-Accelerated Large Displacement Optical Flow", ECCV
-    2010, equation 5). It fails where a pixel is hidden in the other picture; one that leaves the picture is invalid
+    2010, equation 5). It fails where a pixel is hidden in the other picture; a pixel that leaves the picture is invalid
     too.
 
     Args:
@@ -183,7 +184,7 @@ def consistent(field: Field, opposite: Field) -> npt.NDArray[np.bool_]:
 
 
 class _Pictures:
-    """The pictures that flow is estimated on, made when they are asked for."""
+    """The pictures that flow is estimated on, computed on first use."""
 
     def __init__(
         self, frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None, needed: int
@@ -207,7 +208,7 @@ class _Pictures:
             )
 
     def pair(self, earlier: int, later: int) -> tuple[Picture, Picture]:
-        # One pair's later picture is mostly the next one's earlier one; nothing older is asked for again.
+        # The later picture of a pair is usually the earlier picture of the next; older ones are not needed again.
         self._made = {number: self._made[number] if number in self._made else self._make(self._frames[number])
                       for number in (earlier, later)}  # fmt: skip
         return self._made[earlier], self._made[later]
@@ -221,13 +222,15 @@ class _Pictures:
         return np.ascontiguousarray(resized[top : top + height, left : left + width], np.uint8)
 
     def crop(self, field: npt.NDArray[Any], flip: bool) -> npt.NDArray[Any]:
-        """The crop's part of something on the grid of the pictures, mirrored where the view is; values as they are."""
+        """Return the crop's part of an array on the grid of the pictures, mirrored if the view is; values are
+        unchanged.
+        """
         part = field[self._top : self._top + self._height, self._left : self._left + self._width]
         return part[:, ::-1] if flip else part
 
 
 def _region(params: SampleParams, recipe: Recipe, margin_px: int | None, height_px: int, width_px: int) -> Window:
-    """The crop with its margin, in the resized picture."""
+    """Return the crop with its margin, in the resized picture."""
     if margin_px is None:
         return Window(0, 0, height_px, width_px)
     top, left = max(0, params.crop_top_px - margin_px), max(0, params.crop_left_px - margin_px)
@@ -237,7 +240,7 @@ def _region(params: SampleParams, recipe: Recipe, margin_px: int | None, height_
 
 
 def _offset(params: SampleParams, margin_px: int | None) -> tuple[int, int]:
-    """Row and column of the crop in its region."""
+    """Return row and column of the crop in its region."""
     if margin_px is None:
         return params.crop_top_px, params.crop_left_px
     return min(params.crop_top_px, margin_px), min(params.crop_left_px, margin_px)

@@ -1,20 +1,20 @@
-"""The methods by name, and the choice among them.
+"""Flow estimators by name, and the choice among them.
 
 All of them are zero or dense inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016)
 by OpenCV: patches are matched from coarse to fine down to a finest scale, whose field is then enlarged. Scale 2 is a
 quarter of the picture's size; scale 1 takes two to three times as long and resolves motion that scale 2 blurs.
 
-``auto`` chooses for each pair of pictures by a cheap look at how much moves:
+``auto`` chooses for each pair of pictures by a quick estimate of the motion:
 
 - Still: no block of 8 x 8 pixels changes its mean by more than 1.5 grey levels. A coder's noise averages out in a
   block, a moving edge does not. The flow is zero.
-- Slow: 95 % of the picture moves less than half a pixel. Dense inverse search without refinement is then as good as
-  with it, at half the time.
+- Slow: 95 % of the picture moves less than half a pixel. Dense inverse search without refinement is then as accurate as
+  with it, in half the time.
 - Otherwise with refinement. Of the methods whose median error on pans and zooms is below a quarter of a pixel it is the
-  cheapest that also holds on frames of little texture (docs/flow.md).
+  cheapest that also works on frames with little texture (docs/flow.md).
 
-The look takes about a third of the time of the costliest choice: dense inverse search on the picture at a quarter of
-its size.
+The quick estimate takes about a third of the time of the costliest choice: dense inverse search on the picture at a
+quarter of its size.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Estimator = Callable[[Picture, Picture], Field]
 buffers, so each thread needs its own."""
 
 ULTRAFAST, FAST, MEDIUM = range(3)
-"""OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*: naming them here would load it."""
+"""OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*; using its names would import it."""
 SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
 
@@ -53,24 +53,24 @@ _MOST_OF_THE_PICTURE = 0.95
 
 
 def zero() -> Estimator:
-    """An estimator for which nothing ever moves."""
+    """Return an estimator that always gives zero flow."""
     return lambda first, second: np.zeros((*first.shape, 2), np.float32)
 
 
 def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estimator:
-    """Dense inverse search with a preset's number of iterations, patch stride and refinement; guarded.
+    """Return a guarded estimator: dense inverse search with a preset's number of iterations and patch stride.
 
     Args:
         preset: ULTRAFAST, FAST or MEDIUM.
         finest_scale: the pyramid level that matching ends at; 0 is the full picture.
-        refinements: iterations of the variational refinement; None: the preset's, 5 (ultrafast: none).
+        refinements: iterations of the variational refinement; None: the preset's, 5 (ultrafast: 0).
     """
     search = cv2.DISOpticalFlow.create(preset)
     if refinements is not None:
         search.setVariationalRefinementIterations(refinements)
 
     def estimate(first: Picture, second: Picture) -> Field:
-        # A small picture makes OpenCV lower the finest scale, and leave it so for the pictures that follow.
+        # A small picture makes OpenCV lower the finest scale, also for the pictures that follow.
         search.setFinestScale(finest_scale)
         field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
         return field
@@ -87,14 +87,14 @@ METHODS: Mapping[str, Callable[[], Estimator]] = MappingProxyType(
         "dis-fast-1": partial(dis, FAST, 1),
     }
 )
-"""What makes an estimator of each method. "lean" refines three times, not five; "1" is the finest scale."""
+"""Constructors of the estimators. "lean" refines three times, not five; "1" is the finest scale."""
 
 
 def estimator(name: str) -> Estimator:
-    """A new estimator of that method.
+    """Return a new estimator of that method.
 
     Raises:
-        UsageError: no such method; the message lists them.
+        UsageError: there is no such method; the message lists them.
     """
     if name not in METHODS:
         raise UsageError(f"flow method {name!r}: choose one of {', '.join(METHODS)}")
@@ -102,7 +102,7 @@ def estimator(name: str) -> Estimator:
 
 
 def choose(first: Picture, second: Picture) -> str:
-    """The name of the method that "auto" takes for a pair of [h, w] uint8 pictures."""
+    """Return the method that "auto" uses for a pair of [h, w] uint8 pictures."""
     change = cv2.subtract(first, second, dtype=cv2.CV_32F)
     if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= STILL_GREY_LEVELS:
         return STILL
@@ -118,10 +118,10 @@ def _shrunk(picture: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
 
 
 def guarded(estimate: Estimator, smallest_side_px: int) -> Estimator:
-    """The same estimator, made safe.
+    """Return a safe form of an estimator.
 
-    Equal pictures have exactly zero flow, whatever the method makes of them. A picture with a side below
-    ``smallest_side_px`` is enlarged by repeating its border: methods fail on such, some by a segmentation fault.
+    Equal pictures have exactly zero flow, whatever the method returns. A picture with a side below ``smallest_side_px``
+    is enlarged by repeating its border: methods fail on smaller ones, some with a segmentation fault.
     """
 
     def safe(first: Picture, second: Picture) -> Field:
@@ -141,8 +141,9 @@ def guarded(estimate: Estimator, smallest_side_px: int) -> Estimator:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV with one thread: a server worker is one core's worth of work, and how a picture is divided among threads
-    cannot change a result."""
+    """Limit OpenCV to one thread: a server worker uses one core, and dividing a picture among threads must not change a
+    result.
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,12 +1,12 @@
 """The folder of a server's keys. I/O.
 
-    server.key          the server's own pair, mode 0600
+    server.key          the server's own key pair, mode 0600
     consumer/NAME       public key of a consumer
     worker/NAME         public key of a worker
 
-What is given to a peer (:mod:`v2v_protocol.keys`) is written elsewhere; its secret is not kept here. To revoke a key is
-to remove its file: a running server looks twice a second. What a server lends to workers that it starts on other hosts
-is in its memory only.
+The key file of a peer (:mod:`v2v_protocol.keys`) is written elsewhere; its secret is not kept here. Removing a file
+revokes its key: a running server checks the folder twice a second. Keys for workers that the server starts on other
+hosts exist only in its memory.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class KeyFolder:
-    """A folder that :meth:`init` made.
+    """A folder that :meth:`init` created.
 
     Args:
-        path: of the folder.
+        path: path of the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,10 +38,10 @@ class KeyFolder:
         self._lent: dict[str, dict[str, str]] = {side: {} for side in SIDES}
 
     def init(self) -> None:
-        """Make the folder and the server's keys.
+        """Create the folder and the server's keys.
 
         Raises:
-            UsageError: there are keys already, or the folder cannot be made.
+            UsageError: there are keys already, or the folder cannot be created.
         """
         public, secret = (key.decode() for key in zmq.curve_keypair())
         try:
@@ -50,23 +50,24 @@ class KeyFolder:
                 (self.path / side).mkdir(mode=0o700, exist_ok=True)
             write_private(self._server, json.dumps({"public": public, "secret": secret}) + "\n")
         except FileExistsError as error:
-            raise UsageError(f"{self._server} is there: keys that were given out would end with it") from error
+            raise UsageError(f"{self._server} exists: replacing it would invalidate all keys made with it") from error
         except OSError as error:
             raise UsageError(f"--dir {self.path}: {error.strerror}") from error
 
     def server_keys(self) -> tuple[bytes, bytes]:
-        """The server's public and secret key.
+        """Return the server's public and secret key.
 
         Raises:
-            KeyRefused: there is none, others can read it, or others can write to the folder, and so let themselves in.
+            KeyRefused: there are no keys, other users can read them, or other users can write to the folder and so add
+                keys.
         """
         text = read_private(self._server)
         for folder in (self.path, *(self.path / side for side in SIDES)):
             mode = stat.S_IMODE(folder.stat().st_mode) if folder.is_dir() else 0
             if mode & 0o022:
                 raise KeyRefused(
-                    f"others can write to {folder} (mode {mode:04o}), and so give keys to whom they like: "
-                    f"chmod 700 {folder}, and look at what `v2v-keys list` shows"
+                    f"others can write to {folder} (mode {mode:04o}), and so add keys: "
+                    f"chmod 700 {folder}, and check the keys that `v2v-keys list` shows"
                 )
         try:
             keys = parse_json(text)
@@ -74,18 +75,18 @@ class KeyFolder:
         except (ValueError, KeyError, TypeError):
             public = secret = None
         if not is_key(public) or not is_key(secret):
-            raise KeyRefused(f"{self._server} is no key file: v2v-keys init makes one")
+            raise KeyRefused(f"{self._server} is not a key file: create one with v2v-keys init")
         return public.encode(), secret.encode()
 
     def new(self, name: str, side: str, out: Path) -> None:
-        """Make a key for a peer, and lets it in.
+        """Create a key for a peer, and allow it.
 
         Args:
             side: "consumer" or "worker".
-            out: the file to be given to it.
+            out: file for the peer.
 
         Raises:
-            UsageError: the name is taken or no name, or a file cannot be written.
+            UsageError: the name is taken or invalid, or a file cannot be written.
             KeyRefused: the server has no keys.
         """
         if not _NAME.fullmatch(name):
@@ -94,7 +95,7 @@ class KeyFolder:
         public, secret = (key.decode() for key in zmq.curve_keypair())
         entry = self.path / side / name
         if entry.exists():
-            raise UsageError(f"there is a {side} key {name!r}: revoke it first, or take another name")
+            raise UsageError(f"there is a {side} key {name!r}: revoke it first, or use another name")
         try:
             write_key(out, PeerKey(side, name, server.decode(), public, secret))
             write_private(entry, public + "\n")
@@ -102,7 +103,7 @@ class KeyFolder:
             raise UsageError(f"{error.filename}: {error.strerror}") from error
 
     def lend(self, name: str, side: str) -> PeerKey:
-        """A key that nobody writes down: it lets in until this object is gone.
+        """Create a key that is not written to disk; it is valid while this object exists.
 
         Raises:
             KeyRefused: the server has no keys.
@@ -113,20 +114,20 @@ class KeyFolder:
         return PeerKey(side, name, server.decode(), public, secret)
 
     def revoke(self, name: str) -> list[str]:
-        """Remove the keys of that name; returns their sides.
+        """Remove the keys with that name; return their sides.
 
         Raises:
-            UsageError: there is none.
+            UsageError: there is no such key.
         """
         sides = [side for side in SIDES if _NAME.fullmatch(name) and (self.path / side / name).exists()]
         if not sides:
-            raise UsageError(f"no key {name!r} in {self.path}: v2v-keys list shows all")
+            raise UsageError(f"no key {name!r} in {self.path}: v2v-keys list shows all keys")
         for side in sides:
             (self.path / side / name).unlink(missing_ok=True)
         return sides
 
     def changed(self) -> tuple[int, ...]:
-        """Something that differs once a key was made or removed. A folder that is gone has no keys."""
+        """Return a value that differs after a key was created or removed. A missing folder has no keys."""
         return tuple(self._stamp(self.path / side) for side in SIDES)
 
     @staticmethod
@@ -137,7 +138,7 @@ class KeyFolder:
             return 0
 
     def allowed(self) -> dict[str, dict[str, str]]:
-        """Of each side: names by public key."""
+        """Return the allowed keys of each side: names by public key."""
         return {side: self._of(side) | self._lent[side] for side in SIDES}
 
     def _of(self, side: str) -> dict[str, str]:
@@ -150,7 +151,7 @@ class KeyFolder:
             try:
                 public = entry.read_text(encoding="ascii").strip()
             except (OSError, ValueError):
-                continue  # revoked at this moment, or none of ours
+                continue  # revoked at this moment, or not a key file
             if _NAME.fullmatch(entry.name) and is_key(public):
                 found[public] = entry.name
         return found

@@ -1,8 +1,8 @@
-"""Answers ZeroMQ's question whether a key may come in (ZAP, RFC 27), in a thread of its own. I/O.
+"""Answer ZeroMQ's authentication requests (ZAP, RFC 27), in a thread of its own. I/O.
 
-The answer is about the key and the domain, which is "consumer" or "worker": a key of one side does not open the other's
-port. ZeroMQ asks at the handshake only. It keeps the key as the connection's user id, by which messages of a connection
-are known whose key was revoked since.
+The answer depends on the key and the domain, which is "consumer" or "worker": a key of one side is not valid at the
+other's port. ZeroMQ asks only at the handshake. It keeps the key as the connection's user id, which identifies messages
+of connections whose key was revoked since.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from v2v_protocol.keys import SIDES
 from v2v_server.keys.folder import KeyFolder
 
 HANDSHAKE_MS = 3000
-"""Who has not shaken hands by then is cut off by ZeroMQ."""
+"""Time limit of a handshake, after which ZeroMQ disconnects the peer."""
 _LOOK_SECONDS = 0.5
 _TURN_MS = 100
 
 
 class Gate:
-    """Watches a context's handshakes, until closed. To be made before a socket of it binds.
+    """Authenticate a context's handshakes until closed. Create it before a socket of the context binds.
 
     Args:
-        context: of the sockets.
+        context: context of the sockets.
         folder: the keys.
 
     Raises:
@@ -46,20 +46,20 @@ class Gate:
         self._thread.start()
 
     def guard(self, socket: zmq.Socket[bytes], side: str) -> None:
-        """Addresses that the socket binds from now on are for the keys of that side only."""
+        """Require keys of that side at the addresses that the socket binds from now on."""
         socket.curve_secretkey = self._secret
         socket.curve_publickey = self._public
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt(zmq.ZAP_DOMAIN, side.encode())
-        # Without it everyone comes in where nobody answers.
+        # Without a domain ZeroMQ accepts every peer if the authentication thread does not answer.
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def admits(self, side: str, user: str) -> bool:
-        """Whether a key that came in by a handshake may still be here."""
+        """Return whether a key that passed the handshake is still valid."""
         return user in self._allowed[side]
 
     def close(self) -> None:
-        """End the thread. To be called before the context is closed."""
+        """End the thread. Call it before the context is closed."""
         self._closing.set()
         self._thread.join()
         self._questions.close(linger=0)
@@ -78,7 +78,7 @@ class Gate:
                 self._questions.send_multipart([version, request, status, text, user, b""])
 
     def _user(self, side: str, mechanism: bytes, credentials: list[bytes]) -> bytes:
-        """The key that asks to come in; empty where it may not."""
+        """Return the key of a handshake; empty if it is not valid."""
         if mechanism != b"CURVE" or side not in SIDES or len(credentials) != 1 or len(credentials[0]) != 32:
             return b""
         public: bytes = z85.encode(credentials[0])

@@ -1,4 +1,4 @@
-"""A corpus catalogued ahead, on one host or on many, so that a server starts at once."""
+"""Catalogue a corpus before a server needs it, on one host or many."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from v2v_server.video.rows import Rows
 
 @dataclass(frozen=True)
 class Ahead:
-    """What is catalogued, and how; see :func:`v2v_server.catalogue.catalogue.open_catalogue`."""
+    """What to catalogue, and how; see :func:`v2v_server.catalogue.catalogue.open_catalogue`."""
 
     videos: str
     list_file: str | None = None
@@ -34,13 +34,13 @@ class Ahead:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A shard that is done.
+    """A finished shard.
 
     Attributes:
         path: of its index.
-        videos: of the corpus.
-        taken_in: of them in this shard.
-        problems: of those the ones that cannot be used, by reason.
+        videos: number of videos of the corpus.
+        taken_in: videos in this shard.
+        problems: how many of them cannot be used, by reason.
     """
 
     path: Path
@@ -50,15 +50,15 @@ class Part:
 
 
 def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None, notice: Notice | None) -> Catalogue:
-    """The catalogue of a corpus, all of whose files are in the index afterwards. The caller closes it.
+    """Open the catalogue of a corpus with all of its files in the index. The caller closes it.
 
     Args:
         asked: the corpus.
-        parts: folder of the parts that other hosts made; what fits the files here need not be probed again.
+        parts: folder of the parts that other hosts made; files that match are not probed again.
         progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
 
     Raises:
-        CorpusError: as there; or the parts are not complete, or cannot be read.
+        CorpusError: as there; or parts are missing or cannot be read.
     """
     if parts is not None:
         complete = parts_in(parts)
@@ -79,17 +79,17 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
 
 
 def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | None, notice: Notice | None) -> Part:
-    """Catalogues a shard of a corpus, and leaves its index among the parts. What was done before a kill stays done: it
-    lies in the cache folder of this host.
+    """Catalogue a shard of a corpus and write its index to the parts.
+
+    Progress is kept in this host's cache folder, so that a killed run continues.
 
     Args:
         asked: the corpus.
-        shard: of it.
         out: folder of the parts, which all hosts see.
         progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
 
     Raises:
-        CorpusError: there is no such corpus, or a folder that cannot be written to.
+        CorpusError: there is no such corpus, or a folder cannot be written to.
     """
     make_folder(out)
     bucket = copies_of(os.fspath(asked.videos), asked.copies, asked.copies_gib, asked.cache_dir)

@@ -1,5 +1,7 @@
-"""What `v2v-doctor` looks at: whatever makes a first hour go wrong, and what to change. Works where most packages are
-missing, which is one of the things it says; so it opens nothing of ours that needs one before it knows."""
+"""The checks of `v2v-doctor`: installation, machine, port and corpus, each with what to change.
+
+Missing packages are one of its findings, so it imports modules that need them only after it has checked.
+"""
 
 from __future__ import annotations
 
@@ -51,9 +53,9 @@ class Finding:
 
     Attributes:
         level: OK, NOTE (worth knowing) or BAD (in the way).
-        about: what was looked at.
+        about: what was checked.
         text: what was found.
-        change: what to do; empty where nothing is to be done.
+        change: what to do; empty if nothing.
     """
 
     level: str
@@ -63,10 +65,10 @@ class Finding:
 
 
 def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None) -> Iterator[Finding]:
-    """Everything there is to say, each as soon as it is known; arguments as of the command.
+    """Run all checks and yield each finding at once; arguments as of the command.
 
     Raises:
-        UsageError: the recipe or the rows say nothing.
+        UsageError: wrong recipe or rows.
     """
     yield Finding(OK, "version", f"{version_of('v2v-stream')}, Python {sys.version.split()[0]}, {sys.platform}")
     missing: dict[str, list[str]] = {}
@@ -80,9 +82,9 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     yield from _machine()
     yield _port(port)
     if videos is None:
-        yield Finding(OK, "corpus", "not looked at; --videos DIR does")
+        yield Finding(OK, "corpus", "not checked; --videos DIR checks one")
     elif missing["server"]:
-        yield Finding(BAD, "corpus", "cannot be looked at without the extra 'server'", "pip install '.[server]'")
+        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", "pip install '.[server]'")
     else:
         # Needs packages of that extra.
         corpus = importlib.import_module("v2v_server.offline.doctor_corpus")
@@ -90,7 +92,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
 
 
 def _missing(part: str) -> list[str]:
-    """What an extra of this distribution asks for and is not here, with its floor."""
+    """List the requirements of an extra that are not installed, or too old, with their lowest versions."""
     try:
         requirements = metadata.requires("v2v-stream") or []
     except metadata.PackageNotFoundError:
@@ -123,11 +125,11 @@ def _numbers(version: str) -> list[int]:
 def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
     for part, names in missing.items():
         if not names:
-            yield Finding(OK, part, "everything that this part needs is installed")
+            yield Finding(OK, part, "all required packages are installed")
         else:
             level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
             change = f"pip install '.[{part}]' in a checkout, if you need that part on this machine"
-            # Packages of a part that this machine may not need are no news.
+            # Name the packages only if no part works: this machine may not need the others.
             text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
             yield Finding(level, part, text, change)
 
@@ -137,7 +139,7 @@ def _libraries() -> Iterator[Finding]:
         av, zmq, numba = (importlib.import_module(name) for name in ("av", "zmq", "numba"))
         importlib.import_module("cv2")
     except (ImportError, OSError) as error:
-        change = "install what it names with the system's packages, or install that Python package again"
+        change = "install the library it names with the system's package manager, or reinstall that Python package"
         yield Finding(BAD, "libraries", f"a package is installed and cannot be loaded: {error}", change)
         return
     ffmpeg = ".".join(map(str, av.library_versions["libavcodec"]))
@@ -165,7 +167,7 @@ def _has_codec(av: Any, name: str, mode: str) -> bool:
 
 
 def _torch() -> Finding:
-    """In a process of its own: to load it takes seconds, and a driver that does not fit may end the process."""
+    """Load torch in another process: loading takes seconds, and a wrong driver may end the process."""
     cards = _cards()
     try:
         done = subprocess.run(
@@ -173,7 +175,7 @@ def _torch() -> Finding:
         )
         version, names = json.loads(done.stdout.strip().splitlines()[-1])
     except (subprocess.TimeoutExpired, IndexError, ValueError):
-        return Finding(BAD, "torch", "is installed and cannot be loaded", 'see what python -c "import torch" says')
+        return Finding(BAD, "torch", "is installed and cannot be loaded", 'run python -c "import torch" to see why')
     if names:
         return Finding(OK, "torch", f"{version}; {', '.join(names)}")
     if cards:
@@ -202,10 +204,10 @@ def _machine() -> Iterator[Finding]:
     yield from _shared_memory()
     kernels = os.environ.get("NUMBA_CACHE_DIR", "")  # chosen when v2v_server was imported
     if kernels:
-        yield Finding(OK, "kernels", f"once compiled, they are kept in {kernels}")
+        yield Finding(OK, "kernels", f"compiled kernels are kept in {kernels}")
     else:
-        change = "set V2V_CACHE_DIR to a folder that can be written"
-        yield Finding(NOTE, "kernels", "no folder to keep compiled ones: every start takes longer", change)
+        change = "set V2V_CACHE_DIR to a writable folder"
+        yield Finding(NOTE, "kernels", "no folder for compiled kernels: every start takes longer", change)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < _FEW_FILES:
         change = "ulimit -Hn 65536, LimitNOFILE= of systemd, or docker run --ulimit nofile=65536"
@@ -218,13 +220,13 @@ def _memory() -> Finding:
     available = _kilobytes("MemAvailable") * 1024
     limit, used = control_group_memory()
     if not available and limit is None:
-        return Finding(NOTE, "memory", "this system does not say how much is free")
+        return Finding(NOTE, "memory", "this system does not report free memory")
     free = min(value for value in (available or None, None if limit is None else limit - used) if value is not None)
     text = f"{free / _GIB:.1f} GiB free"
     if limit is not None:
         text += f"; the control group's limit is {limit / _GIB:.1f} GiB"
     if free < _LITTLE_MEMORY_BYTES:
-        return Finding(BAD, "memory", text, "free some, or raise the limit: a server and one worker need about 1 GiB")
+        return Finding(BAD, "memory", text, "free memory or raise the limit: a server and one worker need about 1 GiB")
     return Finding(OK, "memory", text)
 
 
@@ -232,9 +234,9 @@ def _sandbox() -> Finding:
     can = can_confine()
     lacking = [name for name, has in (("seccomp", can.calls), ("Landlock", can.files)) if not has]
     if not lacking:
-        return Finding(OK, "sandbox", "what decodes videos starts no program, and opens and writes nothing it need not")
-    text = f"no {' and no '.join(lacking)} here: a video that finds a flaw in a decoder has more of its user's rights"
-    return Finding(NOTE, "sandbox", text, "run servers of strangers' videos in a container, or under deploy/systemd")
+        return Finding(OK, "sandbox", "processes that decode videos cannot start programs or open other files")
+    text = f"no {' and no '.join(lacking)} here: a video that exploits a decoder gets more of its user's rights"
+    return Finding(NOTE, "sandbox", text, "serve untrusted videos from a container, or with deploy/systemd")
 
 
 def _kilobytes(name: str, table: Path = Path("/proc/meminfo")) -> int:
@@ -248,8 +250,10 @@ def _kilobytes(name: str, table: Path = Path("/proc/meminfo")) -> int:
 def control_group_memory(
     groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
 ) -> tuple[int | None, int]:
-    """(limit, used), bytes, of the control group with the least room among this process's own and those above it
-    (Linux, version 2); a limit of None: none is set."""
+    """Return (limit, used), bytes, of the tightest control group among this process's own and those above it.
+
+    Linux, version 2. The limit is None if no group has one.
+    """
     with suppress(OSError, ValueError):
         (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
         found, folder = [], groups
@@ -269,7 +273,7 @@ def _shared_memory(folder: str = "/dev/shm") -> Iterator[Finding]:
         if free >= _SMALL_SHM_BYTES:
             yield Finding(OK, "/dev/shm", f"{free / _GIB:.1f} GiB free")
         else:
-            change = "docker run --shm-size 1g; our own server, workers and stream do not use it"
+            change = "docker run --shm-size 1g; v2v-stream itself does not use it"
             text = f"{free >> 20} MiB free: too little for a DataLoader with num_workers above 0"
             yield Finding(NOTE, "/dev/shm", text, change)
 
@@ -280,6 +284,6 @@ def _port(port: int) -> Finding:
             taker.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             taker.bind(("127.0.0.1", port))
     except (OSError, OverflowError) as error:
-        change = f"a server may be running already; else give v2v-serve --bind tcp://127.0.0.1:{port % 60000 + 1}"
+        change = f"a server may be running already; otherwise give v2v-serve --bind tcp://127.0.0.1:{port % 60000 + 1}"
         return Finding(NOTE, "port", f"{port} cannot be taken: {getattr(error, 'strerror', None) or error}", change)
     return Finding(OK, "port", f"{port} is free")

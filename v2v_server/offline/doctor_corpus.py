@@ -1,4 +1,4 @@
-"""A look at a corpus for `v2v-doctor`: what can be used, what cannot and why, and whether it suits a recipe."""
+"""The corpus check of `v2v-doctor`: which videos can be used, why others cannot, and whether they suit a recipe."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator
+from itertools import islice
 
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.cloud.copies import Copies
 from v2v_server.config import recipe_setting
+from v2v_server.offline.aperture import clean_aperture
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
@@ -20,17 +23,20 @@ from v2v_server.video.rows import Rows
 Line = tuple[str, str, str, str]
 """(level, about, text, change)"""
 
+_VIDEOS_OPENED = 10_000
+"""Most videos of which more is read than their line of the index."""
+
 
 def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, shown: int) -> Iterator[Line]:
-    """Lines of the report.
+    """Check a corpus and yield lines of the report.
 
     Args:
         videos, rows, cache_dir: as of :func:`v2v_server.catalogue.catalogue.open_catalogue`.
         recipe: name of a preset, or a YAML file.
-        shown: of many refusals of a kind, how many to name.
+        shown: how many refusals of a kind to name.
 
     Raises:
-        UsageError: the recipe or the rows say nothing.
+        UsageError: wrong recipe or rows.
     """
     spec = StreamSpec.from_dict({"recipe": recipe_setting(recipe, [])})
     Rows.parse(rows)  # before any work
@@ -49,17 +55,19 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
     text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
+    text += f"; {int(found.frames.sum())} frames that decode"
     yield "ok", "corpus", text, ""
     if catalogue.refusals:
         few = "; ".join(map(str, catalogue.refusals[:shown]))
         more = len(catalogue.refusals) - shown
         text = f"{len(catalogue.refusals)} files cannot be used: {few}" + (f"; and {more} more" if more > 0 else "")
-        change = "they are passed over: repair those that matter, or leave them out of --videos"
+        change = "they are skipped: repair them, or leave them out of --videos"
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
         yield "note", "corpus", text, change
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
+    yield from _how_videos_are_stored(catalogue)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
@@ -76,14 +84,38 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         began = time.perf_counter()
         remaker.sample(0, 0, min(1, remaker.count - 1))
     except V2VError as error:
-        yield "bad", "corpus", f"a sample could not be made: {error}", "see what v2v-simulate says of that video"
+        yield "bad", "corpus", f"a sample could not be made: {error}", "run v2v-simulate on that video"
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
 
 
+def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
+    if catalogue.prepared is not None:
+        return
+    ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
+    counted = [id for id in ids if not catalogue.frame_index(id).seekable]
+    if counted:
+        text = (
+            f"{len(counted)} videos have no time stamps that name their frames ({counted[0]}): every clip of them is "
+            "decoded from the beginning of its file"
+        )
+        yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
+    if isinstance(catalogue.root, Copies):
+        return
+    cropped = [(id, shown) for id in ids if (shown := clean_aperture(catalogue.path(id))) is not None]
+    if cropped:
+        id, (width, height) = cropped[0]
+        text = (
+            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show ({id}: "
+            f"{float(width):g}x{float(height):g} px): it is not applied, the whole stored picture is served"
+        )
+        change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
+        yield "note", "corpus", text, change
+
+
 def _remedy(longest: int, wanted: int) -> str:
-    """What to do about videos that are too short; empty where no clip length admits them.
+    """Say what to do about videos that are too short; "" if no clip length admits them.
 
     Args:
         longest: ``voxels_per_clip`` that admits all of them; 0: none does.

@@ -1,5 +1,4 @@
-"""Files of events, in the forms that the field reads. Says in each, where it has a place for words, that times within a
-bin are invented."""
+"""Files of events in common formats. Formats with room for a note say that times within a bin are invented."""
 
 from __future__ import annotations
 
@@ -17,14 +16,14 @@ _NOTE = "simulated from voxel grids: times within a bin are invented"
 
 
 def write_events(path: Path, events: EventList) -> None:
-    """Writes events; the end of the name says how.
+    """Write events in the format that the ending names.
 
     ``.h5``, ``.hdf5``: the layout of DSEC: ``events/x``, ``y``, ``t`` (microseconds), ``p`` (0, 1), ``ms_to_idx``,
     ``t_offset``; root attributes ``width`` and ``height``. ``.npz``: x, y, t, p, width, height. ``.raw`` (EVT 3),
     ``.aedat4``, ``.es``, ``.dat``: written by the package faery, which keeps no note in them.
 
     Raises:
-        UsageError: another ending, a package that is missing, or the file cannot be written.
+        UsageError: unknown ending, missing package, or the file cannot be written.
     """
     check_event_file(path)
     try:
@@ -34,14 +33,14 @@ def write_events(path: Path, events: EventList) -> None:
 
 
 def check_event_file(path: Path) -> None:
-    """Refuses, before any work, a name that :func:`write_events` cannot write.
+    """Check, before any work, that :func:`write_events` can write a file of this name.
 
     Raises:
         UsageError: see :func:`write_events`.
     """
     ending = path.suffix.lower()
     if ending not in FORMS:
-        raise UsageError(f"{path}: events go into a file that ends in {', '.join(FORMS)}")
+        raise UsageError(f"{path}: unknown ending; events go into a file that ends in {', '.join(FORMS)}")
     if package := _PACKAGES.get(FORMS[ending]):
         _package(package, path)
 

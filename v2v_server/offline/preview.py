@@ -1,7 +1,8 @@
 """`v2v-preview`: what a recipe makes of a video, to look at, without a server.
 
-One clip for each virtual camera, made by the very functions that a server's worker uses, so what is shown is what a
-trainer gets. A video too short or too small for the recipe is shown with shorter clips or smaller crops, and said so.
+The whole picture without noise comes first. Then one clip for each virtual camera, made by the functions that a
+server's worker uses, so what is shown is what a trainer gets. A video too short or too small for the recipe is shown
+with shorter clips or smaller crops, and the output says so.
 """
 
 from __future__ import annotations
@@ -25,14 +26,16 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.offline.remake import open_shown, remake
-from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.decode import decode_luma
+from v2v_server.cloud.copies import open_local
+from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
+from v2v_server.offline.remake import Remaker, open_shown
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.store.clips import clips_of
+from v2v_server.video.collect import Cut
 
 KINDS = (".png", ".mp4", ".gif", ".html")
-_TOLD_SECONDS = 2.0
+_REPORT_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
-_NOISE = ("noise_sigma", "hot_pixel_share", "shot_noise_hz", "leak_hz")
 _GIF_EVERY = 2  # every other bin: half the size
 
 
@@ -41,7 +44,7 @@ class Shot:
     """One camera of a preview.
 
     Attributes:
-        title: written beside it.
+        title: written beside the camera; "" writes the seed.
         recipe: fields or a preset's name.
         seed: of the sample.
     """
@@ -54,10 +57,11 @@ class Shot:
 def preview(
     source: str,
     out: Path,
-    looks: Sequence[Shot],
+    shots: Sequence[Shot],
     spec: Mapping[str, Any],
     *,
     title: str,
+    find_motion: bool = False,
     list_file: str | None = None,
     rows: str = "full",
     with_flow: bool = True,
@@ -65,121 +69,148 @@ def preview(
     cache_dir: str | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Makes the cameras' clips, draws them, writes the file.
+    """Make the cameras' clips, draw them, and write the file.
 
     Args:
         source, list_file, rows: the corpus, as for a server.
         out: .png (a sheet), .mp4 or .gif (a film), or .html (both in one file).
-        looks: the cameras.
+        shots: the cameras.
         spec: other fields of the StreamSpec; None in any takes the default.
         title: of the page.
+        find_motion: take other seeds than those of ``shots``, whose crops show motion. Equal seeds stay equal.
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
-        say: takes each line for the user.
+        say: called with each line for the user.
 
     Raises:
-        UsageError: an ending that is none of these, a wrong recipe, or a file that cannot be written.
+        UsageError: unknown ending, wrong recipe, or a file that cannot be written.
         CorpusError: no video can be used, even with short clips and small crops.
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
     if out.suffix not in KINDS:
-        raise UsageError(f"--out {out}: give a name that ends in {', '.join(KINDS)}")
+        raise UsageError(f"--out {out}: unknown ending; give a name that ends in {', '.join(KINDS)}")
     if not out.parent.is_dir():  # before any work
-        raise UsageError(f"--out {out}: there is no folder {out.parent}")
+        raise UsageError(f"--out {out}: there is no folder {out.parent}; create it first")
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
     notes: dict[str, list[str]] = {}
-    told: _Told | None = None
+    progress: _Progress | None = None
     try:
-        for look in looks:
-            cameras.append(_camera(catalogue, look, spec, with_flow, notes))
-            if told is None:  # the first may have waited for kernels to be compiled, and says nothing of the others
-                told = _Told(say, "cameras", len(looks), done=1)
+        first = _fitted_stream(catalogue, spec, shots[0].recipe)
+        wholes = WholePictures(catalogue, first)
+        if find_motion:
+            shots, note = _moving(shots, Remaker(catalogue, first), wholes)
+            say(note)
+        for shot in shots:
+            cameras.append(_camera(catalogue, shot, spec, with_flow, notes))
+            if progress is None:  # the first may include compiling, so it is no estimate for the others
+                progress = _Progress(say, "cameras", len(shots), done=1)
             else:
-                told.one_more()
+                progress.step()
+        whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
     for note, titles in notes.items():
-        say(f"{', '.join(titles) if len(titles) < len(looks) else 'all cameras'}: {note}")
-    write(out, _content(out.suffix, cameras, title, moments, say))
+        say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
+    write(out, _content(out.suffix, whole, cameras, title, moments, say))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
-class _Told:
-    """Says now and then how many of so many things are done, how fast that goes, and how long it will take."""
+def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
+    """Return the same cameras with seeds that show motion, and a note for the user."""
+    asked = sorted({shot.seed for shot in shots})
+    chosen, moving = moving_seeds(remaker, wholes, len(asked))
+    seeds = dict(zip(asked, chosen, strict=True))
+    names = f"seed{'s' if len(chosen) > 1 else ''} {', '.join(map(str, chosen))}"
+    if moving == len(chosen):
+        note = f"{names}: chosen because their crops show motion; --seed 0 takes what chance gives"
+    else:
+        note = f"{names}: {moving} of {len(chosen)} crops show more motion than noise, no more were found"
+    return [dataclasses.replace(shot, seed=seeds[shot.seed]) for shot in shots], note
+
+
+def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
+    (video,) = (video for video in catalogue.videos if video.id == provenance.video)
+    return VideoSequence(video, provenance.start_frame)
+
+
+class _Progress:
+    """Report from time to time how many of the things are done, how fast, and the time left."""
 
     def __init__(self, say: Callable[[str], None], things: str, total: int, done: int = 0) -> None:
         self._say, self._things, self._total = say, things, total
         self._done = self._first = done
         self._began = self._told = time.monotonic()
 
-    def one_more(self) -> None:
+    def step(self) -> None:
         self._done += 1
         now, left = time.monotonic(), self._total - self._done
-        if left and now - self._told > _TOLD_SECONDS:
+        if left and now - self._told > _REPORT_SECONDS:
             self._told, each = now, (now - self._began) / (self._done - self._first)
             rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
             self._say(f"{self._done} of {self._total} {self._things}, {rate}, {left * each:.0f} s left")
 
 
-def _content(kind: str, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]) -> bytes | str:
+def _content(
+    kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]
+) -> bytes | str:
     if kind == ".png":
-        return png_bytes(draw_sheet(cameras, title, moments=moments))
+        return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
-    told, film = _Told(say, "pictures of the film", grids * bins), []
-    for picture in draw_film(cameras, title):
+    progress, film = _Progress(say, "pictures of the film", grids * bins), []
+    for picture in draw_film(cameras, title, whole=whole):
         film.append(picture)
-        told.one_more()
+        progress.step()
     if kind == ".mp4":
         return mp4_bytes(film, FRAMES_PER_SECOND)
     if kind == ".gif":
         return gif_bytes(film[::_GIF_EVERY], FRAMES_PER_SECOND / _GIF_EVERY)
-    return html_page(title, draw_sheet(cameras, title, moments=moments), film, FRAMES_PER_SECOND)
+    return html_page(title, draw_sheet(cameras, title, moments=moments, whole=whole), film, FRAMES_PER_SECOND)
 
 
 def _camera(
-    catalogue: Catalogue, look: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
+    catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> Camera:
-    """One camera's clip; what is to be said of it goes to ``notes``, by the text, because many may share it."""
-    stream = StreamSpec.from_dict({**spec, "recipe": look.recipe})
-    fitted = _fitted(catalogue, stream)
-    if fitted != stream.recipe:
+    """Make one camera's clip; add the titles of the cameras that a note is about to ``notes``, by its text."""
+    title = shot.title or f"seed {shot.seed}"
+    asked, stream = StreamSpec.from_dict({**spec, "recipe": shot.recipe}), _fitted_stream(catalogue, spec, shot.recipe)
+    if stream != asked:
+        fitted, recipe = stream.recipe, asked.recipe
         note = (
             f"shown with {fitted.voxels_per_clip} voxel grids of {fitted.crop_width_px} x "
-            f"{fitted.crop_height_px} instead of {stream.recipe.voxels_per_clip} of {stream.recipe.crop_width_px} x "
-            f"{stream.recipe.crop_height_px}: no video here is long and large enough for more"
+            f"{fitted.crop_height_px} instead of {recipe.voxels_per_clip} of {recipe.crop_width_px} x "
+            f"{recipe.crop_height_px}: no video here is long and large enough for more"
         )
-        notes.setdefault(note, []).append(look.title)
-        stream = StreamSpec.from_dict({**spec, "recipe": fitted})
+        notes.setdefault(note, []).append(title)
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
-    sample = remake(catalogue, stream, seed=look.seed, epoch=0, index=0, arrays=arrays)
-    whole = _whole_picture(catalogue, sample.provenance)
-    camera = Camera.of(sample.arrays, sample.provenance, look.title, stream.recipe.frames_per_bin, whole)
-    quiet_recipe = stream.recipe.replace(**dict.fromkeys(_NOISE, (0.0, 0.0)))
-    quiet_stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": quiet_recipe})
-    quiet = remake(catalogue, quiet_stream, seed=look.seed, epoch=0, index=0, arrays=("voxels", "frames"))
-    without = Camera.of(quiet.arrays, quiet.provenance, look.title)
-    events = float(camera.rates.sum())
-    share = max(0.0, 1.0 - float(without.rates.sum()) / events) if events else 0.0
-    return dataclasses.replace(camera, noise_share=share)
+    made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
+    provenance, frames_per_bin = made.sample.provenance, stream.recipe.frames_per_bin
+    whole = _whole_picture(catalogue, provenance)
+    camera = Camera.of(made.sample.arrays, provenance, title, frames_per_bin, whole)
+    quiet = dataclasses.replace(camera, voxels=quiet_voxels(made)[camera.lead_voxels :])
+    return dataclasses.replace(camera, quiet=quiet.rates)
 
 
-def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8] | None:
-    """The video's rows at the clip's first frame, or None: a prepared folder has files that are no videos."""
-    if catalogue.prepared is not None:
-        return None
+def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:
+    """Read the video's rows at the clip's first frame: [rows, columns] uint8."""
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
-    rows = (top, 0, bottom - top, index.width_px)
-    picture: npt.NDArray[np.uint8] = decode_luma(
-        catalogue.path(provenance.video), index, provenance.start_frame, 1, rows
-    ).frames[0]
+    cut = Cut(1, (top, 0, bottom - top, index.width_px))
+    with open_local(catalogue.root, provenance.video, provenance.fingerprint) as path:
+        (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
+    picture: npt.NDArray[np.uint8] = clip.frames[0]
     return picture
 
 
+def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:
+    """Return the stream of a recipe that :func:`_fitted` has made fit."""
+    stream = StreamSpec.from_dict({**spec, "recipe": recipe})
+    return StreamSpec.from_dict({**spec, "recipe": _fitted(catalogue, stream)})
+
+
 def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
-    """The recipe, with clips as long and crops as large as the videos admit, if they admit less."""
+    """Return the recipe, with shorter clips or smaller crops if the videos admit no others."""
     recipe = stream.recipe
     while True:
         table = SequenceTable(catalogue.videos, catalogue.rows, stream)

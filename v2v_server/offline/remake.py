@@ -1,10 +1,10 @@
-"""Any sample of any stream, made in this process: what `v2v-simulate` does, and how a test or a bug report remakes a
-sample that a trainer saw."""
+"""Any sample of any stream, made in this process: `v2v-simulate`, tests, and bug reports about a trainer's sample."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from v2v_pictures.camera import Camera, check_drawable
 from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -25,17 +26,26 @@ from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.console.progress import catalogue_progress
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, make_sample
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
 
 
+@dataclass(frozen=True, slots=True)
+class RemadeSample:
+    """A sample, the lease it was made for, and the frames it was made of."""
+
+    lease: Lease
+    decoded: Decoded
+    sample: Sample
+
+
 class Remaker:
-    """Makes samples of one stream, each by its name: the same bytes a server streams.
+    """Make samples of one stream by their names: the same bytes a server streams.
 
     Args:
         catalogue: the corpus.
@@ -47,7 +57,7 @@ class Remaker:
         count: samples of an epoch.
 
     Raises:
-        UsageError: arrays nobody makes.
+        UsageError: unknown arrays.
         CorpusError: no video gives a sequence.
     """
 
@@ -68,13 +78,21 @@ class Remaker:
         self._schedule = Schedule.of(table, spec)
         self.count = self._schedule.count
 
+    def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:
+        """Return the sequence that the sample of this name is made from if it can be read."""
+        return self._schedule.candidate(seed, epoch, index, 0)
+
     def sample(self, seed: int, epoch: int, index: int) -> Sample:
-        """The sample of this name, candidates and refusals included.
+        """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
+        return self.made(seed, epoch, index).sample
+
+    def made(self, seed: int, epoch: int, index: int) -> RemadeSample:
+        """Make the sample of this name, and return what it was made of too.
 
         Raises:
             UsageError: an index outside the epoch.
             SampleUnavailable: no candidate could give the sample.
-            VideoUnreadable: this host cannot read a candidate's file, whatever a server made of it.
+            VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
         SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
@@ -95,7 +113,8 @@ class Remaker:
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
             try:
-                return make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+                decoded = decode_for(lease, lease.indices, catalogue.root)[0]
+                return RemadeSample(lease, decoded, make_sample(lease, decoded))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise
@@ -107,7 +126,7 @@ class Remaker:
 def open_shown(
     source: str, *, list_file: str | None, rows: str, cache_dir: str | None, scene: bool = False
 ) -> Catalogue:
-    """:func:`open_catalogue` for somebody who waits: on all cores, and how far it is on stderr."""
+    """Call :func:`open_catalogue` on all cores, with progress on stderr."""
     with catalogue_progress() as progress:
         return open_catalogue(
             source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir,
@@ -124,7 +143,7 @@ def open_remaker(
     spec: StreamSpec,
     arrays: tuple[str, ...],
 ) -> Remaker:
-    """From what a user names; errors as of :func:`open_catalogue` and :class:`Remaker`."""
+    """Open a corpus and return its remaker. Errors: :func:`open_catalogue` and :class:`Remaker`."""
     scene = spec.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     return Remaker(catalogue, spec, arrays)
@@ -141,12 +160,12 @@ def remake(
     quarantine: Quarantine | None = None,
     snapshot: int = 0,
 ) -> Sample:
-    """One sample of an identity. Arguments and errors: see :class:`Remaker`."""
+    """Make one sample. Arguments and errors: see :class:`Remaker`."""
     return Remaker(catalogue, spec, arrays, quarantine, snapshot).sample(seed, epoch, index)
 
 
 def _is_left_out(catalogue: Catalogue, video: str) -> bool:
-    """Whether a prepared folder only keeps the video's place, because it could not be prepared: no server has it."""
+    """Return whether the video could not be prepared, so that a prepared folder has no file for it."""
     return catalogue.prepared is not None and not catalogue.path(video).exists()
 
 
@@ -166,12 +185,12 @@ def simulate_to_file(
     cache_dir: str | None = None,
     events: Path | None = None,
 ) -> None:
-    """Makes one sample and writes it as .npz: the asked arrays and ``provenance``, a JSON text.
+    """Make one sample and write it as .npz: the requested arrays and ``provenance``, a JSON text.
 
     Args:
         source, list_file, rows: the corpus, as for a server.
-        out: the .npz file; a name that does not end so gets it added.
-        picture: a .png file to draw it into, or None.
+        out: the .npz file; the ending is added if it is missing.
+        picture: a .png file for a picture of the sample, or None.
         spec: fields of the StreamSpec; None in any takes the default.
         arrays, seed, epoch, index: see :func:`remake`.
         snapshot: number of the quarantine snapshot to make it under.
@@ -189,7 +208,7 @@ def simulate_to_file(
     if events is not None:
         check_event_file(events)
         if "voxels" not in arrays:
-            raise UsageError("--events needs the array voxels")
+            raise UsageError("--events needs the array voxels: add it to --arrays")
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
@@ -207,7 +226,7 @@ def simulate_to_file(
         snapshot=snapshot,
     )
     if not out.name.endswith(".npz"):
-        out = Path(f"{out}.npz")  # as numpy would, which does not say so
+        out = Path(f"{out}.npz")  # as numpy would, without saying so
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:
@@ -233,5 +252,5 @@ def simulate_to_file(
 def _bin_us(catalogue: Catalogue, sample: Sample, spec: StreamSpec) -> float:
     (video,) = (video for video in catalogue.videos if video.id == sample.provenance.video)
     if not video.frames_per_second > 0:
-        raise UsageError(f"{video.id}: its frame rate is unknown, and events need times")
+        raise UsageError(f"{video.id}: its frame rate is unknown, and events need times; leave --events out")
     return 1e6 * spec.recipe.frames_per_bin * spec.recipe.frame_stride / video.frames_per_second

@@ -1,4 +1,4 @@
-"""The process of the page. Started by a server, which has bound its port already: ``v2v_server.page.child``."""
+"""The process of the page. A server starts it after binding its port: ``v2v_server.page.child``."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ from v2v_server.page.source import Source
 from v2v_server.system.process import die_with_parent
 
 _NICE = 10
-"""What watches takes no time from what is watched."""
+"""Niceness of the page's process, so that it takes no time from the server and its workers."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serve until it is told to stop, or the server ends."""
+    """Serve until told to stop, or until the server ends."""
     parser = argparse.ArgumentParser(prog="python -m v2v_server.page", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server's own workers connect")
-    parser.add_argument("--fd", required=True, type=int, help="descriptor of the socket that listens")
-    parser.add_argument("--parent-pid", required=True, type=int, help="the server, with which this process ends")
-    parser.add_argument("--names", default="", help="names that the page may be asked by, with commas between")
+    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="address for the server's own workers")
+    parser.add_argument("--fd", required=True, type=int, help="file descriptor of the listening socket")
+    parser.add_argument(
+        "--parent-pid", required=True, type=int, help="process id of the server, with which this process ends"
+    )
+    parser.add_argument("--names", default="", help="host names to accept, separated by commas")
     arguments = parser.parse_args(argv)
     die_with_parent(arguments.parent_pid)
     os.nice(_NICE)
-    # No key: the server lets in its own user here, see v2v_server.page.child.
+    # No key: this address admits the server's own user, see v2v_server.page.child.
     source = Source(Looker(arguments.connect, keys=""))
     config = uvicorn.Config(
         make_app(source, filter(None, arguments.names.split(","))),

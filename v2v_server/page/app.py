@@ -1,8 +1,8 @@
-"""What is answered to which path.
+"""Answer each path.
 
-/          the page, for a person; /static has its parts
-/healthz   200 where the server answers; for a probe that starts it again
-/readyz    200 where somebody can make samples; for a probe that sends consumers to it
+/          the page, for people; /static has its parts
+/healthz   200 if the server answers; for a liveness probe, which restarts it
+/readyz    200 if a worker can make samples; for a readiness probe, which sends consumers to it
 /metrics   for Prometheus
 /state     the newest state, JSON
 /events    every new state, as server-sent events
@@ -28,14 +28,14 @@ from v2v_server.page.source import Source
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
 MOST_STREAMS = 64
-"""Browsers that are told of every state. One that stops reading holds its own connection, and a state of memory."""
+"""Browsers that receive every state. One that stops reading occupies its connection and the memory of one state."""
 
 
 class Pages:
-    """The answers.
+    """Handlers of the paths.
 
     Args:
-        source: of states.
+        source: source of states.
     """
 
     def __init__(self, source: Source) -> None:
@@ -43,38 +43,40 @@ class Pages:
         self._streams = 0
 
     async def page(self, request: Request) -> Response:
-        """For a person."""
+        """Return the page for people."""
         return FileResponse(STATIC / "index.html")
 
     async def healthz(self, request: Request) -> Response:
-        """Whether the server answers."""
+        """Report whether the server answers."""
         sight = await self._source.known()
         return _said(sight.trouble)
 
     async def readyz(self, request: Request) -> Response:
-        """Whether somebody can make samples."""
+        """Report whether a worker can make samples."""
         sight = await self._source.known()
         if sight.state is None:
             return _said(sight.trouble)
         return _said("" if sight.state["is_ready"] and sight.state["worker_count"] else "no worker is connected")
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus; also where the server does not answer, which ``v2v_up`` then says."""
+        """Return the metrics; if the server does not answer, ``v2v_up`` is 0."""
         sight = await self._source.latest()
         content, content_type = exposition(sight.state, request.headers.get("accept", ""))
         return Response(content, headers={"content-type": content_type})
 
     async def state(self, request: Request) -> Response:
-        """The newest state."""
+        """Return the newest state."""
         sight = await self._source.latest()
         if sight.state is None:
             return JSONResponse({"trouble": sight.trouble}, 503)
         return JSONResponse(sight.state)
 
     async def events(self, request: Request) -> Response:
-        """States as they come: ``event: state``; ``event: trouble`` where the server does not answer."""
+        """Stream states: ``event: state``, or ``event: trouble`` if the server does not answer."""
         if self._streams >= MOST_STREAMS:
-            return PlainTextResponse(f"{MOST_STREAMS} others look on already\n", 503)
+            return PlainTextResponse(
+                f"too many viewers: {MOST_STREAMS} are connected, the limit; close one and reload\n", 503
+            )
         return StreamingResponse(self._events(), media_type="text/event-stream")
 
     async def _events(self) -> AsyncIterator[bytes]:
@@ -91,11 +93,11 @@ class Pages:
 
 
 def make_app(source: Source, names: Iterable[str] = ()) -> App:
-    """The application.
+    """Build the application.
 
     Args:
-        source: of states.
-        names: that the page may be asked by, besides addresses and this host's own.
+        source: source of states.
+        names: host names that it accepts, in addition to IP addresses and this host's own name.
     """
     pages = Pages(source)
     routes = [

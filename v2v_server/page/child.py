@@ -1,9 +1,9 @@
-"""The page's process as the server has it. Needs none of the packages that the page needs.
+"""Run the page's process from the server. Needs none of the packages that the page needs.
 
-The server binds the port and passes it on, so that a port which is taken is said at the start, and nothing that asks is
-turned away while the process is started again. The process asks the server over ZeroMQ where the server's own workers
-do: that address is private to this host and user (the kernel says whose process connects), so that it needs no key of a
-consumer, which somebody would have to make, keep and revoke for a program that only looks.
+The server binds the port and passes it on. So a port in use is reported at the start, and requests wait while the
+process is restarted. The process reads the state over ZeroMQ from the address for the server's own workers. That
+address is private to this host and user (the kernel reports whose process connects). So the page needs no consumer key,
+which a person would have to create, store and revoke.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from v2v_protocol.programs import environment
 _PACKAGES = ("starlette", "uvicorn", "prometheus_client")
 _FIRST_PAUSE_SECONDS, _LONGEST_PAUSE_SECONDS = 1.0, 60.0
 _LONG_LIFE_SECONDS = 60.0
-"""After so long a life the pauses begin small again."""
+"""After running for this long, the delay before a restart starts small again."""
 _STOP_SECONDS = 3.0
 
 
 class PageProcess:
-    """A port that listens, and the process that answers there.
+    """A listening port, and the process that answers there.
 
     Args:
         host, port: where to listen.
-        names: that it may be asked by, with commas between.
+        names: host names to accept, separated by commas.
 
     Raises:
-        UsageError: that cannot be had, or a package is missing.
+        UsageError: the port cannot be bound, or a package is missing.
     """
 
     def __init__(self, host: str, port: int, names: str = "") -> None:
@@ -54,26 +54,26 @@ class PageProcess:
 
     @property
     def url(self) -> str:
-        """Where it is."""
+        """URL of the page."""
         host, port = self._socket.getsockname()[:2]
         return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
     @property
     def pid(self) -> int | None:
-        """Of the process; None while there is none."""
+        """Process id; None while there is no process."""
         return None if self._process is None else self._process.pid
 
     def start(self, address: str) -> None:
-        """From now on :meth:`watch` keeps a process running, which asks the server at ``address``."""
+        """Make :meth:`watch` keep a process running, which reads the state from the server at ``address``."""
         self._address = address
 
     def watch(self, now: float) -> list[str]:
-        """Start the process where there is none, and says how one ended. To be called a few times a second."""
+        """Start the process if it is not running, and return lines that say how it ended. Call a few times a second."""
         if self._process is not None and (status := self._process.poll()) is not None:
             if now - self._started_at >= _LONG_LIFE_SECONDS:
                 self._pause = _FIRST_PAUSE_SECONDS
             self._process, self._start_at = None, now + self._pause
-            text = f"the page's process {_ended(status)}; samples are not affected, and it is started again in "
+            text = f"the page's process {_ended(status)}; samples are not affected; it is restarted in "
             said = [f"{text}{self._pause:g} s"]
             self._pause = min(2 * self._pause, _LONGEST_PAUSE_SECONDS)
             return said
@@ -100,7 +100,7 @@ class PageProcess:
         )
 
     def stop(self) -> None:
-        """End the process, and listens no more."""
+        """End the process and stop listening."""
         self._address = ""
         process, self._process = self._process, None
         if process is not None:
@@ -114,7 +114,8 @@ class PageProcess:
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """
+    """Bind and return the socket.
+
     Raises:
         UsageError: it cannot be bound.
     """
@@ -123,7 +124,7 @@ def _listening(host: str, port: int) -> socket.socket:
         return socket.create_server(address[:2], family=family, backlog=128)
     except OSError as error:
         is_port = error.errno in (errno.EADDRINUSE, errno.EACCES) and not isinstance(error, socket.gaierror)
-        # Python adds a sentence of its own to the system's.
+        # Python adds its own text to the system's message.
         text = os.strerror(error.errno) if is_port and error.errno else error.strerror or str(error)
         remedy = "give another port with --page PORT" if is_port else "give an address of this host with --page-host"
         raise UsageError(f"--page {port} at {host}: {text}; {remedy}") from error

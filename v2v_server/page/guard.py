@@ -1,9 +1,9 @@
-"""Who may ask the page, and what a browser may do with the answer.
+"""Decide which requests the page answers, and what a browser may do with the answer.
 
-A page of this host can be asked by every web site that its user visits: the browser does it, under the site's own name,
-if that name is made to stand for this host (DNS rebinding). So only names that nobody else can have are answered:
-addresses, localhost, this host's own, and those that the operator gives. What is shown comes from strangers (names of
-files and peers): nothing but this server's own files may run, and nothing may be sent elsewhere.
+Every web site that a user visits can make the user's browser send requests to a page on this host, under the site's own
+name if that name resolves to this host (DNS rebinding). So only names that others cannot own are accepted: IP
+addresses, localhost, this host's own name, and names that the operator gives. The page shows untrusted text (names of
+files and peers): only this server's own scripts may run, and nothing may be sent elsewhere.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ HEADERS = {
 
 
 class Guard:
-    """Stands before an application (ASGI).
+    """Middleware before an application (ASGI).
 
     Args:
-        app: what it guards.
-        names: that may be asked by, besides addresses, localhost and this host's own.
+        app: the application.
+        names: host names that it accepts, in addition to IP addresses, localhost and this host's own name.
     """
 
     def __init__(self, app: App, names: Iterable[str] = ()) -> None:
@@ -47,7 +47,7 @@ class Guard:
         self._headers = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        """See ASGI."""
+        """Handle a request, see ASGI."""
         if scope["type"] != "http":
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
@@ -64,12 +64,12 @@ class Guard:
             await self._app(scope, receive, send_with_headers)
             return
         refusal = PlainTextResponse(
-            "this page is not asked by that name; ask by an address, or start v2v-serve with --page-names NAME\n", 421
+            "Unknown Host header. Use an IP address, or allow the name with v2v-serve --page-names NAME.\n", 421
         )
         await refusal(scope, receive, send_with_headers)
 
     def admits(self, host: str) -> bool:
-        """Whether a Host header names this host in a way that nobody else can."""
+        """Return whether a Host header names this host in a way that others cannot."""
         name = _without_port(host).lower()
         if name in self._names:
             return True

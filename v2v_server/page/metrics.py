@@ -1,7 +1,7 @@
-"""The state as Prometheus wants it: names by its convention (base units, ``_total`` for what only grows).
+"""Format the state as Prometheus metrics, named by its convention (base units, ``_total`` for counters).
 
-Consumers and workers have labels. A consumer's is what it calls itself, not its connection's number, which is another
-one in each epoch; those that call themselves alike are added up.
+Consumers and workers have labels. A consumer's label is its display name, not the number of its connection, which
+changes in each epoch; consumers with the same name are added up.
 """
 
 from __future__ import annotations
@@ -15,59 +15,65 @@ from prometheus_client.exposition import choose_encoder
 
 GIB = 1 << 30
 _COUNTERS = {
-    "v2v_samples": ("samples", "Samples handed to consumers."),
-    "v2v_batches": ("batches", "The same in batches of each consumer's own size."),
-    "v2v_decodes": ("decodes", "Clips decoded for them."),
-    "v2v_sample_bytes": ("bytes", "Bytes of their arrays."),
-    "v2v_shared_memory_samples": ("in_slots", "Samples put into memory shared with their consumer."),
+    "v2v_samples": ("samples", "Samples sent to consumers."),
+    "v2v_batches": ("batches", "Batches sent to consumers, in each consumer's own batch size."),
+    "v2v_decodes": ("decodes", "Clips decoded for the samples sent."),
+    "v2v_sample_bytes": ("bytes", "Bytes of the arrays of the samples sent."),
+    "v2v_shared_memory_samples": ("in_slots", "Samples written to memory shared with their consumer."),
     "v2v_worker_cpu_seconds": ("cpu_seconds", "Processor time that samples took in workers."),
-    "v2v_consumer_waiting_seconds": ("waited_seconds", "Time that consumers waited for samples, as they say."),
+    "v2v_consumer_waiting_seconds": ("waited_seconds", "Time that consumers waited for samples, as they report."),
     "v2v_refused_candidates": ("refused_candidates", "Videos passed over."),
-    "v2v_unavailable_samples": ("unavailable", "Samples that no candidate could give."),
+    "v2v_unavailable_samples": ("unavailable", "Samples without a usable candidate."),
     "v2v_returned_leases": ("returned_leases", "Leases taken back from workers that died, hung or left."),
     "v2v_second_leases": ("second_leases", "Samples given to a second worker because the first was slow."),
-    "v2v_late_results": ("late_results", "Answers to leases that had been taken back."),
+    "v2v_late_results": ("late_results", "Results of leases that had been taken back."),
     "v2v_lost_workers": ("workers_lost", "Workers that died or were given up."),
-    "v2v_missing_videos": ("missing_videos", "Leases whose worker could not have a video of the server's host."),
-    "v2v_malformed_messages": ("malformed", "Messages that were none."),
-    "v2v_faults": ("faults", "Everything that went wrong and was survived."),
+    "v2v_missing_videos": ("missing_videos", "Leases whose worker could not read a video that the server's host has."),
+    "v2v_malformed_messages": ("malformed", "Malformed messages received."),
+    "v2v_faults": ("faults", "Faults that the service survived, in total."),
 }
 _GAUGES = {
-    "v2v_uptime_seconds": ("uptime_seconds", "Since the server could be asked for anything."),
-    "v2v_queued_samples": ("queue", "Asked samples that nobody works on."),
-    "v2v_waiting_share": ("queued_share", "Consumers that asked for such samples, of all that are connected, 0 to 1."),
-    "v2v_worker_processes": ("worker_processes", "Workers that the server runs itself."),
+    "v2v_uptime_seconds": ("uptime_seconds", "Time since the server was ready to accept consumers."),
+    "v2v_queued_samples": ("queue", "Requested samples that are not leased to a worker."),
+    "v2v_waiting_share": (
+        "queued_share",
+        "Share of connected consumers with requests that are not leased to a worker, 0 to 1.",
+    ),
+    "v2v_worker_processes": ("worker_processes", "Worker processes that the server runs itself."),
     "v2v_videos": ("video_count", "Videos of the catalogue."),
-    "v2v_unusable_videos": ("unusable_count", "Files that cannot be used at all."),
-    "v2v_quarantined_sequences": ("quarantined", "Verdicts of the quarantine in force."),
+    "v2v_unusable_videos": ("unusable_count", "Files that cannot be used."),
+    "v2v_quarantined_sequences": ("quarantined", "Quarantine entries in force."),
 }
-_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover")
-PARTS = ("nobody", "start", "workers", "consumers", "decode", "simulate", "handover", "broker", "way", "even")
+_SHARES = ("consumers", "idle", "broker", "decode", "simulate", "handover", "queued")
+PARTS = ("nobody", "start", "workers", "consumers", "cores", "decode", "simulate", "handover", "broker", "way", "even")
 _WORKER_STATES = ("working", "idle", "resting", "lost")
 _CONSUMER_STATES = ("stalled", "taking", "idle", "gone")
 _OF_CONSUMERS = {
-    "v2v_consumer_waiting_ratio": ("Of the last ten seconds, in which it waited for batches.", "waiting_share"),
-    "v2v_consumer_epoch": ("Epoch that it is in.", "epoch"),
-    "v2v_consumer_in_flight_samples": ("Samples that it asked for and workers have.", "in_flight"),
-    "v2v_consumer_queued_samples": ("Samples that it asked for and nobody works on.", "waiting"),
-    "v2v_consumer_credit_samples": ("Samples that it may have asked for at a time.", "credit"),
+    "v2v_consumer_waiting_ratio": (
+        "Share of the last ten seconds in which the consumer waited for batches, 0 to 1.",
+        "waiting_share",
+    ),
+    "v2v_consumer_epoch": ("Epoch that the consumer is in.", "epoch"),
+    "v2v_consumer_in_flight_samples": ("Samples requested by the consumer and leased to workers.", "in_flight"),
+    "v2v_consumer_queued_samples": ("Samples requested by the consumer and not leased to a worker.", "waiting"),
+    "v2v_consumer_credit_samples": ("Largest number of samples that the consumer may have outstanding.", "credit"),
 }
 _LARGEST_OF_ALIKE = ("v2v_consumer_waiting_ratio", "v2v_consumer_epoch")
 _State = Mapping[str, Any]
 
 
 class StateCollector:
-    """Makes metrics of a state.
+    """Collector of the metrics of one state.
 
     Args:
-        state: ``v2v_server.console.state.ServiceState.to_dict()``; None where the server does not answer.
+        state: ``v2v_server.console.state.ServiceState.to_dict()``; None if the server does not answer.
     """
 
     def __init__(self, state: _State | None) -> None:
         self._state = state
 
     def collect(self) -> Iterator[Metric]:
-        """Every metric."""
+        """Yield every metric."""
         state = self._state
         yield GaugeMetricFamily("v2v_up", "Whether the server answers.", value=float(state is not None))
         if state is None:
@@ -78,9 +84,7 @@ class StateCollector:
         yield info
         for name, (key, text) in _COUNTERS.items():
             yield CounterMetricFamily(name, text, value=state["totals"][key])
-        work = CounterMetricFamily(
-            "v2v_worker_seconds", "Time of workers by the clock, by what they do.", labels=("part",)
-        )
+        work = CounterMetricFamily("v2v_worker_seconds", "Wall-clock time of workers, by activity.", labels=("part",))
         for part in ("decode", "simulate", "handover"):
             work.add_metric((part,), state["totals"][f"{part}_seconds"])
         yield work
@@ -95,11 +99,11 @@ class StateCollector:
 
 
 def exposition(state: _State | None, accept: str = "") -> tuple[bytes, str]:
-    """The metrics of a state, and their content type.
+    """Return the metrics of a state, and their content type.
 
     Args:
         state: see :class:`StateCollector`.
-        accept: what the asker takes, as its header says.
+        accept: the request's Accept header.
     """
     registry = CollectorRegistry(auto_describe=False)
     registry.register(StateCollector(state))
@@ -110,13 +114,13 @@ def exposition(state: _State | None, accept: str = "") -> tuple[bytes, str]:
 def _of_waiting(waiting: _State) -> Iterator[Metric]:
     shares = GaugeMetricFamily(
         "v2v_time_ratio",
-        "Of the last ten seconds: consumers waited, workers were idle, the broker was busy, workers did what.",
+        "Share of the last ten seconds by part: waiting consumers, idle workers, broker, workers. 0 to 1.",
         labels=("part",),
     )
     for part in _SHARES:
         shares.add_metric((part,), waiting["shares"][part])
     yield shares
-    slow = GaugeMetricFamily("v2v_slow_part", "1 for the part that the others wait for.", labels=("part",))
+    slow = GaugeMetricFamily("v2v_slow_part", "1 for the part that is the bottleneck.", labels=("part",))
     for part in PARTS:
         slow.add_metric((part,), float(part == waiting["part"]))
     yield slow
@@ -126,10 +130,12 @@ def _of_cache(cache: _State | None) -> Iterator[Metric]:
     if cache is None:
         return
     yield CounterMetricFamily("v2v_cache_hits", "Clips read from the cache.", value=cache["hits"])
-    yield CounterMetricFamily("v2v_cache_misses", "Clips that had to be decoded.", value=cache["misses"])
+    yield CounterMetricFamily("v2v_cache_misses", "Clips that were not in the cache.", value=cache["misses"])
     if cache["folder"]:
-        yield GaugeMetricFamily("v2v_cache_bytes", "What lies in the cache.", value=cache["held_gib"] * GIB)
-        yield GaugeMetricFamily("v2v_cache_limit_bytes", "What may lie there.", value=cache["most_gib"] * GIB)
+        yield GaugeMetricFamily("v2v_cache_bytes", "Bytes stored in the cache.", value=cache["held_gib"] * GIB)
+        yield GaugeMetricFamily(
+            "v2v_cache_limit_bytes", "Size limit of the cache, bytes.", value=cache["most_gib"] * GIB
+        )
 
 
 def _by_state(name: str, text: str, peers: list[_State], states: tuple[str, ...]) -> Metric:
@@ -141,9 +147,13 @@ def _by_state(name: str, text: str, peers: list[_State], states: tuple[str, ...]
 
 def _of_workers(workers: list[_State]) -> Iterator[Metric]:
     labels = ("worker", "host")
-    samples = CounterMetricFamily("v2v_worker_samples", "Samples that it made.", labels=labels)
-    busy = GaugeMetricFamily("v2v_worker_busy_ratio", "Of the last ten seconds, in which it made them.", labels=labels)
-    memory = GaugeMetricFamily("v2v_worker_memory_bytes", "Memory of its process.", labels=labels)
+    samples = CounterMetricFamily("v2v_worker_samples", "Samples that the worker made.", labels=labels)
+    busy = GaugeMetricFamily(
+        "v2v_worker_busy_ratio",
+        "Share of the last ten seconds in which the worker made samples, 0 to 1.",
+        labels=labels,
+    )
+    memory = GaugeMetricFamily("v2v_worker_memory_bytes", "Resident memory of the worker's process.", labels=labels)
     for worker in workers:
         label = worker["name"], worker["host"]
         samples.add_metric(label, worker["samples"])
@@ -158,8 +168,10 @@ def _of_consumers(consumers: list[_State]) -> Iterator[Metric]:
         if consumer["state"] != "gone":
             alike.setdefault((consumer["name"], consumer["host"]), []).append(consumer)
     labels = ("consumer", "host")
-    samples = CounterMetricFamily("v2v_consumer_samples", "Samples sent to it.", labels=labels)
-    progress = GaugeMetricFamily("v2v_consumer_epoch_ratio", "Of the epoch, how much it has.", labels=labels)
+    samples = CounterMetricFamily("v2v_consumer_samples", "Samples sent to the consumer.", labels=labels)
+    progress = GaugeMetricFamily(
+        "v2v_consumer_epoch_ratio", "Share of the epoch that the consumer has received, 0 to 1.", labels=labels
+    )
     for label, group in alike.items():
         samples.add_metric(label, sum(each["served"] for each in group))
         progress.add_metric(label, min(each["position"] / max(1, each["sequences"]) for each in group))

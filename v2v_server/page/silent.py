@@ -18,7 +18,7 @@ class BoundedProtocol(H11Protocol):
     silent: ClassVar[dict[BoundedProtocol, asyncio.TimerHandle]] = {}
 
     def connection_made(self, transport: Any) -> None:
-        """See asyncio.Protocol."""
+        """Start the timer of a connection, see asyncio.Protocol."""
         super().connection_made(transport)
         self.silent[self] = self.loop.call_later(SILENT_SECONDS, transport.abort)
         if len(self.silent) > MOST_SILENT:
@@ -27,13 +27,13 @@ class BoundedProtocol(H11Protocol):
             oldest.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """See asyncio.Protocol."""
+        """Handle received data, see asyncio.Protocol."""
         super().data_received(data)
         if self.cycle is not None:
             self._settle()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """See asyncio.Protocol."""
+        """Stop the timer of a connection, see asyncio.Protocol."""
         self._settle()
         super().connection_lost(exc)
 

@@ -1,4 +1,4 @@
-"""The newest state of the service, asked for only when somebody wants it: a page that nobody looks at costs nothing."""
+"""Get the newest state of the service on demand: a page without viewers costs nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from v2v_protocol.errors import RemoteError, V2VError
 from v2v_protocol.messages import ErrorCode
 
 FRESH_SECONDS = 0.4
-"""A state of this age is as good as a new one, however many ask."""
+"""A state of at most this age is reused."""
 _ANSWER_SECONDS = 3.0
 KNOWN_SECONDS = 15.0
 """A health check accepts a state of this age."""
@@ -27,12 +27,12 @@ class Looks(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Glimpse:
-    """What was seen last.
+    """The last answer of the server.
 
     Attributes:
-        state: ``v2v_server.console.state.ServiceState.to_dict()``; None when the server did not answer.
-        trouble: why it did not; empty where it did.
-        at: when, seconds.
+        state: ``v2v_server.console.state.ServiceState.to_dict()``; None if the server did not answer.
+        trouble: why it did not answer; empty if it did.
+        at: time of the answer, seconds.
     """
 
     state: dict[str, Any] | None
@@ -41,11 +41,11 @@ class Glimpse:
 
 
 class Source:
-    """Asks a server, at most once at a time and a few times a second.
+    """Request the state from a server, one request at a time and at most a few per second.
 
     Args:
-        looker: asks; used by one thread at a time.
-        clock: seconds.
+        looker: sends the requests; used by one thread at a time.
+        clock: returns monotonic time, seconds.
     """
 
     def __init__(self, looker: Looks, clock: Callable[[], float] = time.monotonic) -> None:
@@ -57,7 +57,7 @@ class Source:
         self._asking: asyncio.Future[Glimpse] | None = None
 
     async def latest(self) -> Glimpse:
-        """The newest state, which is at most :data:`FRESH_SECONDS` old."""
+        """Return the newest state, which is at most :data:`FRESH_SECONDS` old."""
         async with self._lock:
             if self._latest is None or self._clock() - self._latest.at >= FRESH_SECONDS:
                 self._latest = await asyncio.to_thread(self._look)
@@ -80,7 +80,7 @@ class Source:
         try:
             state = self._looker.look(_ANSWER_SECONDS)
         except RemoteError as error:
-            if error.code == ErrorCode.BUSY and self._answered is not None:  # the server lives
+            if error.code == ErrorCode.BUSY and self._answered is not None:  # the server is alive
                 self._answered = replace(self._answered, at=self._clock())
             return Glimpse(None, str(error), self._clock())
         except V2VError as error:

@@ -1,13 +1,13 @@
-"""Writing luma to a video file that decodes fast, with exactly the time stamps it is given.
+"""Write luma to a video file that decodes fast, with exactly the given time stamps.
 
-What is written is full-range luma and nothing else, in MP4: x264 in true monochrome (4:0:0, so sizes may be odd) with
-``tune fastdecode`` (no CABAC, no loop filter, no weighted prediction), constant rate factor, no psychovisual
-optimisation: that spends bits on texture that looks right to a person, where pixels that are right are wanted.
+The file holds only full-range luma, in MP4: x264 in true monochrome (4:0:0, so sizes may be odd) with
+``tune fastdecode`` (no CABAC, no loop filter, no weighted prediction), constant rate factor, and no psychovisual
+optimisation, which spends bits on texture that looks right to people, where accurate pixels are wanted.
 
-Keyframes come at multiples of the GOP and nowhere else, at cuts neither: with a GOP that divides it, at the first frame
-of every sequence. There are no B-frames, so packets leave in order of presentation. The encoder runs on a clock of its
-own: one tick a frame. So its rate control treats every frame alike whatever the rate; the source's time stamps are put
-onto the packets.
+Keyframes come only at multiples of the GOP, and not at shot boundaries: with a GOP that divides it, at the first frame
+of every sequence. There are no B-frames, so packets leave in order of presentation. The encoder's clock has one tick
+per frame, so its rate control treats all frames alike whatever the rate; the source's time stamps are set on the
+packets.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ def encode_luma(
     pts: Sequence[int],
     time_base: Fraction,
 ) -> None:
-    """Write a file; any that stands there is overwritten. Memory does not grow with its length.
+    """Write a file, overwriting an existing one. Memory does not grow with its length.
 
     Args:
         path: the file; its suffix does not matter.
         frames: ``len(pts)`` pictures [height, width] uint8, full range.
-        encoding: the settings, of h264.
-        height, width: of the pictures, pixels; odd ones too.
+        encoding: settings of h264.
+        height, width: size of the pictures, pixels; odd sizes are allowed.
         pts: strictly increasing time stamps in units of ``time_base``.
         time_base: seconds.
 
     Raises:
         VideoError: the encoder or the container refuses (a picture too small or too large for the codec, a full disk).
     """
-    # A first time stamp other than 0 is stored in units of the movie's clock: by default milliseconds.
+    # MP4 stores a first time stamp other than 0 in units of the movie's clock, by default milliseconds.
     container_options = {"movie_timescale": str(time_base.denominator), "movflags": "write_colr"}
     try:
         with av.open(os.fspath(path), "w", format="mp4", options=container_options) as output:

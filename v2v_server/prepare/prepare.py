@@ -1,12 +1,13 @@
-"""`v2v-prepare`: a corpus decoded once, and kept as what training needs.
+"""`v2v-prepare`: decode a corpus once, and store what training needs.
 
-The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation, and
-a manifest that says what the files are: of the store (:mod:`v2v_server.store.format`), which give the very frames of
-their sources, or MP4; whatever their names end in.
+The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation. A
+manifest states what the files are, whatever their suffixes: store files (:mod:`v2v_server.store.format`), which
+reproduce the exact frames of their sources, or MP4.
 
-Whatever happens, the folder stays sound: a file gets its name only when whole and verified, and its line in the
-manifest after that. A second run keeps what the manifest lists, if file and source are still those, and does the rest.
-No run forgets what it was not asked for: those records are set aside (see :mod:`v2v_server.catalogue.manifest`).
+The folder stays consistent after any interruption: a file gets its final name only when complete and verified, and its
+line in the manifest after that. A second run keeps files that the manifest lists if file and source are unchanged, and
+does the rest. Records of videos that a run does not include are set aside, not dropped (see
+:mod:`v2v_server.catalogue.manifest`).
 """
 
 from __future__ import annotations
@@ -38,19 +39,19 @@ from v2v_server.video.rows import Rows
 
 DEFAULT_FLOOR_DB = 35.0
 DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
-"""How far below the clip's floor a frame may lie. The worst frame of a sound clip is some 5 dB worse than the clip at
-most; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
+"""Distance of a frame's floor below the clip's floor. The worst frame of a sound clip is at most some 5 dB worse than
+the clip; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
 
 LEAST_FREE_BYTES = 1 << 30
-"""So much of the disk is left to others: who fills a disk to the last byte stops what else runs there."""
+"""Always keep this much disk space free: a full disk stops other programs."""
 
 _STORED_BITS_PER_PIXEL = 2.2
-"""Of a lossless file, in the middle of the clips that were measured (docs/prepare.md): 0.7 to 3.4."""
+"""Size of a lossless file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
 
 _TELLING_SHARE = 0.02
 
 Progress = Callable[[int, int, int, int], None]
-"""(source frames dealt with, source frames in all, bytes made so far, bytes to expect in all)."""
+"""Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
 
 
 def prepare(
@@ -65,24 +66,24 @@ def prepare(
     single: bool = False,
     progress: Progress | None = None,
 ) -> Report:
-    """Transcode a corpus; a video that cannot be is recorded with the reason, and the others go on.
+    """Transcode a corpus. A video that cannot be transcoded is recorded with the reason, and the others continue.
 
     Args:
-        catalogue: the source; its ``rows`` are what is kept of the pictures.
-        destination: the folder to make or to go on with.
+        catalogue: the source; its ``rows`` are stored.
+        destination: the folder to create or to continue.
         encoding: codec settings.
-        processes: how many transcode at a time, spawned; 0 transcodes in this one.
-        floor_db: least PSNR of a clip for ``Report.below_floor``.
-        frame_floor_db: least PSNR of each frame for the same; None: 5 dB below ``floor_db``.
-        scene: also take the statistics of what each video shows; those of one prepared without them are taken from
-            its source, and its file stays.
+        processes: number of parallel transcoding processes, spawned; 0 transcodes in this process.
+        floor_db: lowest PSNR of a clip for ``Report.below_floor``, dB.
+        frame_floor_db: lowest PSNR of each frame for the same, dB; None: 5 dB below ``floor_db``.
+        scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
+            and its file stays.
         single: the source is one video, so the destination may lie in its folder.
-        progress: told at the start, after each video whose file was looked for, and after each that was done.
+        progress: called at the start, after each video whose file was checked, and after each that was done.
 
     Raises:
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
-            settings or from another source, a prepared file cannot be read, another process is at work there, or the
-            source is prepared itself; or the disk has not the room, or no longer.
+            settings or from another source, a prepared file cannot be read, another process works there, the source is
+            a prepared folder itself, or the disk is too full.
         UsageError: a number outside its limits.
     """
     if frame_floor_db is None:
@@ -141,11 +142,11 @@ def prepare(
 
 
 class _Room:
-    """Whether the disk has the room for what is to come.
+    """Check of the free disk space for the expected files.
 
     Raises:
-        CorpusError: it has not, by a first estimate.
-        OSError: it cannot be asked.
+        CorpusError: there is not enough, by a first estimate.
+        OSError: the free space cannot be read.
     """
 
     def __init__(self, target: Path, catalogue: Catalogue, encoding: Encoding, left: Sequence[VideoEntry]) -> None:
@@ -157,30 +158,34 @@ class _Room:
         free = shutil.disk_usage(target).free
         if self.expected > free - LEAST_FREE_BYTES:
             raise CorpusError(
-                f"{target}: about {self.expected / 1e9:.1f} GB are to be written, and the disk has "
-                f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; make room, keep fewer rows, "
-                "name fewer videos by --list, or take --codec h264"
+                f"{target}: about {self.expected / 1e9:.1f} GB will be written, but the disk has "
+                f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must stay free; "
+                "free disk space, keep fewer rows, select fewer videos with --list, or use --codec h264"
             )
 
     def done(self, video: VideoEntry, made: int) -> None:
-        """A video is dealt with, and so many bytes were made of it."""
+        """Count a finished video and the bytes written for it."""
         self._done_pixels += self._pixels[video.id]
         self.made += made
 
     @property
     def expected(self) -> int:
-        """How many bytes there will be: by those that were made, as soon as they say something."""
+        """Expected total of bytes, estimated from the finished videos once they are representative."""
         if self.made and self._done_pixels > _TELLING_SHARE * self._all_pixels:
             return int(self.made / self._done_pixels * self._all_pixels)
         return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels) if self._lossless else 0
 
     def check(self) -> None:
-        """Raise CorpusError where the disk is nearly full."""
+        """Check the free space during the run.
+
+        Raises:
+            CorpusError: the disk is nearly full.
+        """
         free = shutil.disk_usage(self._target).free
         if free < LEAST_FREE_BYTES:
             raise CorpusError(
-                f"{self._target}: the disk has {free / 1e9:.2f} GB left, of which {LEAST_FREE_BYTES / 1e9:.1f} stay; "
-                "what is done is kept, and the same command goes on when there is room"
+                f"{self._target}: the disk has {free / 1e9:.2f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must "
+                "stay free; finished files are kept; free disk space and run the same command to continue"
             )
 
 
@@ -194,11 +199,11 @@ def _pixels(video: VideoEntry, rows: Rows) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Earlier:
-    """What earlier runs did of the videos that this one is asked for.
+    """Results of earlier runs for the videos of this one.
 
     Attributes:
-        standing: records by id, whose prepared file is there.
-        finished: ids of those that lack nothing.
+        standing: records by id, whose prepared file exists.
+        finished: ids of those that are complete.
         failed: records without a file. They stay until the video was tried again: a finished folder stays finished.
     """
 
@@ -234,7 +239,7 @@ def _outcomes(
     scene: bool,
     processes: int,
 ) -> Iterator[tuple[VideoEntry, PreparedVideo | Refusal]]:
-    """The new record of each video, in order of completion; a problem where the standing one has to stay as it is."""
+    """Yield the new record of each video, in order of completion, or a problem if the existing record has to stay."""
     jobs = []
     for video in videos:
         try:
@@ -275,7 +280,7 @@ def _outcomes(
 
 @dataclass(frozen=True, slots=True)
 class _ToPrepare:
-    """A video to be transcoded; or, where its prepared file stands, only to be looked at."""
+    """A video to transcode, or only to analyse if its prepared file exists."""
 
     video: VideoEntry
     window: Window
@@ -288,13 +293,15 @@ def _window(video: VideoEntry, rows: Rows) -> Window:
 
 
 def _deadline_seconds(job: _ToPrepare) -> float:
-    """Some fifty times as long as a core takes to transcode and verify it: for one that waits for a file for ever."""
+    """Return the time limit for a video, seconds: some fifty times what a core takes to transcode and verify it. It
+    ends jobs whose storage never answers.
+    """
     video = job.video
     return 600 + video.frames * (0.5 + 5e-6 * video.width_px * video.height_px)
 
 
 def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
-    """What was made or seen, or why nothing was."""
+    """Return the result of one job, or the reason why there is none."""
     try:
         return transcode(job[1]) if job[0].standing is None else look_again(job[1])
     except VideoError as error:

@@ -1,4 +1,4 @@
-"""What a run of `v2v-prepare` has done."""
+"""Results of a run of `v2v-prepare`."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from v2v_server.catalogue.manifest import PreparedVideo
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a run has done.
+    """Results of a run.
 
     Attributes:
         videos: a record of every video of the source, by id.
-        kept: how many of them an earlier run had done.
-        looked_at: how many of them an earlier run had done but for the statistics of what they show.
-        aside: how many videos of earlier runs this one was not asked for; see :mod:`v2v_server.catalogue.manifest`.
-        not_looked_at: prepared videos whose statistics could not be taken, and why. What they had stays.
-        unusable: files of the source that no server takes in either.
-        floor_db: least PSNR of a clip.
-        frame_floor_db: least PSNR of each of its frames.
+        kept: number of videos that an earlier run had finished.
+        looked_at: number of videos that an earlier run had finished except for their scene statistics.
+        aside: number of videos of earlier runs that this run does not include; see
+            :mod:`v2v_server.catalogue.manifest`.
+        not_looked_at: prepared videos whose statistics could not be computed, and why. Their files stay.
+        unusable: files of the source that a server cannot use either.
+        floor_db: lowest PSNR of a clip, dB.
+        frame_floor_db: lowest PSNR of each of its frames, dB.
     """
 
     videos: tuple[PreparedVideo, ...]
@@ -35,18 +36,19 @@ class Report:
 
     @property
     def prepared(self) -> tuple[PreparedVideo, ...]:
-        """Those that have a prepared file."""
+        """The videos that have a prepared file."""
         return tuple(video for video in self.videos if video.problem is None)
 
     @property
     def failed(self) -> tuple[PreparedVideo, ...]:
-        """Those that have none."""
+        """The videos that have no prepared file."""
         return tuple(video for video in self.videos if video.problem is not None)
 
     @property
     def below_floor(self) -> tuple[PreparedVideo, ...]:
-        """Those whose PSNR, or that of one of their frames, is below its floor, the worst frame first. Their files are
-        kept, and served."""
+        """The videos whose PSNR, or that of one of their frames, is below its floor, the worst frame first. Their files
+        are kept, and served.
+        """
         low = [
             video
             for video in self.prepared
@@ -56,17 +58,17 @@ class Report:
 
     @property
     def source_bytes(self) -> int:
-        """Of the sources that were prepared."""
+        """Size of the sources that were prepared, bytes."""
         return sum(video.source_bytes for video in self.prepared)
 
     @property
     def prepared_bytes(self) -> int:
-        """Of the prepared files."""
+        """Size of the prepared files, bytes."""
         return sum(video.bytes for video in self.prepared)
 
     @property
     def complete(self) -> bool:
-        """Whether every video file was prepared, with all that was asked for, and well enough."""
+        """Whether every video file was prepared, with everything requested, and above the floors."""
         return not (self.failed or self.below_floor or self.unusable or self.not_looked_at)
 
 

@@ -1,4 +1,4 @@
-"""What earlier runs of `v2v-prepare` left in a folder, and which folders it takes at all."""
+"""Read what earlier runs of `v2v-prepare` left in a folder, and refuse unsuitable folders."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ _LOCK_NAME = ".v2v-prepare.lock"
 _NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
 _READERS = 16
 _AT_A_TIME = 1024
-"""Files whose reading is asked for at a time, so that the memory for asking does not grow with the corpus."""
+"""Files that are read at a time, so that the memory for the requests does not grow with the corpus."""
 
 
 def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
-    """Make sure that source and destination share no file, now or when the source is searched again.
+    """Check that source and destination share no file, now or when the source is searched again.
 
     Args:
         catalogue: the source.
         target: the destination, resolved.
-        single: the source is one video: nothing else of its folder will be taken for one.
+        single: the source is one video: other files of its folder are never used.
 
     Raises:
-        CorpusError: they do, or the source is prepared itself.
+        CorpusError: they do, or the source is a prepared folder itself.
     """
     root = catalogue.folder
     if catalogue.prepared is not None:
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
     below = target != root and target.is_relative_to(root)
     if root.is_relative_to(target) or (below and not single):
-        raise CorpusError(f"{target} and the source {root} lie in one another; choose a destination beside the source")
-    # To resolve a path asks the system about each of its parts: done for every folder once, and for links among files.
+        raise CorpusError(f"{target} and the source {root} overlap; choose a destination outside the source")
+    # Resolving a path queries each of its parts, so do it once for every folder, and for files that are links.
     inside: dict[str, bool] = {}
     for video in catalogue.videos:
         path = root / video.id
@@ -54,32 +54,32 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
 
 @contextlib.contextmanager
 def locked(target: Path) -> Iterator[None]:
-    """Keep other processes out of the folder; the system lets go of the lock however this one ends.
+    """Keep other processes out of the folder; the system releases the lock however this process ends.
 
     Raises:
-        CorpusError: another process is at work there.
+        CorpusError: another process works there.
         OSError: the folder cannot be written to.
     """
     with (target / _LOCK_NAME).open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise CorpusError(f"{target}: another v2v-prepare is at work there; wait for its end") from None
+            raise CorpusError(f"{target}: another v2v-prepare works there; wait until it ends") from None
         yield
 
 
 def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:
-    """The records of all earlier runs, also those set aside, after clearing away what they left unfinished.
+    """Return the records of all earlier runs, including those set aside, after removing unfinished files.
 
     Args:
         target: the destination.
-        header: what this run asks for.
-        videos: of its source.
+        header: settings of this run.
+        videos: videos of its source.
 
     Raises:
         CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings or
             from another source.
-        OSError: it cannot be read, or what is unfinished cannot be removed.
+        OSError: it cannot be read, or unfinished files cannot be removed.
     """
     if not (target / MANIFEST_NAME).exists():
         for folder in target.parents:
@@ -94,12 +94,12 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
         return {}
     manifest = read_manifest(target)
     if not manifest.header.same_settings(header):
-        # One header holds for all files of a folder, so two settings cannot lie in one; and to make all of them anew
-        # unasked may cost days.
+        # One header describes all files of a folder, so it cannot hold two settings; and preparing all of them again
+        # without being asked may cost days.
         made = sum(video.problem is None for records in (manifest.videos, manifest.aside) for video in records.values())
         raise CorpusError(
-            f"{target} was prepared with {manifest.header.settings()}, and now {header.settings()} is asked for, which "
-            f"its {made} prepared videos are not; choose another folder, or delete this one to have all made anew"
+            f"{target} holds {made} videos prepared with {manifest.header.settings()}, but {header.settings()} is "
+            "requested; choose another folder, or delete this one to prepare all of them again"
         )
     known = manifest.aside | manifest.videos
     _refuse_other_source(target, manifest.header.source, header.source, known, videos)
@@ -111,8 +111,10 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
 def _refuse_other_source(
     target: Path, earlier: str, now: str, known: dict[str, PreparedVideo], videos: Sequence[VideoEntry]
 ) -> None:
-    """Another corpus would pass for this one with every video changed or removed, and its files would replace those
-    of the same names, which may have taken days. A source that keeps its name, or some video, is the same one."""
+    """Refuse another corpus. Otherwise it would look like this one with every video changed or removed, and its files
+    would replace those of the same names, which may have taken days. A source that keeps its name, or some video, is
+    the same.
+    """
     if earlier == now or not known:
         return
     if any(video.id in known and known[video.id].source_fingerprint == video.fingerprint for video in videos):
@@ -120,19 +122,20 @@ def _refuse_other_source(
     raise CorpusError(
         f"{target} was prepared from a folder called {earlier}, and none of its {len(known)} videos is one of the "
         f"{len(videos)} of {now}; choose another folder for another corpus. If it is the same one renamed, begin with "
-        "all of its videos, or with its old name"
+        "all of its videos, or use its old name"
     )
 
 
 def standing_files(
     target: Path, videos: Sequence[VideoEntry], known: dict[str, PreparedVideo]
 ) -> Generator[tuple[VideoEntry, bool], None, None]:
-    """Whether the prepared file of each video is there, unchanged, and that of this state of the source; in order.
+    """Yield for each video, in order, whether its prepared file exists, is unchanged, and belongs to this state of the
+    source.
 
-    Beginning and end of each file are read, many files at a time: what this waits for is the disk.
+    Beginning and end of each file are read, many files at a time, because this waits for the disk.
 
     Raises:
-        CorpusError: a file is there and cannot be read.
+        CorpusError: a file exists and cannot be read.
     """
     pool = ThreadPoolExecutor(_READERS)
     try:
@@ -144,7 +147,7 @@ def standing_files(
 
 
 def has_failed(video: VideoEntry, known: dict[str, PreparedVideo]) -> bool:
-    """Whether an earlier run could not prepare this state of the source."""
+    """Return whether an earlier run could not prepare this state of the source."""
     record = known.get(video.id)
     return record is not None and record.problem is not None and record.source_fingerprint == video.fingerprint
 
@@ -158,7 +161,7 @@ def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) ->
     except VideoError as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
             raise CorpusError(
-                f"{target / video.id} {error.reason}, so nobody can tell whether it is still what was prepared, and "
-                "nothing was changed; make it readable, or delete it to have it made anew"
+                f"{target / video.id} {error.reason}, so it cannot be checked, and "
+                "nothing was changed; make it readable, or delete it to prepare it again"
             ) from error
         return False

@@ -1,6 +1,6 @@
-"""One video into its prepared form: decode, write under a temporary name, verify, rename.
+"""Convert one video to its prepared form: decode, write under a temporary name, verify, rename.
 
-A lossless file is verified by reading all of it back: it has to give the very frames that were decoded. A lossy one is
+A lossless file is verified by reading all of it back: it has to give the exact frames that were decoded. A lossy one is
 decoded again and compared with its source.
 """
 
@@ -46,20 +46,20 @@ _LARGEST_DENOMINATOR = 10**6
 
 @dataclass(frozen=True, slots=True)
 class Transcoding:
-    """One video to be prepared.
+    """One video to prepare.
 
     Attributes:
         video: its id.
         source: the file.
-        fingerprint: which it must have.
+        fingerprint: expected fingerprint of the file.
         codec: FFmpeg's name of its format.
-        index: ``FrameIndex.to_bytes()`` of it.
-        frames_per_second: its average rate, NaN where unknown; gives the time stamps where the index has none.
-        window: of its upright pictures, what to keep.
+        index: its ``FrameIndex.to_bytes()``.
+        frames_per_second: its average rate, NaN if unknown; gives the time stamps if the index has none.
+        window: the part of its upright pictures to store.
         encoding: codec settings.
         root: the folder that the target must not leave, resolved.
-        target: the file to make; its folder is made if missing.
-        scene: whether to take the statistics of what it shows.
+        target: the file to write; its folder is created if missing.
+        scene: whether to compute the scene statistics.
     """
 
     video: str
@@ -77,12 +77,12 @@ class Transcoding:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A prepared file that was verified.
+    """A prepared and verified file.
 
     Attributes:
-        fingerprint, bytes: of it.
-        psnr_db, worst_psnr_db: of all frames together and of the worst, against what the source decodes to.
-        scene: of the source's frames; None where it was not asked for.
+        fingerprint, bytes: fingerprint and size of the file.
+        psnr_db, worst_psnr_db: of all frames together and of the worst, against the decoded source.
+        scene: statistics of the source's frames; None if they were not requested.
     """
 
     fingerprint: str
@@ -93,11 +93,11 @@ class Made:
 
 
 def transcode(job: Transcoding) -> Made:
-    """Make the prepared file. Under its final name it is either whole and verified, or what stood there before.
+    """Write the prepared file. Its final name holds either the complete, verified file or the earlier one.
 
     Raises:
-        VideoError: the source is not what was catalogued, a frame of it does not decode, its frame rate is unknown,
-            the encoder refuses, or what was written does not give back as many frames at the same times.
+        VideoError: the source is not the catalogued file, a frame of it does not decode, its frame rate is unknown, the
+            encoder refuses, or the written file does not have as many frames at the same times.
         OSError: the target cannot be written.
     """
     check_fingerprint(job.source, job.fingerprint)
@@ -105,7 +105,7 @@ def transcode(job: Transcoding) -> Made:
     if not job.target.parent.resolve().is_relative_to(job.root):
         raise VideoError(os.fspath(job.source), None, f"{job.target.parent} is a link out of the destination")
     job.target.parent.mkdir(parents=True, exist_ok=True)
-    # Hidden, so that no catalogue takes it in; hashed, so that the longest of names leaves room for the suffix.
+    # Hidden, so that no catalogue includes it; hashed, so that the suffix fits even with the longest names.
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     partial = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     try:
@@ -123,10 +123,10 @@ def transcode(job: Transcoding) -> Made:
 
 
 def look_again(job: Transcoding) -> Scene:
-    """The statistics that :func:`transcode` takes with ``scene``, from the source alone and without a prepared file.
+    """Compute the statistics that :func:`transcode` computes with ``scene``, from the source alone.
 
     Raises:
-        VideoError: the source is not what was catalogued, or a frame of it does not decode.
+        VideoError: the source is not the catalogued file, or a frame of it does not decode.
     """
     check_fingerprint(job.source, job.fingerprint)
     seen = Look()
@@ -136,7 +136,7 @@ def look_again(job: Transcoding) -> Scene:
 
 
 def _watched(frames: Iterator[npt.NDArray[np.uint8]], seen: Look) -> Iterator[npt.NDArray[np.uint8]]:
-    """The same frames; those at the beginning are looked at on their way."""
+    """Yield the same frames; those at the beginning are analysed as they pass."""
     for number, frame in enumerate(frames):
         if number < MOST_FRAMES:
             seen.add(frame)
@@ -148,7 +148,7 @@ def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint
 
 
 def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
-    """Make a file of the store, and reads it back."""
+    """Write a store file, and verify it by reading it back."""
     packing = SIZES[job.encoding.size]
     top, _, rows, width = job.window
     rate = job.frames_per_second
@@ -168,12 +168,12 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
         for picture in stored_pictures(stored, job.window):
             got.update(np.ascontiguousarray(picture).data)
     if wanted.digest() != got.digest():
-        raise VideoError(os.fspath(job.source), None, "verification: what was stored does not give back its frames")
+        raise VideoError(os.fspath(job.source), None, "verification: the stored file does not reproduce the frames")
     return Made(fingerprint(made), made.stat().st_size, HIGHEST_PSNR_DB, HIGHEST_PSNR_DB)
 
 
 def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
-    """Encode a video, and compares it with its source."""
+    """Encode a video, and compare it with its source."""
     pts, time_base = _times(job, index)
     height, width = job.window[2:]
     encode_luma(made, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)
@@ -185,7 +185,7 @@ def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[n
 
 def _times(job: Transcoding, index: FrameIndex) -> tuple[list[int], Fraction]:
     if index.seekable:
-        # Containers cannot begin before 0, and nothing depends on where the clock begins.
+        # Containers cannot begin before 0, and only differences of time stamps matter.
         return (index.pts - min(0, int(index.pts[0]))).tolist(), Fraction(*index.time_base)
     if not (math.isfinite(job.frames_per_second) and job.frames_per_second > 0):
         raise VideoError(os.fspath(job.source), None, "has neither usable time stamps nor a frame rate")
@@ -211,7 +211,7 @@ def _verified(job: Transcoding, index: FrameIndex, made: Path, pts: list[int], t
 
 
 def _squared_errors(job: Transcoding, index: FrameIndex, made: Path, found: FrameIndex) -> npt.NDArray[np.float64]:
-    """[n] mean squared error of each prepared frame, as the server will decode it, against the source's."""
+    """Return [n] the mean squared error of each prepared frame, as the server will decode it, against the source's."""
     errors = np.empty(len(index))
     for ordinal, wanted in enumerate(_frames(job, index)):
         at = ordinal % _COMPARED_FRAMES

@@ -1,21 +1,21 @@
 """A virtual event camera: frames in, voxels out.
 
-:func:`simulate` is for anyone with an array of frames; :func:`simulate_log` for log intensities (high dynamic range,
-analytic scenes); :func:`simulate_clip` is what the server worker calls. The pixel model is in ``v2v_protocol.recipe``.
+:func:`simulate` takes any array of frames; :func:`simulate_log` takes log intensities (high dynamic range, analytic
+scenes); the server worker calls :func:`simulate_clip`. The pixel model is in ``v2v_protocol.recipe``.
 
     draw.py       from a recipe to one camera and its view
-    view.py       what the camera sees of the picture: resize, crop, flip, contrast
+    view.py       the camera's view of the picture: resize, crop, flip, contrast
     grey.py       frames of any usual kind to grey levels
     intensity.py  from grey level to log intensity and to light
-    clip.py       simulating a clip: arguments checked, noise prepared, kernel called
-    result.py     what it returns
+    clip.py       simulate a clip: check arguments, prepare noise, call the kernel
+    result.py     the result of a simulation
     pixel.py      the kernel: all pixels, all steps, one pass
     noise.py      its random numbers: the definition
     voxel.py      steps, bins and dtypes: the definition
-    effects/      what a camera does beyond the paper's pixel, one file an effect
+    effects/      effects beyond the paper's pixel, one file per effect
     precision.py  float32, float64 or a refusal
-    variants.py   the compiled forms of the kernels, and having them in time
-    vectors.py    what the compiler's language lacks
+    variants.py   the compiled forms of the kernels, and when they are loaded
+    vectors.py    functions that the compiler's language lacks
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Simulating a clip: arguments checked, noise prepared, kernel called."""
+"""Simulate a clip: check arguments, prepare noise, call the kernel."""
 
 from __future__ import annotations
 
@@ -49,26 +49,25 @@ def simulate(
     """Simulate an event camera that watches a clip.
 
     Args:
-        frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or what ``grey.py`` makes these of: colour
-            (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``.
+        frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or a form that ``grey.py`` converts:
+            colour (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``.
         threshold_pos: contrast threshold of brighter events, log-intensity units.
-        threshold_neg: that of darker events; None: the same.
+        threshold_neg: contrast threshold of darker events; None: the same.
         noise_sigma: standard deviation of the noise, log units per frame.
-        hot_pixel_count: how many pixels drift by themselves.
+        hot_pixel_count: number of pixels that drift.
         hot_pixel_sigma: standard deviation of their drift, log units per frame.
         start_residual: every pixel's residual before the first step, log units; None draws it uniformly between
             -threshold_neg and threshold_pos, as the paper does.
-        bins: of a voxel grid.
-        frames_per_bin: steps between frames that fall into one bin.
+        bins: bins of a voxel grid.
+        frames_per_bin: steps between frames in one bin.
         gamma: exponent of the reverse gamma correction (``intensity.py``).
-        log_eps: what is added inside the logarithm, as a share of white.
+        log_eps: epsilon inside the logarithm, as a share of white.
         seed: 0 .. 2**64 - 1; the same seed gives the same bytes.
         dtype: "int8", "int16" or "float32".
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
             below half a threshold (``precision.py``).
-        frames_per_second: of the frames; needed for an effect in Hz or seconds.
-        effects: values for what a camera does beyond the paper's model, by the recipe's names (``leak_hz=0.1``);
-            zero is off.
+        frames_per_second: frame rate of the frames; needed for an effect in Hz or seconds.
+        effects: values of effects beyond the paper's model, by the recipe's names (``leak_hz=0.1``); zero is off.
 
     Returns:
         voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins. A numpy
@@ -112,13 +111,13 @@ def simulate_log(
     dtype: str = "int8",
     precision: str = AUTO,
 ) -> Voxels:
-    """The same for log intensities.
+    """Simulate an event camera from log intensities.
 
     Args:
         log_frames: [n, H, W] floating point, natural log of intensity; rounded to ``precision`` first.
 
     Other arguments, result and errors are those of :func:`simulate`. There are no effects beyond the paper's model:
-    some depend on how bright a pixel is beside white, which a logarithm of unknown scale does not tell.
+    some depend on the brightness of a pixel relative to white, which a logarithm of unknown scale does not give.
     """
     log_frames = np.asarray(log_frames)
     if log_frames.ndim != 3 or log_frames.dtype.kind != "f":
@@ -202,7 +201,9 @@ def _simulate_array(
     effects: Mapping[str, float] = MappingProxyType({}),
     frame_seconds: float = 1.0,
 ) -> Voxels:
-    """``intensity``: gamma and log_eps of grey levels, None where the frames are log intensities (without effects)."""
+    """Simulate an array. ``intensity``: gamma and log_eps of grey levels; None: the frames are log intensities, and
+    there are no effects.
+    """
     threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
     _check_number("threshold_pos", threshold_pos, positive=True)
     _check_number("threshold_neg", threshold_neg, positive=True)
@@ -276,7 +277,9 @@ def _run(
     prepared: tuple[Any, ...] | None = None,
     out: npt.NDArray[Any] | None = None,
 ) -> Voxels:
-    """``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: None without effects."""
+    """Call the kernel. ``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: tables of the
+    effects, None without effects.
+    """
     _, height, width = frames.shape
     steps, pixels, real = len(noise_durations), height * width, table.dtype.type
     voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype, out)
@@ -344,7 +347,7 @@ def _params(
     seed: int,
     effects: Mapping[str, float] = MappingProxyType({}),
 ) -> SampleParams:
-    """A camera without a view."""
+    """Return the parameters of a camera without a view."""
     return SampleParams(
         threshold_pos=threshold_pos,
         threshold_neg=threshold_neg,

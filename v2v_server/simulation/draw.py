@@ -1,14 +1,15 @@
-"""From a recipe to one virtual camera: every draw of a sample, a pure function of (recipe, seed, epoch, index, video).
+"""Draw one virtual camera from a recipe: every draw of a sample is a pure function of (recipe, seed, epoch, index,
+video).
 
 Random bits are the raw 64-bit output of Philox4x64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3",
 SC 2011) as numpy implements it: key (seed, a constant), counter (block, purpose, index, epoch). Raw output is a stable
-interface of numpy; its distributions are not, so the mappings to numbers stand here, each an IEEE float64 expression
-or exact integer arithmetic. Each purpose owns a counter stream: a draw that is added later, or one that takes more
-numbers, shifts no other.
+interface of numpy, but its distributions are not. So the mappings to numbers are here, each an IEEE float64 expression
+or exact integer arithmetic. Each purpose has its own counter stream, so a draw that is added later, or that takes more
+numbers, does not change the others.
 
     uniform [0, 1)     u = floor(raw / 2**11) * 2**-53
     range [a, b]       min(a + u (b - a), b)
-    chance p           u < p
+    probability p      u < p
     whole 0 .. n-1     floor(raw * n / 2**64), exact
 """
 
@@ -27,7 +28,7 @@ from v2v_protocol.sample import SampleParams
 
 _SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
-"""Stands for a drawn contrast of 0, because 0.0 means "left alone"; it gives the same flat grey picture."""
+"""Replaces a drawn contrast of 0, because 0.0 means "unchanged"; it gives the same flat grey picture."""
 
 
 class Purpose(IntEnum):
@@ -67,14 +68,15 @@ def draw(
     video_id: str,
     video_thresholds: tuple[float, float] | None = None,
 ) -> SampleParams:
-    """The virtual camera and view of one sample.
+    """Draw the virtual camera and view of one sample.
 
     Args:
         recipe: ranges to draw from.
-        seed, epoch, index: the sample's place in its stream (limits in ``v2v_protocol.sample``).
-        picture_height_px, picture_width_px: the usable picture of the video, upright, before any resize.
+        seed, epoch, index: position of the sample in its stream (limits in ``v2v_protocol.sample``).
+        picture_height_px, picture_width_px: size of the usable picture of the video, upright, before any resize.
         video_id: the catalogue id; used with ``threshold_source="video"`` only.
-        video_thresholds: (threshold_pos, threshold_neg) where the list file states them; likewise.
+        video_thresholds: (threshold_pos, threshold_neg) that the list file states for the video, or None; used with
+            ``threshold_source="video"`` only.
 
     Returns:
         the draw; its thresholds are float32 values.
@@ -131,12 +133,12 @@ def draw(
 
 
 def smallest_scale(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> float:
-    """The resize scale at which the crop just fits into the picture."""
+    """Return the resize scale at which the crop just fits into the picture."""
     return max(recipe.crop_height_px / picture_height_px, recipe.crop_width_px / picture_width_px)
 
 
 def admits(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> bool:
-    """True where some scale of the recipe makes the picture as large as the crop."""
+    """Return whether some scale of the recipe makes the picture as large as the crop."""
     return (
         min(picture_height_px, picture_width_px) > 0
         and smallest_scale(recipe, picture_height_px, picture_width_px) <= recipe.resize_scale[1]
@@ -144,12 +146,12 @@ def admits(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> boo
 
 
 def resized_size(height_px: int, width_px: int, scale: float) -> tuple[int, int]:
-    """Height and width of the picture after the resize, each rounded half up."""
+    """Return height and width of the picture after the resize, each rounded half up."""
     return _rounded(height_px * scale), _rounded(width_px * scale)
 
 
 def noise_key_of_seed(seed: int) -> tuple[int, int, int, int]:
-    """A noise key for a caller who has a seed but no stream: that of (seed, epoch 0, index 0)."""
+    """Return a noise key for a seed without a stream: that of (seed, epoch 0, index 0)."""
     first, second = _raw((seed, _SAMPLE_KEY), (0, Purpose.NOISE_KEY, 0, 0), 2)
     return first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32
 
@@ -170,20 +172,23 @@ def _thresholds(
 
 
 def _log_eps(ends: Range, raw: int) -> float | None:
-    """None for one value. A range is drawn in even steps: a table of log intensity takes tens of milliseconds, and a
-    worker keeps the last 64."""
+    """Draw log_eps; None if the range is one value. A range is drawn in even steps: a table of log intensity takes tens
+    of milliseconds, and a worker caches the last 64.
+    """
     low, high = ends
     return None if low == high else low + _below(_LOG_EPS_STEPS + 1, raw) / _LOG_EPS_STEPS * (high - low)
 
 
 def _stream_of(effect: str) -> int:
-    """The counter stream of an effect: a digest of its name, far above all other numbers; the first had numbers."""
+    """Return the counter stream of an effect: a digest of its name, far above all other numbers. The first effects have
+    fixed numbers.
+    """
     digest = hashlib.blake2b(effect.encode(), digest_size=6).digest()
     return _FIRST_EFFECTS.get(effect) or 2**32 + int.from_bytes(digest, "little")
 
 
 def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
-    """Run of repeated frames of a Markov chain that starts in the running state."""
+    """Draw runs of repeated frames from a Markov chain that starts in the running state."""
     if recipe.pause_probability == 0.0:
         return ()
     runs: list[tuple[int, int]] = []

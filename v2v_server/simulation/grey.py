@@ -1,4 +1,4 @@
-"""Frames of any usual kind to the grey levels that are simulated."""
+"""Convert frames of any usual kind to the grey levels that are simulated."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 
 _WEIGHTS = (299, 587, 114)
-"""Of red, green and blue in grey (ITU-R BT.601), thousandths."""
+"""Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""
 
 
 def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
-    """Grey levels 0 .. 255 of a clip.
+    """Return the grey levels 0 .. 255 of a clip.
 
     Grey is 0.299 red + 0.587 green + 0.114 blue. Floating point means 0 for black and 1 for white; the result is
-    rounded to the nearest of 256 levels (``simulate_log`` takes what shall not be rounded).
+    rounded to the nearest of 256 levels (use ``simulate_log`` to avoid the rounding).
 
     Args:
         frames: a numpy array or a torch tensor in main memory; uint8, or floating point in 0 .. 1; [n, H, W], colour
-            (RGB) as [n, H, W, 3] or [n, 3, H, W], one channel as [n, H, W, 1] or [n, 1, H, W]. Where both ends could
-            be channels, the last is.
+            (RGB) as [n, H, W, 3] or [n, 3, H, W], one channel as [n, H, W, 1] or [n, 1, H, W]. If both ends could be
+            channels, the last one is.
 
     Returns:
-        uint8 [n, H, W]; grey uint8 as it is, without a copy.
+        uint8 [n, H, W]; grey uint8 is returned without a copy.
 
     Raises:
-        UsageError: anything else.
+        UsageError: another type, shape or range.
     """
     try:
         given = np.asarray(frames)
-    except (TypeError, RuntimeError) as error:  # torch's, of a tensor on a GPU or one that asks for gradients
+    except (TypeError, RuntimeError) as error:  # raised by torch for a tensor on a GPU or one that requires gradients
         raise UsageError(f"frames: {error}") from error
     if given.ndim == 4 and given.shape[-1] not in (1, 3):
         given = np.moveaxis(given, 1, -1)
@@ -45,7 +45,7 @@ def grey_levels(frames: Any) -> npt.NDArray[np.uint8]:
     if given.ndim == 3 and given.dtype == np.uint8:
         return given
     grey = np.empty(given.shape[:3], np.uint8)
-    for frame, out in zip(given, grey, strict=True):  # one at a time: what is in between is eight times as large
+    for frame, out in zip(given, grey, strict=True):  # one at a time: the intermediate arrays are eight times as large
         out[:] = _of_frame(frame)
     return grey
 

@@ -1,9 +1,9 @@
-"""From grey level to log intensity, and to light.
+"""Convert grey levels to log intensity, and to light.
 
     L(F) = log(log_eps + (F / 255) ** gamma)            natural logarithm; paper section 3
 
-The camera's response curve is undone by the reverse gamma correction; the epsilon is the dark floor that keeps the
-logarithm finite: the dark current of a pixel as a share of white's photocurrent. Logarithm and exponential are our own,
+The reverse gamma correction undoes the camera's response curve. The epsilon is the dark floor that keeps the logarithm
+finite: the dark current of a pixel as a share of white's photocurrent. Logarithm and exponential are implemented here,
 so every host has the same tables.
 """
 
@@ -23,7 +23,7 @@ _EXP_DEGREE = 14
 
 @functools.lru_cache(maxsize=64)
 def log_table(gamma: float, log_eps: float) -> npt.NDArray[np.float32]:
-    """L of every grey level.
+    """Return L of every grey level.
 
     Computed in decimal arithmetic of 50 digits and then rounded once, because the logarithm of a maths library may
     differ in its last bit from host to host.
@@ -42,7 +42,7 @@ def log_table(gamma: float, log_eps: float) -> npt.NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=64)
 def log_table_float64(gamma: float, log_eps: float) -> Doubles:
-    """The same, [256] float64, read-only."""
+    """Return L of every grey level, [256] float64, read-only."""
     with decimal.localcontext(decimal.Context(prec=50)):
         exponent, floor = decimal.Decimal(gamma), decimal.Decimal(log_eps)
         levels = [(floor + (decimal.Decimal(level) / 255) ** exponent if level else floor).ln() for level in range(256)]
@@ -52,12 +52,12 @@ def log_table_float64(gamma: float, log_eps: float) -> Doubles:
 
 
 def linear_light(gamma: float, log_eps: float) -> Doubles:
-    """i(F) = (F / 255) ** gamma of every grey level, [256] float64 from 0 (black) to 1 (white)."""
+    """Return i(F) = (F / 255) ** gamma of every grey level, [256] float64 from 0 (black) to 1 (white)."""
     return np.clip(exponential(log_table_float64(gamma, log_eps)) - log_eps, 0.0, 1.0)
 
 
 def exponential(x: Doubles) -> Doubles:
-    """e ** x to a few units in the last place.
+    """Return e ** x to a few units in the last place.
 
     x = n ln 2 + r, |r| <= ln 2 / 2, and the Taylor series of e ** r (degree 14, truncated below 1e-18).
     """

@@ -46,7 +46,7 @@ NoiseKey = tuple[int, int, int, int]
 WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
 PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
-"""What a word is for. Numbers are never reused; 9 to 15 belong to effects."""
+"""Purposes of words. Numbers are never reused; 9 to 15 belong to effects."""
 
 GOLDEN = np.uint32(0x9E3779B9)
 SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))
@@ -71,7 +71,7 @@ COS_COEFFICIENTS = tuple(
 
 
 def scramble(x: Words) -> Words:
-    """S: bijection of 32-bit words, three multiplications."""
+    """Apply S: a bijection of 32-bit words, three multiplications."""
     x = x ^ (x >> np.uint32(17))
     x = x * SCRAMBLE_FACTORS[0]
     x = x ^ (x >> np.uint32(11))
@@ -82,7 +82,9 @@ def scramble(x: Words) -> Words:
 
 
 def mix(z: Words, angle_word: Words) -> tuple[Words, Words]:
-    """x and y of the module's docstring, from the exclusive or of the two radius words and of the two angle words."""
+    """Return x and y of the module's docstring, from the exclusive or of the two radius words and of the two angle
+    words.
+    """
     x = z ^ (z >> np.uint32(16))
     x = x * MIX_FACTORS[0]
     x = x ^ (x >> np.uint32(15))
@@ -91,7 +93,7 @@ def mix(z: Words, angle_word: Words) -> tuple[Words, Words]:
 
 
 def words(key: NoiseKey, purpose: int, counter: npt.ArrayLike) -> Words:
-    """word(purpose, n) of each counter n.
+    """Return word(purpose, n) of each counter n.
 
     Args:
         key: four words, 0 .. 2**32 - 1.
@@ -106,7 +108,7 @@ def words(key: NoiseKey, purpose: int, counter: npt.ArrayLike) -> Words:
 
 
 def fold(key: NoiseKey, constant: int) -> Words:
-    """A word of the whole key: [1] uint32."""
+    """Return a word of the whole key: [1] uint32."""
     word = scramble(np.array([constant * int(GOLDEN) % 2**32], np.uint32))
     for part in key:
         word = scramble(word + np.uint32(part))
@@ -114,7 +116,7 @@ def fold(key: NoiseKey, constant: int) -> Words:
 
 
 def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
-    """Two independent standard normals of each pair of words: (r cos, r sin), float32."""
+    """Return two independent standard normals of each pair of words: (r cos, r sin), float32."""
     value = ((x & np.uint32(0x7FFFFFFF)) | np.uint32(1)).astype(np.int32).astype(np.float32)
     bits = value.view(np.int32)
     exponent = (bits - SQRT_HALF_BITS) >> np.int32(23)
@@ -133,7 +135,7 @@ def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
 
 
 def standard_normals(key: NoiseKey, steps: int, pixels: int) -> Reals:
-    """The noise of every step, before it is scaled.
+    """Return the noise of every step, before it is scaled.
 
     Returns:
         [steps, pixels] float32; steps counted from 0 (the step from frame 0 to frame 1), pixels in row order.
@@ -150,19 +152,20 @@ def standard_normals(key: NoiseKey, steps: int, pixels: int) -> Reals:
 
 
 def start_uniforms(key: NoiseKey, pixels: int) -> Reals:
-    """Where each pixel's residual starts between -threshold_neg (0) and +threshold_pos (1): [pixels] float32 in [0, 1),
-    multiples of 2**-24."""
+    """Return the start of each pixel's residual between -threshold_neg (0) and +threshold_pos (1): [pixels] float32 in
+    [0, 1), multiples of 2**-24.
+    """
     return (words(key, START, np.arange(pixels)) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
 
 
 def hot_pixels(
     key: NoiseKey, count: int, pixels: int, words_of: WordsOf = words
 ) -> tuple[npt.NDArray[np.int64], Reals]:
-    """The hot pixels: those of the smallest words, so they are distinct for any count up to all.
+    """Choose the hot pixels: those of the smallest words, so they are distinct for any count up to all.
 
     Args:
-        count: how many, 0 .. pixels.
-        words_of: a faster :func:`words` where the caller has one.
+        count: number of hot pixels, 0 .. pixels.
+        words_of: a faster :func:`words`, if the caller has one.
 
     Returns:
         positions [count] int64, ascending, in row order; their standard normals [count] float32.
@@ -175,7 +178,7 @@ def hot_pixels(
 def smallest_words(
     key: NoiseKey, purpose: int, count: int, pixels: int, words_of: WordsOf = words
 ) -> npt.NDArray[np.int64]:
-    """The pixels that have the smallest words: [count] int64, ascending, in row order."""
+    """Return the pixels that have the smallest words: [count] int64, ascending, in row order."""
     if count == 0:
         return np.empty(0, np.int64)
     place_words = words_of(key, purpose, np.arange(pixels))

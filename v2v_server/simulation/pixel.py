@@ -29,10 +29,10 @@ from v2v_server.simulation.vectors import (
 )
 
 BLOCK_PX = 512
-"""Pixels of a block. Fewer would touch each page of frames and voxels more often, more would not stay in the cache."""
+"""Pixels of a block. Smaller blocks touch each page of frames and voxels more often; larger ones exceed the cache."""
 
-PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would look alike to the processor's store buffer
-ROWS_AHEAD = 3  # how many steps before its use a row of frames is fetched into the cache
+PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would alias in the processor's store buffer
+ROWS_AHEAD = 3  # number of steps that a row of frames is prefetched before its use
 
 _GOLDEN = noise.GOLDEN
 _S0, _S1, _S2 = noise.SCRAMBLE_FACTORS
@@ -49,7 +49,7 @@ _LOW_31_BITS = np.uint32(0x7FFFFFFF)
 
 
 def _log_intensity(table, value):
-    """Grey levels go through the table; floating point values are log intensities already."""
+    """Return log intensities: grey levels go through the table, floating point values are log intensities already."""
     raise NotImplementedError("compiled code only")
 
 
@@ -92,7 +92,7 @@ def word(folds, counter):
 
 @numba.njit(nogil=True, cache=True)
 def words(key, purpose, counters):
-    """``noise.words`` of [count] uint32 counters: [count] uint32."""
+    """Return ``noise.words`` of [count] uint32 counters: [count] uint32."""
     found = np.empty(len(counters), np.uint32)
     folds = folds_of(key, purpose)
     for i in range(len(counters)):
@@ -102,10 +102,10 @@ def words(key, purpose, counters):
 
 @numba.njit(nogil=True, inline="always")
 def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
-    """``noise.mix`` and ``noise.box_muller`` of a block: into ``normal`` [2, block], by way of the three other rows.
+    """Write ``noise.mix`` and ``noise.box_muller`` of a block to ``normal`` [2, block], using the three other rows.
 
-    Several short loops: a processor overlaps the rounds of a loop only as far as its window of waiting instructions
-    reaches, and a long chain of dependent operations fills that window with a single round.
+    Several short loops: a processor overlaps iterations only within its window of waiting instructions, and a long
+    chain of dependent operations fills that window with a single iteration.
     """
     for i in range(BLOCK_PX):
         x = np.uint32(radius_words[i] ^ radius_word)
@@ -147,7 +147,9 @@ def look_up(table, row, coming, levels):
 
 @numba.njit(nogil=True, error_model="numpy")
 def crossed(potential, threshold_pos, threshold_neg, tolerance):
-    """Signed events of a potential, and the residual they leave: the rule of ``voxel.py``. No event is +0, never -0."""
+    """Return the signed events of a potential, and the residual they leave: the rule of ``voxel.py``. No event is
+    +0, never -0.
+    """
     zero = tolerance - tolerance
     rising = potential >= zero
     threshold = threshold_pos if rising else threshold_neg
@@ -158,7 +160,7 @@ def crossed(potential, threshold_pos, threshold_neg, tolerance):
 
 @numba.njit(nogil=True, inline="always")
 def store(counts, limit, stored):
-    """One bin of each pixel into the voxels; returns how many had to be clipped."""
+    """Store one bin of each pixel in the voxels; return how many had to be clipped."""
     exceeded = False
     for i in range(len(stored)):
         exceeded |= abs(counts[i]) > limit
@@ -248,7 +250,7 @@ def simulate_pixels(
                 two_normals(
                     radius_words, angle_words, pairs[0, pair], pairs[1, pair], words[2], words[3], floats[2], normal
                 )
-            # Without noise its row is zeros, which changes no more than the sign of a zero, and that is never seen.
+            # Without noise its row is zeros. Adding them changes at most the sign of a zero, which has no effect.
             scale = noise_scale[step] if noisy else tolerance - tolerance
             of_bin = step - row * steps_per_bin
             if of_bin == 0:

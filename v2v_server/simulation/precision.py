@@ -40,23 +40,24 @@ from v2v_protocol.recipe import LARGEST_EVENTS
 AUTO = "auto"
 Real = type[np.floating[Any]]
 LIMITS: dict[str, tuple[Real, float]] = {"float32": (np.float32, 2.0**20), "float64": (np.float64, LARGEST_EVENTS)}
-"""Most events a pixel may fire in a clip, by arithmetic; narrowest first."""
+"""Largest number of events of a pixel in a clip, by arithmetic; narrowest first."""
 THRESHOLD_ENDS = (2.0**-100, 2.0**100)
-"""Thresholds between these neither overflow nor lose digits to underflow, in either arithmetic."""
+"""Limits of a threshold, between which neither arithmetic overflows or loses digits to underflow."""
 
 EFFECTS_MARGIN = 4.0
-"""How many times the error of the plain model that with effects may be."""
+"""Bound of the error with effects, as a multiple of the plain model's error."""
 
 
 def choose(asked: str, events: float) -> Real:
-    """The arithmetic for a clip.
+    """Choose the arithmetic for a clip.
 
     Args:
-        asked: "auto" for the narrowest that is exact enough, or the name of one.
+        asked: "auto" for the narrowest that is exact enough, or a name.
         events: ``most_events`` of the clip.
 
     Raises:
-        UsageError: no such arithmetic, or the clip is beyond the limit of the one asked for, of all with "auto".
+        UsageError: there is no such arithmetic, or the clip exceeds the limit of the requested one, or of all with
+            "auto".
     """
     if asked != AUTO and asked not in LIMITS:
         raise UsageError(f"precision {asked!r}: choose one of {AUTO}, {', '.join(LIMITS)}")
@@ -66,13 +67,13 @@ def choose(asked: str, events: float) -> Real:
     name = "float64" if asked == AUTO else asked
     raise UsageError(
         f"a pixel of this clip may fire {events:.4g} events; {name} counts at most {LIMITS[name][1]:.4g} exactly: "
-        "raise the thresholds, lower noise or hot pixels, take fewer frames"
+        "raise the thresholds, lower noise or hot pixels, or use fewer frames"
         + (", or precision='auto'" if name == "float32" else "")
     )
 
 
 def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
-    """Refuse thresholds that a float32 cannot work with.
+    """Refuse thresholds that float32 arithmetic cannot handle.
 
     Raises:
         UsageError: one is outside THRESHOLD_ENDS.
@@ -84,12 +85,12 @@ def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
 
 
 def error_bound(real: Real, events: float, smaller_threshold: float) -> float:
-    """By how much (log units) events and residual of a pixel may miss the change and noise they came from."""
+    """Return the largest error of a pixel's events and residual, log units, given exact change and noise."""
     return 4.0 * float(np.finfo(real).eps) * events * smaller_threshold
 
 
 def noise_sum(noise_sigma: float, hot_pixel_sigma: float, step_seconds: npt.NDArray[np.float64]) -> float:
-    """The standard deviations of noise and hot drift, summed over the steps, log units."""
+    """Return the standard deviations of noise and hot drift, summed over the steps, log units."""
     first = float(step_seconds[0])
     if (step_seconds == first).all():
         return len(step_seconds) * (noise_sigma * math.sqrt(first) + hot_pixel_sigma * first)

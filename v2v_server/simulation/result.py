@@ -1,4 +1,4 @@
-"""What a simulation returns, and how it shows itself in a notebook."""
+"""The result of a simulation, and its display in a notebook."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from v2v_protocol.tables import html_table
 
 
 class Voxels(NamedTuple):
-    """What a simulation returns.
+    """Result of a simulation.
 
     Attributes:
         voxels: [T, bins, H, W] signed event counts.
-        saturated_bins: how many bins were clipped to what the dtype holds.
+        saturated_bins: number of bins that were clipped to the range of the dtype.
     """
 
     voxels: npt.NDArray[Any]
     saturated_bins: int
 
     def to_events(self, bin_us: float) -> EventList:
-        """Events (x, y, t, p) with these counts, for bins of ``bin_us`` microseconds. Their times within a bin are
-        invented, by the rule of ``v2v_protocol.events``.
+        """Convert to events (x, y, t, p) with these counts, for bins of ``bin_us`` microseconds. Their times within a
+        bin are invented, by the rule of ``v2v_protocol.events``.
 
         Raises:
-            UsageError: a duration out of range.
+            UsageError: the duration is out of range.
         """
         return to_events(self.voxels, bin_us)
 
     def show(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Up to four voxel grids as a picture, bin by bin, which a notebook displays.
+        """Draw up to four voxel grids, bin by bin, as a picture that a notebook displays.
 
         Args:
-            path: a PNG to write too.
+            path: also write the picture to this PNG file; None writes no file.
 
         Returns:
             A PIL image.

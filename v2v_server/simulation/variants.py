@@ -1,7 +1,7 @@
-"""The compiled forms of the kernels: which a stream may need, and having them.
+"""List the compiled forms of the kernels that a stream may need, and load them.
 
-Each takes seconds to compile, and there are a dozen. A worker has the usual ones from its start; the others are made
-ready where a stream needs them, and before the work on its first sample begins.
+Each takes seconds to compile, and there are a dozen. A worker loads the usual ones at its start. The others are
+compiled when a stream needs them, before the work on its first sample begins.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from v2v_server.simulation.precision import EFFECTS_MARGIN, LIMITS
 
 
 class Variant(NamedTuple):
-    """One compiled form."""
+    """One compiled form of a kernel."""
 
     voxel_dtype: str
     effects: bool
@@ -28,22 +28,22 @@ class Variant(NamedTuple):
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
-"""What :func:`warm_up` loads: without effects every dtype, with effects int8 alone."""
+"""Variants that :func:`warm_up` loads: every dtype without effects, only int8 with effects."""
 
 
 def variants(
     recipe: Recipe, voxel_dtype: str, step_seconds: float = 1.0, thresholds: tuple[float, float] | None = None
 ) -> frozenset[Variant]:
-    """What the draws of a recipe may need, as far as that can be told without them.
+    """Return the variants that the draws of a recipe may need, as far as the recipe determines them.
 
-    It cannot where something is stated per second and time stamps are irregular: such a clip may turn out to need
-    float64 after all, and waits for the compiler then.
+    It does not if something is stated per second and time stamps are irregular: such a clip may turn out to need
+    float64, and then waits for the compiler.
 
     Args:
         recipe: the recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: from one frame to the next; matters only where something is stated per second.
-        thresholds: those that a list file states for the video; None where it states none.
+        step_seconds: time from one frame to the next; used only if something is stated per second.
+        thresholds: thresholds that a list file states for the video; None if it states none.
     """
     events = recipe.worst_events(step_seconds, thresholds) * (EFFECTS_MARGIN if recipe.has_effects else 1.0)
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
@@ -51,7 +51,7 @@ def variants(
 
 
 def load(variant: Variant) -> None:
-    """Load one from numba's cache, or compiles it."""
+    """Load a variant from numba's cache, or compile it."""
     simulate(
         np.zeros((2, 1, 1), np.uint8),
         threshold_pos=0.2,
@@ -64,6 +64,6 @@ def load(variant: Variant) -> None:
 
 
 def warm_up() -> None:
-    """Load, or compiles, what a server worker usually needs."""
+    """Load, or compile, the variants that a server worker usually needs."""
     for variant in sorted(USUAL):
         load(variant)

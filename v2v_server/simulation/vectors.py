@@ -1,7 +1,8 @@
-"""What numba's language lacks and the pixel kernel needs: bit patterns, vector width, alignment, table look-up.
+"""Functions that numba's language lacks and the pixel kernel needs: bit patterns, vector width, alignment, table
+look-up.
 
-Everything here moves bits or hints at speed; nothing rounds. So a processor without the instructions named below gives
-the same bytes, later.
+They only move bits or affect speed; nothing rounds. So a processor without the instructions named below gives the same
+bytes, only more slowly.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -22,22 +23,23 @@ _INT8, _INT32, _INT64, _FLOAT = ir.IntType(8), ir.IntType(32), ir.IntType(64), i
 
 @intrinsic
 def float_of_bits(typing_context: Any, bits: Any) -> Any:
-    """The float32 whose bit pattern the int32 is."""
+    """Return the float32 with the bit pattern of an int32."""
     return types.float32(types.int32), lambda context, builder, signature, args: builder.bitcast(args[0], _FLOAT)
 
 
 @intrinsic
 def bits_of_float(typing_context: Any, value: Any) -> Any:
-    """The bit pattern of the float32, as int32."""
+    """Return the bit pattern of a float32 as int32."""
     return types.int32(types.float32), lambda context, builder, signature, args: builder.bitcast(args[0], _INT32)
 
 
 @intrinsic
 def use_widest_vectors(typing_context: Any) -> Any:
-    """Let LLVM use 512-bit vectors in the calling function where the processor has them; ignored elsewhere.
+    """Let LLVM use 512-bit vectors in the calling function if the processor has them; no effect elsewhere.
 
-    For some processors LLVM halves them by default, lest a few wide instructions lower the clock of all the others.
-    Here the wide ones are the work. llvmlite knows no attributes with a value, hence ``set.add``.
+    For some processors LLVM halves them by default, because a few wide instructions would lower the clock for all
+    others. This kernel consists of wide instructions. llvmlite does not support attributes with a value, so ``set.add``
+    is used.
     """
 
     def generate(context, builder, signature, args):
@@ -49,7 +51,9 @@ def use_widest_vectors(typing_context: Any) -> Any:
 
 @numba.njit(nogil=True, inline="always")
 def aligned_rows(rows, length, dtype):
-    """[rows, length] zeros; every row begins at a multiple of 64 bytes if ``length`` numbers are one."""
+    """Return [rows, length] zeros; every row begins at a multiple of 64 bytes if the size of ``length`` numbers is
+    one.
+    """
     memory = np.zeros(rows * length + _VECTOR_BYTES, dtype)
     skip = (-memory.ctypes.data % _VECTOR_BYTES) // memory.itemsize
     return memory[skip : skip + rows * length].reshape(rows, length)
@@ -57,7 +61,7 @@ def aligned_rows(rows, length, dtype):
 
 @intrinsic
 def look_up_by_permutation(typing_context: Any, table: Any, row: Any, coming: Any, levels: Any) -> Any:
-    """``levels[:n] = table[row[:n]]`` by AVX-512; returns n, the multiple of 16 that it did.
+    """Compute ``levels[:n] = table[row[:n]]`` by AVX-512; return n, the multiple of 16 that was processed.
 
     A gather, or sixteen loads and inserts, take longer than permuting the whole table: 256 float32 numbers fill sixteen
     vector registers; eight two-register permutations by the low five bits of a grey level give eight candidates, and
@@ -66,12 +70,12 @@ def look_up_by_permutation(typing_context: Any, table: Any, row: Any, coming: An
     Args:
         table: [256] float32.
         row: [width] uint8.
-        coming: [width] uint8, a row that a later call will read: it is fetched into the cache meanwhile. Blocks of a
-            row are too short for the processor to notice by itself.
+        coming: [width] uint8, a row that a later call will read; it is prefetched into the cache. The blocks of a row
+            are too short for the processor's own prefetching.
         levels: [width or more] float32, written.
 
     Returns:
-        0, with nothing done, where the processor has no AVX-512 or the arrays have other types.
+        0, with nothing done, if the processor has no AVX-512 or the arrays have other types.
     """
     fits = table.dtype == types.float32 and row.dtype == types.uint8
 

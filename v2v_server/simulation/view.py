@@ -1,7 +1,7 @@
-"""The view of a virtual camera: which part of the picture it sees, at which size, which way round.
+"""The view of a virtual camera: which part of the picture it sees, at which size and orientation.
 
-Order: resize the whole usable picture, crop, flip, degrade the contrast. Resizing first and cropping then makes the
-crop's border see its true neighbours.
+Order: resize the whole usable picture, crop, flip, degrade the contrast. Because resizing comes before cropping, the
+crop's border is interpolated from its true neighbours.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Window(NamedTuple):
 def source_window(
     params: SampleParams, recipe: Recipe, picture_top_px: int, picture_height_px: int, picture_width_px: int
 ) -> Window:
-    """The part of the video picture that :func:`apply_view` needs.
+    """Return the part of the video picture that :func:`apply_view` needs.
 
     Args:
         params, recipe: the draw and its recipe.
@@ -41,7 +41,7 @@ def source_window(
         picture_height_px, picture_width_px: size of the usable picture.
 
     Returns:
-        the crop alone at scale 1, else the whole usable picture.
+        the crop alone at scale 1, otherwise the whole usable picture.
     """
     if params.scale == 1.0:
         return Window(
@@ -51,7 +51,7 @@ def source_window(
 
 
 def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
-    """The frames as the virtual camera sees them.
+    """Return the frames as the virtual camera sees them.
 
     Args:
         frames: [n, h, w] uint8, the window of :func:`source_window`.
@@ -92,6 +92,6 @@ def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
 
 
 def contrast_table(contrast: float) -> Frames:
-    """clip((F - 127.5) s + 127.5, 0, 255) of every grey level F, rounded half up: [256] uint8."""
+    """Return clip((F - 127.5) s + 127.5, 0, 255) of every grey level F, rounded half up: [256] uint8."""
     levels = [math.floor((level - 127.5) * contrast + 128.0) for level in range(256)]
     return np.array([min(max(level, 0), 255) for level in levels], np.uint8)

@@ -37,9 +37,9 @@ LARGEST_COUNT = {"int8": 127.0, "int16": 32767.0, "float32": np.inf}
 
 
 def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
-    """The change, log units, by which a threshold may be missed and still counts as reached.
+    """Return by how much, in log units, a change may miss a threshold and still count as reaching it.
 
-    With c the smaller threshold: 2**-21, or c * 2**-19 where that is more; never more than c / 16.
+    With c the smaller threshold: 2**-21, or c * 2**-19 if that is more; never more than c / 16.
     """
     smaller = min(threshold_pos, threshold_neg)
     return min(max(2.0**-21, smaller * 2.0**-19), smaller * 2.0**-4)
@@ -48,7 +48,7 @@ def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
 def voxel_array(
     voxels: int, bins: int, height: int, width: int, dtype: str, out: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[Any]:
-    """An uninitialised voxel array [voxels, bins, height, width]: ``out``, where it is given.
+    """Return an uninitialised voxel array [voxels, bins, height, width], or ``out`` if it is given.
 
     Raises:
         UsageError: the dtype is not one of int8, int16, float32, or ``out`` is not such an array.
@@ -66,19 +66,19 @@ def voxel_array(
 def step_seconds(
     seconds: npt.NDArray[np.float64], source_index: npt.NDArray[np.int64], average_fps: float
 ) -> tuple[npt.NDArray[np.float64], int]:
-    """Durations of the steps of a clip.
+    """Return the durations of the steps of a clip.
 
     Args:
-        seconds: [count] presentation time of each decoded frame; NaN where the file gives none.
+        seconds: [count] presentation time of each decoded frame; NaN if the file gives none.
         source_index: [steps + 1], which decoded frame each position shows (``SampleParams.source_index``).
-        average_fps: frames per second of the video; stands in where two time stamps give no increase. A paused step
-            lasts one average frame too.
+        average_fps: frames per second of the video; used if two time stamps do not increase. A paused step lasts one
+            average frame too.
 
     Returns:
-        durations [steps] float64, all > 0; how many steps that are not paused had to use the average.
+        durations [steps] float64, all > 0; number of steps that are not paused and had to use the average.
 
     Raises:
-        UsageError: fewer time stamps than frames, or an average rate that is no positive finite number.
+        UsageError: fewer time stamps than frames, or an average rate that is not a positive finite number.
     """
     if not (np.isfinite(average_fps) and average_fps > 0):
         raise UsageError(f"average_fps = {average_fps}: noise per second needs the video's frame rate")

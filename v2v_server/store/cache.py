@@ -20,7 +20,7 @@ import hashlib
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -32,8 +32,9 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.used import PARTIAL, count_bytes, locked_use, used_bytes
+from v2v_server.store.used import PARTIAL, Used, count_bytes, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
+from v2v_server.system.private import make_private
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
 from v2v_server.video.fingerprint import check_fingerprint
@@ -71,6 +72,7 @@ class Cache:
         least_free_bytes: disk space to keep free, bytes.
 
     Attributes:
+        on_wait: called with True before this waits for other processes, and with False when it goes on.
         trouble: the last problem, for people: why nothing more is stored, or a damaged piece; empty if there is none.
     """
 
@@ -80,6 +82,7 @@ class Cache:
         self._least_free_bytes = least_free_bytes
         self._rest_until, self._rest_reason = 0.0, ""
         self.trouble = ""
+        self.on_wait: Callable[[bool], object] = lambda waits: None
         with contextlib.suppress(OSError):
             _remove_abandoned(folder)
 
@@ -234,6 +237,7 @@ class Cache:
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
+            make_private(partial)
             with StoreWriter(partial, head, QUICK) as writer:
                 fcntl.flock(
                     writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
@@ -241,7 +245,7 @@ class Cache:
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
-            with locked_use(self.folder) as used:
+            with self._locked_use() as used:
                 if path.exists() or used.bytes + writer.bytes > self._most_bytes:
                     return
                 path.parent.mkdir(exist_ok=True)
@@ -256,10 +260,19 @@ class Cache:
     def _remove(self, path: Path, why: str) -> None:
         """Remove an unreadable piece, so that it is decoded again."""
         self.trouble = f"a damaged piece was removed: {why}"
-        with contextlib.suppress(OSError), locked_use(self.folder) as used:
+        with contextlib.suppress(OSError), self._locked_use() as used:
             size = path.stat().st_size
             path.unlink()
             used.add(-size)
+
+    @contextlib.contextmanager
+    def _locked_use(self) -> Iterator[Used]:
+        self.on_wait(True)
+        try:
+            with locked_use(self.folder) as used:
+                yield used
+        finally:
+            self.on_wait(False)
 
     def _rest(self, why: str) -> None:
         self.trouble = self._rest_reason = why

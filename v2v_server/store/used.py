@@ -9,11 +9,12 @@ import contextlib
 import errno
 import fcntl
 import os
-import stat
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from v2v_server.system.private import open_private
 
 _USED, PARTIAL = "used", "partial"
 _WAIT_SECONDS = 0.06
@@ -34,7 +35,7 @@ class Used:
 def used_bytes(folder: Path) -> int:
     """Return the number of bytes in the folder; 0 if it is unknown."""
     try:
-        with open(_open_regular(folder / _USED, os.O_RDONLY), "rb") as file:
+        with open(open_private(folder / _USED, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
             text = file.read(64)
     except OSError:
         return 0
@@ -53,7 +54,7 @@ def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Us
         BlockingIOError: another process keeps the lock for longer than an update takes. Callers continue without it.
         OSError: the file cannot be opened or written.
     """
-    with open(_open_regular(folder / _USED, os.O_RDWR | os.O_CREAT), "r+b") as file:
+    with open(open_private(folder / _USED, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW), "r+b") as file:
         _lock(file.fileno(), wait_seconds)
         text = file.read(64)
         used = Used(int(text) if text.isdigit() else count_bytes(folder))
@@ -61,23 +62,6 @@ def locked_use(folder: Path, wait_seconds: float = _WAIT_SECONDS) -> Iterator[Us
         file.seek(0)
         file.write(b"%020d" % used.bytes)
         file.truncate()
-
-
-def _open_regular(path: Path, flags: int) -> int:
-    """Open one of our files without blocking. Other users must not be able to read it, since reading is enough to
-    lock it.
-    """
-    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW, 0o600)
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-        if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) & 0o077:
-            os.fchmod(descriptor, 0o600)  # an earlier release made it readable
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
 
 
 def _lock(descriptor: int, wait_seconds: float) -> None:

@@ -1,11 +1,12 @@
-"""What we ask of the operating system, and of libraries that ask it for us.
+"""Services of the operating system, and of libraries that use them.
 
-process         memory that stays, cores, long turns, children that die with their parent
-isolate         a function applied to many items in processes of their own, where a crash costs one item
-sandbox         what a process that decodes gives up: programs, networks, writing
-compile_cache   where numba keeps compiled kernels
+process         memory that stays, cores, long time slices, children that die with their parent
+isolate         a function applied to many items in processes of their own, so that a crash costs one item
+sandbox         restrictions of a process that decodes: programs, networks, writing
+compile_cache   where numba stores compiled kernels
+private         files that other users of the host cannot open
 turn_away       has the kernel drop newcomers from some addresses
-log             lines for whoever runs a service, as text or JSON
-clock           a clock that stands still while its process does
-opencv          OpenCV, loaded when it is first used
+log             log lines, as text or JSON
+clock           a clock that stands still while its process is stopped
+opencv          OpenCV, imported on first use
 """

@@ -1,18 +1,18 @@
-"""A clock that stands still while its process does."""
+"""A clock that stands still while its process is stopped."""
 
 from __future__ import annotations
 
 import time
 
 _LONGEST_TURN_SECONDS = 1.0
-"""What goes beyond is time in which nobody was listened to."""
+"""A longer step than this counts as time in which the process was stopped."""
 
 
 class Clock:
-    """Seconds, as far as this process was there to listen.
+    """Seconds during which this process was running.
 
-    While it is stopped (in a terminal, by a batch system, with its whole machine) it hears no answer, and those who owe
-    one may be stopped as well: a deadline that runs out meanwhile is nobody's fault.
+    A stopped process (in a terminal, by a batch system, with its whole machine) receives no answers, and its peers may
+    be stopped as well. So a deadline that expires meanwhile does not count.
     """
 
     def __init__(self) -> None:

@@ -1,12 +1,12 @@
-"""Where numba keeps the compiled kernels: a folder of its own for every state of their sources and every processor.
+"""Choose where numba stores compiled kernels: a separate folder for every state of their sources and every processor.
 
-Numba takes compiled code for fresh while the one file that defines the function is unchanged. A kernel of ours holds
-functions and constants of several files, so after a change of one of them numba would go on with the old kernel, and
-with other numbers, without a word. Another digest of all these files is another folder.
+Numba treats compiled code as current while the one file that defines the function is unchanged. Our kernels include
+functions and constants of several files. After a change of one of them numba would silently use the old kernel, with
+other results. A digest of all these files in the folder's name prevents this.
 
-Numba numbers the files of compiled code, and its index says which of them is for which processor. Two hosts that share
-a folder and compile at the same time may both take the same number: then the index leads one of them to the code of the
-other, whose instructions it may lack, at every start from then on. So the processor is in the digest too.
+Numba numbers the files of compiled code, and its index states which of them is for which processor. Two hosts that
+share a folder and compile at the same time may take the same number. Then the index leads one of them to the code of
+the other, whose instructions it may lack, at every later start. So the processor is in the digest too.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from itertools import takewhile
 from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "simulation"
-"""The folder of every file from which something can get into a kernel."""
+"""The folder of all files whose code or constants a kernel may use."""
 
 PROCESSORS = Path("/proc/cpuinfo")
-"""What Linux says of the processors. Asking LLVM, as numba does, would mean loading it in every process."""
+"""Linux's description of the processors. Asking LLVM, as numba does, would load it in every process."""
 
 _VARIABLE = "NUMBA_CACHE_DIR"
 _KIND = re.compile(r"(vendor_id|cpu family|model|flags|Features|CPU (implementer|architecture|variant|part)|isa)\s*:")
@@ -35,25 +35,25 @@ _OURS = re.compile(r"numba-[0-9a-f]{12}")
 
 
 def use_compile_cache() -> None:
-    """Make numba keep what this process compiles in the folder of :func:`choose_compile_cache`."""
+    """Make numba store what this process compiles in the folder of :func:`choose_compile_cache`."""
     choose_compile_cache()
     numba = sys.modules.get("numba")
     if numba is not None and not _is_users(numba.config.CACHE_DIR):
-        # It has read the environment already.
+        # Numba has read the environment already.
         numba.config.CACHE_DIR = os.environ.get(_VARIABLE, "")
 
 
 def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> None:
     """Set ``NUMBA_CACHE_DIR``, which numba reads when it is imported.
 
-    What the user has set stays, and is the user's to empty. Else it is a folder ``numba-DIGEST`` beside the code if
-    that can be written; below ``V2V_CACHE_DIR``, or the user's cache folder where that is not set; below the folder for
-    temporary files. Numba alone would try the code and the home folder, and refuse to start where neither can be
-    written, as in a hardened container.
+    A value set by the user stays, and emptying that folder is up to the user. Otherwise it is a folder
+    ``numba-DIGEST``: next to the code if that is writable; else below ``V2V_CACHE_DIR``, or the user's cache folder if
+    that is not set; else below the folder for temporary files. Numba alone would try the code and the home folder, and
+    fail to start if neither is writable, as in a hardened container.
 
-    Where nothing can be written it is not set: numba says so, if it is ever needed.
+    If no folder is writable it is not set, and numba reports the problem if it compiles.
     """
-    # A folder of ours comes from a parent process, which may have been started before the sources changed.
+    # One of our folders was set by a parent process, which may have started before the sources changed.
     if _is_users(environment.get(_VARIABLE, "")):
         return
     try:
@@ -68,13 +68,13 @@ def choose_compile_cache(environment: MutableMapping[str, str] = os.environ) -> 
 
 
 def compile_cache(environment: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
-    """The folder that was chosen, if there is one."""
+    """Return the chosen folder, if there is one."""
     chosen = environment.get(_VARIABLE, "")
     return (Path(chosen),) if chosen else ()
 
 
 def sources_digest(folder: Path = SOURCES) -> str:
-    """Names a state of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
+    """Return a digest of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
     digest = hashlib.sha256(version("numba").encode() + _processor())
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
@@ -82,10 +82,10 @@ def sources_digest(folder: Path = SOURCES) -> str:
 
 
 def _processor() -> bytes:
-    """What kind of processor this is and which instructions it has, as far as the system tells."""
+    """Return the processor's model and instruction sets, as far as the system reports them."""
     told = [os.uname().machine]
     with suppress(OSError), PROCESSORS.open(encoding="utf-8", errors="replace") as file:
-        told += filter(_KIND.match, takewhile(str.strip, file))  # the first one ends with an empty line
+        told += filter(_KIND.match, takewhile(str.strip, file))  # the first processor's lines end with an empty line
     return "\n".join(told).encode()
 
 
@@ -99,19 +99,19 @@ def _parents(environment: Mapping[str, str]) -> Iterator[Path]:
         yield Path(environment["V2V_CACHE_DIR"]).absolute()
     elif environment.get("XDG_CACHE_HOME"):
         yield Path(environment["XDG_CACHE_HOME"]).absolute() / "v2v"
-    elif (home := os.path.expanduser("~")) != "~":  # a user without an entry in the list of users has none
+    elif (home := os.path.expanduser("~")) != "~":  # a user without an entry in the user database has none
         yield Path(home) / ".cache" / "v2v"
     try:
         temporary = Path(tempfile.gettempdir()) / f"v2v-{os.getuid()}"
     except FileNotFoundError:
-        return  # none can be written
-    # Numba unpickles what it finds, and here anyone could have put it.
+        return  # no folder is writable
+    # Numba unpickles the files it finds, and any user could have written them here.
     if _is_private(temporary):
         yield temporary
 
 
 def _is_private(folder: Path) -> bool:
-    """Make the folder if need be; whether nobody else can write into it."""
+    """Create the folder if it is missing; return whether other users cannot write to it."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
@@ -121,7 +121,7 @@ def _is_private(folder: Path) -> bool:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Make the folder if need be."""
+    """Create the folder if it is missing; return whether it is writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

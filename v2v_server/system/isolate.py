@@ -1,7 +1,7 @@
-"""A function applied to many jobs in processes of their own, where a crash costs the one job that caused it.
+"""Apply a function to many jobs in separate processes, so that a crash costs only the job that caused it.
 
-Spawned processes and pipes, nothing else: no lock, queue or shared memory, all of which need a writable ``/dev/shm``,
-and containers exist that have none.
+It uses spawned processes and pipes only. Locks, queues and shared memory need a writable ``/dev/shm``, which some
+containers do not have.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _NO_START = (
-    "a process that reads videos ended as it started ({how}); its own message stands above. In a script, put what "
-    'opens videos below `if __name__ == "__main__":`, because each such process imports the script again'
+    "a process that reads videos ended during its start ({how}); its own message is above. In a script, open "
+    'videos below `if __name__ == "__main__":`, because each such process imports the script again'
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Died:
-    """Stands for the result of a job whose process died.
+    """Result of a job whose process died.
 
     Attributes:
-        exitcode: as ``multiprocessing`` gives it: the exit status, or minus the number of a signal.
-        overdue_seconds: how long it was waited for before it was ended here; 0 if it died by itself.
-        begun: whether the process had started when it died, so that it was at the job.
+        exitcode: as in ``multiprocessing``: the exit status, or minus the number of a signal.
+        overdue_seconds: time after which it was ended here; 0 if it died by itself.
+        begun: whether the process had started when it died, so that it was working on the job.
     """
 
     exitcode: int
@@ -61,10 +61,10 @@ class Died:
 
     @property
     def is_crash(self) -> bool:
-        """Whether the job is to blame: a signal of the process's own making struck it at work.
+        """Whether the job is to blame: a signal that the process caused itself struck it at work.
 
-        Otherwise somebody killed it, the kernel was short of memory, it was overdue, or it ended with a status: an
-        exception of this program, or something that is wrong with the installation.
+        Otherwise it was killed from outside, the kernel was short of memory, it was overdue, or it exited with a
+        status: an exception of this program, or a broken installation.
         """
         return self.begun and self.exitcode < 0 and not self.overdue_seconds and -self.exitcode not in _FROM_OUTSIDE
 
@@ -77,24 +77,24 @@ def run_isolated(
     memory_bytes: int = 0,
     writable: Sequence[Path] | None = None,
 ) -> Iterator[tuple[J, R | Died]]:
-    """(job, result) for every job, in order of completion.
+    """Yield (job, result) for every job, in order of completion.
 
-    A process takes one job after another; the one that dies is replaced. All are ended with the iterator, and die with
-    this process, however that ends. Ctrl-C reaches only this process.
+    A process takes one job after another; a process that dies is replaced. All are ended with the iterator, and die
+    with this process, however it ends. Ctrl-C reaches only this process.
 
     Args:
         function: must be picklable, and return rather than raise: an exception counts as its process's death.
         jobs: picklable; drawn as processes become free.
-        processes: how many, spawned; 0 runs the jobs in this process, unprotected.
-        deadline_seconds: how long a job may take, its process's start included, before that is killed; None: any time.
-            Only time that is spent waiting here counts, so that nothing is overdue after the whole program was stopped.
-        memory_bytes: how much a process may allocate: more is refused to whatever asks for it; 0 sets no limit.
-        writable: what a process may write to, where it may do no more than read, compute and answer
-            (:mod:`v2v_server.system.sandbox`); None: it may do anything.
+        processes: number of spawned processes; 0 runs the jobs in this process, unprotected.
+        deadline_seconds: time limit of a job, including its process's start, before the process is killed; None: no
+            limit. Only time spent waiting here counts, so no job is overdue because the whole program was stopped.
+        memory_bytes: limit of a process's allocations; 0 sets no limit.
+        writable: what a process may write to, while it may otherwise only read, compute and answer
+            (:mod:`v2v_server.system.sandbox`); None: no restrictions.
 
     Raises:
         OSError: no process can be started.
-        UsageError: a process ended with a status before it took its job: no other one would do better.
+        UsageError: a process exited with a status before it took its job, so another one would do the same.
     """
     if processes == 0:
         yield from ((job, function(job)) for job in jobs)
@@ -131,7 +131,7 @@ def run_isolated(
 
 
 def _wait(lanes: dict[Connection, _Lane[J, R]]) -> None:
-    """Until a result is there or a job overdue, or for a while."""
+    """Wait until there is a result or a job is overdue, but not for long."""
     at_most = max(0.0, min(_LONGEST_WAIT_SECONDS, *(lane.patience for lane in lanes.values())))
     started = time.monotonic()
     wait(list(lanes), at_most)
@@ -141,10 +141,10 @@ def _wait(lanes: dict[Connection, _Lane[J, R]]) -> None:
 
 
 class _Lane(Generic[J, R]):
-    """One process and the job it has.
+    """One process and its job.
 
     Attributes:
-        patience: for how many seconds more its job is waited for.
+        patience: remaining seconds until its job is overdue.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class _Lane(Generic[J, R]):
         self.connection, other = context.Pipe()
         given = other, function, os.getpid(), memory_bytes, writable
         self._process = context.Process(target=_serve, args=given, daemon=True)
-        # The first process started brings multiprocessing's tracker along, which would let SIGINT through again.
+        # The first process also starts multiprocessing's tracker, which would unblock SIGINT again.
         resource_tracker.ensure_running()
         try:
             with _interrupt_held_back():
@@ -178,10 +178,10 @@ class _Lane(Generic[J, R]):
         try:
             self.connection.send(job)
         except OSError:
-            return  # it died before it had the job: finish() finds the end of the pipe
+            return  # it died before it received the job: finish() finds the end of the pipe
 
     def finish(self) -> tuple[J, R | Died] | None:
-        """What came of the job; None if the process has only said that it began."""
+        """Return the result of the job; None if the process has only reported that it began."""
         try:
             result = self.connection.recv()
         except (EOFError, OSError):
@@ -212,8 +212,9 @@ class _Lane(Generic[J, R]):
 
 @contextlib.contextmanager
 def _interrupt_held_back() -> Iterator[None]:
-    """A process started inside inherits that SIGINT waits: Ctrl-C in a terminal, which sends it to all, must not strike
-    before :func:`_serve` can ignore it. In this process it strikes at the end."""
+    """Block SIGINT for processes started inside. Ctrl-C in a terminal goes to all of them, and must not strike before
+    :func:`_serve` can ignore it. In this process it takes effect at the end.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
@@ -233,8 +234,10 @@ def _serve(
         limit_memory(memory_bytes)
     if writable is not None:
         confine(writable, network=False)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides what follows
-    connection.send(None)  # begun: what ends this process from here on is no fault of its start
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to all processes; the parent decides what follows
+    connection.send(None)  # report that it began: from here on, its end is not a failed start
     while True:
         try:
             job = connection.recv()

@@ -1,33 +1,36 @@
-"""Lines for whoever runs a service: plain text for people, or one JSON object a line for what collects logs."""
+"""Log lines of a service: plain text for people, or one JSON object per line for log collectors."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
+
+from v2v_protocol.errors import V2VError
 
 LOG_FORMATS = ("text", "json")
 Level = Literal["info", "warning", "error"]
 
 
 def write(stream: TextIO, text: str) -> None:
-    """Say something to whoever looks on. That the log's disk is full, or its terminal gone, must not end a service;
-    and there is nowhere left to say so."""
+    """Write to a log stream, ignoring errors. A full disk or a closed terminal must not end a service, and there is no
+    other place to report it.
+    """
     with suppress(OSError):
         stream.write(text)
         stream.flush()
 
 
 class Log:
-    """Writes to standard error.
+    """Log on standard error.
 
     Args:
-        is_json: one JSON object a line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and what else is known of
-            what the line is about.
-        wall_clock: gives the time.
+        is_json: one JSON object per line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and fields that describe
+            the subject of the line.
+        wall_clock: returns the time.
     """
 
     def __init__(self, *, is_json: bool = False, wall_clock: Callable[[], str] | None = None) -> None:
@@ -35,16 +38,32 @@ class Log:
         self._wall_clock = wall_clock or _utc_now
 
     def say(self, text: str, level: Level = "info", **about: Any) -> None:
-        """One line.
+        """Write one line.
 
         Args:
             text: for people.
-            level: how much it matters.
-            about: plain values for programs; left out of plain text, which says the same in words.
+            level: severity.
+            about: plain values for programs; left out of plain text, which states the same in words.
         """
         if self.is_json:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
         write(sys.stderr, text + "\n")
+
+
+@contextmanager
+def report_errors(log_format: Callable[[], str | None]) -> Iterator[None]:
+    """Write an error that ends a command as a JSON line, instead of the plain text for people.
+
+    Args:
+        log_format: returns the format, once it is known.
+    """
+    try:
+        yield
+    except V2VError as error:
+        if log_format() == "json":
+            Log(is_json=True).say(" ".join(str(error).split()), "error")
+            error.is_reported = True
+        raise
 
 
 def _utc_now() -> str:

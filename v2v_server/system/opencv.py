@@ -1,7 +1,7 @@
-"""OpenCV, loaded when something of it is first used.
+"""OpenCV, imported on first use.
 
-A worker whose samples have no flow and are not resized needs nothing of it, and starts without its 30 MB. What names a
-part of OpenCV while it is imported itself, as a default value or a constant, would load it for all: write ``cv2.NAME``
+A worker whose samples have no flow and are not resized does not need OpenCV, and starts without its 30 MB. A module
+that uses a part of OpenCV at import time, as a default value or a constant, would load it for all: use ``cv2.NAME``
 inside functions only.
 """
 
@@ -18,7 +18,7 @@ else:
             import cv2
 
             value = getattr(cv2, name)
-            setattr(self, name, value)  # the next time it is found without coming here
+            setattr(self, name, value)  # the next access does not call this function
             return value
 
     cv2 = _OpenCV()

@@ -1,4 +1,4 @@
-"""What we ask of the operating system: memory that stays, cores, long turns, children that die with their parent."""
+"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from v2v_protocol import allocator
 from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
-_TURN_SECONDS = 0.1  # the longest that Linux grants
-_MOST_FILES = 1 << 16  # a connection of each consumer and worker that a server takes, and a logbook of each worker
+_TURN_SECONDS = 0.1  # the longest time slice that Linux grants
+_MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 
 
 def keep_freed_memory() -> bool:
-    """:func:`v2v_protocol.allocator.keep_freed_memory` for blocks of the size of a sample: what is free beyond that, a
-    server or worker gives back."""
+    """Call :func:`v2v_protocol.allocator.keep_freed_memory` for blocks of the size of a sample; a server or worker
+    returns larger free memory.
+    """
     return allocator.keep_freed_memory(most_bytes=allocator.LARGEST_SAMPLE_BYTES)
 
 
 class _SchedAttr(ctypes.Structure):
-    """struct sched_attr of sched_setattr(2), as far as the first version goes."""
+    """struct sched_attr of sched_setattr(2), as in its first version."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
@@ -46,14 +47,14 @@ class _SchedAttr(ctypes.Structure):
 
 
 def take_long_turns() -> bool:
-    """Ask for long turns on a core for the calling thread, instead of 3 ms, where several have to share one.
+    """Ask for long time slices on a core for the calling thread, instead of 3 ms, if threads share a core.
 
-    Each turn begins with the caches full of somebody else's pictures. Its share of the core stays what it was, and
-    whoever wakes for a short moment (broker, client, trainer) comes sooner, not later.
+    Each time slice starts with caches full of another process's pictures. The thread's share of the core stays the
+    same, and processes that wake briefly (broker, client, trainer) run sooner, not later.
 
     Returns:
-        False where the system knows nothing of the kind, or this thread is not scheduled in the usual way: nothing was
-        changed. Linux before 6.12 takes the wish and does nothing with it.
+        False if the system does not support it or this thread has another scheduling class; then nothing was changed.
+        Linux before 6.12 accepts the request and ignores it.
     """
     calls = _SCHED_ATTR_CALLS.get(platform.machine()) if sys.platform.startswith("linux") else None
     if calls is None:
@@ -69,25 +70,26 @@ def take_long_turns() -> bool:
 
 
 def open_many_files() -> None:
-    """Let this process have as many files and connections open as the system allows, up to what a server can need.
+    """Raise this process's limit of open files and connections to the system's limit, up to what a server can need.
 
-    By default that is 1024, for the sake of programs that use select(2). With all of them taken ZeroMQ lets nobody in
-    any more, without a word, or ends the process when a local worker connects.
+    The default is 1024, for the sake of programs that use select(2). At the limit ZeroMQ silently accepts no more
+    peers, or ends the process when a local worker connects.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
-        with suppress(OSError, ValueError):  # a system may allow fewer than it says
+        with suppress(OSError, ValueError):  # a system may allow fewer than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def limit_memory(most_bytes: int) -> None:
-    """More is refused to whatever in this process asks for it: a decoder, by a file that claims what it has not.
+    """Limit the memory that this process may allocate. Larger requests fail, such as those of a decoder for a file that
+    claims a huge size.
 
-    What is shared with other processes does not count (a consumer's slots), nor what is only reserved.
+    Memory shared with other processes (a consumer's slots) and memory that is only reserved do not count.
 
     Args:
-        most_bytes: at most; a lower limit that the process has already stays.
+        most_bytes: the limit; a lower existing limit stays.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     at_most = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
@@ -95,11 +97,11 @@ def limit_memory(most_bytes: int) -> None:
 
 
 def limit_processor_time(seconds: float) -> None:
-    """From now on this process may take so much processor time, and is ended by the kernel (SIGXCPU) if it takes more:
-    a decoder that goes round in circles does so at the machine's expense. To be called again before each piece of work.
+    """Limit the processor time of this process from now on; the kernel ends it (SIGXCPU) if it takes more, for instance
+    in a decoder that loops without end. Call again before each piece of work.
 
     Args:
-        seconds: at most; a lower limit that the process has already stays.
+        seconds: the limit; a lower existing limit stays.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
     at_most = math.ceil(time.process_time() + seconds)
@@ -107,8 +109,8 @@ def limit_processor_time(seconds: float) -> None:
 
 
 def usable_cores() -> int:
-    """How many cores this process may use: those that a batch system, a container or ``taskset`` gave it, and no more
-    than the processor time that a container may spend amounts to; those of the machine where the system does not say.
+    """Return how many cores this process may use: those that a batch system, a container or ``taskset`` assigned to it,
+    limited by the container's processor time; the cores of the machine if the system reports no limit.
     """
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
@@ -116,11 +118,11 @@ def usable_cores() -> int:
 
 
 def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float:
-    """Processor time that this process and its siblings are granted in a second, the strictest limit of its control
-    group (Linux, version 2) and of those above it: ``docker run --cpus``, a pod's limit, CPUQuota of systemd.
+    """Return the processor time that this process and its siblings may use per second. It is the strictest limit of its
+    control group (Linux, version 2) and of those above it: ``docker run --cpus``, a pod's limit, CPUQuota of systemd.
 
     Returns:
-        seconds a second; infinite without a limit.
+        seconds per second; infinite without a limit.
     """
     try:
         (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
@@ -132,7 +134,7 @@ def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/pro
         try:
             quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()
         except (OSError, ValueError):
-            continue  # the topmost group has none
+            continue  # the root group has no limit
         if quota != "max":
             least = min(least, int(quota) / int(period))
     return least
@@ -140,8 +142,9 @@ def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/pro
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """Python looks for no reference cycles meanwhile. Where a million objects are made that all stay, it would look
-    through them again and again, which takes longer than to make them."""
+    """Disable Python's search for reference cycles meanwhile. While a million lasting objects are created, it would
+    examine them repeatedly, which takes longer than creating them.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -152,7 +155,9 @@ def without_collections() -> Iterator[None]:
 
 
 def resident_bytes() -> int:
-    """Memory of this process, shared pages too; 0 where the system does not say (Linux says)."""
+    """Return the resident memory of this process, including shared pages, bytes; 0 if the system does not report it
+    (Linux does).
+    """
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):
@@ -161,16 +166,16 @@ def resident_bytes() -> int:
 
 
 def give_way() -> None:
-    """Let others have this core at a good moment, where any are waiting, instead of at the end of the turn."""
+    """Yield this core to waiting processes at a convenient moment, instead of at the end of the time slice."""
     if hasattr(os, "sched_yield"):
         os.sched_yield()
 
 
 def die_with_parent(parent_pid: int) -> None:
-    """Make the kernel kill this process when its parent dies, even by SIGKILL (Linux; elsewhere nothing happens).
+    """Make the kernel kill this process when its parent dies, even by SIGKILL (Linux; no effect elsewhere).
 
     Args:
-        parent_pid: who the parent was when this process was started; if it is gone already, so are we.
+        parent_pid: process id of the parent when this process was started; if it is gone already, this process exits.
     """
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -179,11 +184,11 @@ def die_with_parent(parent_pid: int) -> None:
 
 
 def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
-    """Where this user's indexes and copies lie: what was chosen, else ``$V2V_CACHE_DIR``, else
+    """Return the folder for this user's indexes and copies: the chosen one, else ``$V2V_CACHE_DIR``, else
     ``$XDG_CACHE_HOME/v2v``, else ``~/.cache/v2v``.
 
     Raises:
-        CorpusError: none was chosen, and this user has no home folder.
+        CorpusError: no folder was chosen, and this user has no home folder.
     """
     if chosen is None:
         chosen = os.environ.get("V2V_CACHE_DIR") or None
@@ -191,8 +196,8 @@ def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
         return Path(chosen)
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "v2v"
-    except RuntimeError as error:  # neither HOME nor an entry in the list of users: a container's user, say
+    except RuntimeError as error:  # neither HOME nor an entry in the user database, as in some containers
         raise CorpusError(
-            f"user {os.getuid()} has no home folder to keep the catalogue's index in: say where with --cache-dir or "
+            f"user {os.getuid()} has no home folder for the catalogue's index: give a folder with --cache-dir or "
             "V2V_CACHE_DIR"
         ) from error

@@ -1,13 +1,13 @@
-"""What a process that decodes strangers' videos gives up, for good: the kernel holds it to that (Linux).
+"""Restrict a process that decodes untrusted videos, permanently: the kernel enforces it (Linux).
 
-A file that finds a flaw in the decoder can then read what its user can read, and use memory and time, but
+A file that exploits a flaw in the decoder can then read what its user can read, and use memory and time. But it
 
-    starts no program, looks into no other process, asks for no other rights       seccomp
-    opens no connection to a network, where it needs none                          seccomp
-    writes, makes and removes no file but below the given folders                  Landlock
+    starts no program, accesses no other process, gains no other rights            seccomp
+    opens no network connection, unless the process needs one                      seccomp
+    writes, creates and removes no file except below the given folders             Landlock
 
-Both are the kernel's own, need no rights, and are inherited by whatever the process starts. Calls that are refused fail
-with EPERM or EACCES; nothing is killed for them.
+Both are part of the kernel, need no rights, and are inherited by processes that it starts. Refused calls fail with
+EPERM or EACCES; no process is killed for them.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _ALL_THREADS, _NO_SLOWDOWN = 1, 4  # flags; the second: without the mitigation t
 _ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 _OTHER_ABI = 0x40000000
-"""From this number on: calls of x86_64's 32-bit variant, under which every call is there again."""
+"""Calls from this number on belong to x86_64's 32-bit variant, which repeats every call."""
 _UNIX = 1
 
 _LANDLOCK = (444, 445, 446)  # create, add a rule, restrict; the same on all machines
 _PATH_BENEATH = 1
 _EXECUTE, _READ_FILE, _READ_FOLDER = 1 << 0, 1 << 2, 1 << 3
-_LEAST_VERSION = 2  # the first keeps everyone from moving files from one folder to another
+_LEAST_VERSION = 2  # version 1 forbids moving files between folders
 _KNOWN_TO = {2: 14, 3: 15, 4: 15}  # version of Landlock -> how many rights over files it knows; later ones 16
 _FILE_RIGHTS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14 | 1 << 15
-"""Rights that a rule may give over something that is no folder: execute, write, read, truncate, control a device."""
+"""Rights that a rule may give over a file: execute, write, read, truncate, control a device."""
 
 
 _REFUSED = {
@@ -46,12 +46,12 @@ _REFUSED = {
     "perf_event_open": (298, 241), "userfaultfd": (323, 282), "keyctl": (250, 219), "add_key": (248, 217),
     "request_key": (249, 218), "mount": (165, 40), "unshare": (272, 97), "setns": (308, 268),
 }  # fmt: skip
-"""Calls that are refused, by their numbers on x86_64 and aarch64. io_uring could do the others' work unseen."""
+"""Refused calls, by their numbers on x86_64 and aarch64. io_uring could perform the others without the filter."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Machine:
-    architecture: int  # as the kernel tells a filter
+    architecture: int  # as the kernel reports it to a filter
     seccomp: int
     socket: int
     refused: tuple[int, ...]
@@ -65,11 +65,11 @@ _MACHINES = {
 
 @dataclass(frozen=True, slots=True)
 class Confined:
-    """What holds a process from now on.
+    """Restrictions in force.
 
     Attributes:
-        calls: no program, no other process, and no network where that was asked.
-        files: no writing but below the given folders.
+        calls: whether programs, other processes, and (if requested) networks are blocked.
+        files: whether writing outside the given folders is blocked.
     """
 
     calls: bool
@@ -77,7 +77,7 @@ class Confined:
 
 
 def can_confine() -> Confined:
-    """What :func:`confine` could do here."""
+    """Return which restrictions :func:`confine` could apply here."""
     machine = _MACHINES.get(platform.machine())
     if not sys.platform.startswith("linux") or machine is None:
         return Confined(calls=False, files=False)
@@ -87,16 +87,16 @@ def can_confine() -> Confined:
 
 
 def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
-    """Confine this process, all of its threads as to calls, and what it starts from now on. There is no way back.
+    """Confine this process and its future children; system calls in all of its threads. This cannot be undone.
 
     Args:
-        writable: folders in which it may write; None leaves that as it is. Landlock holds the calling thread, and those
-            that it starts from now on. It also keeps a process from opening files in others by ``/proc/PID/fd``, which
-            is how a sample gets into its consumer's memory.
-        network: whether it may open connections other than to sockets of this host's file system.
+        writable: folders in which it may write; None does not restrict writing. Landlock holds for the calling thread,
+            and threads that it starts from now on. It also prevents opening files of other processes by
+            ``/proc/PID/fd``, which is how a sample gets into its consumer's memory.
+        network: whether it may open connections other than to sockets in this host's file system.
 
     Returns:
-        what the system has; where it has nothing of the kind, nothing was changed.
+        the restrictions that the system supports; the others were not applied.
     """
     machine = _MACHINES.get(platform.machine())
     if not sys.platform.startswith("linux") or machine is None:
@@ -104,7 +104,7 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
     kernel = ctypes.CDLL(None, use_errno=True)
     if kernel.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
         return Confined(calls=False, files=False)
-    has_files = writable is not None and _allow_writing(kernel, writable)  # first: seccomp might not allow it
+    has_files = writable is not None and _allow_writing(kernel, writable)  # before seccomp, whose filter might block it
     code = program(machine, network=network)
     buffer = ctypes.create_string_buffer(code, len(code))
     filter_ = struct.pack("@HP", len(code) // 8, ctypes.addressof(buffer))
@@ -114,7 +114,7 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
 
 
 def program(machine: _Machine, *, network: bool) -> bytes:
-    """The filter over system calls: for each of them allow, or refuse with EPERM."""
+    """Build the filter over system calls, which allows each call or refuses it with EPERM."""
     refuse = _instruction(_RETURN, _REFUSE)
     code = [_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, _instruction(_LOAD, 0)]
     code += [_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse]
@@ -140,7 +140,7 @@ def _allow_writing(kernel: ctypes.CDLL, folders: Iterable[Path]) -> bool:
             try:
                 beneath = os.open(folder, os.O_PATH | os.O_CLOEXEC)
             except OSError:
-                continue  # what is not there cannot be written to
+                continue  # a missing folder cannot be written to
             try:
                 rights = handled if folder.is_dir() else handled & _FILE_RIGHTS
                 if _call(kernel, _LANDLOCK[1], rules, _PATH_BENEATH, struct.pack("=Qi", rights, beneath), 0) != 0:
@@ -153,7 +153,7 @@ def _allow_writing(kernel: ctypes.CDLL, folders: Iterable[Path]) -> bool:
 
 
 def _call(kernel: ctypes.CDLL, number: int, *arguments: int | bytes | None) -> int:
-    """A system call, which returns -1 where it fails."""
+    """Make a system call; return -1 if it fails."""
     given = (ctypes.c_long(each) if isinstance(each, int) else each for each in arguments)
     return int(kernel.syscall(ctypes.c_long(number), *given))
 

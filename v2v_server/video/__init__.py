@@ -3,6 +3,8 @@
 source       opening it, for sequential reading
 probe        what it holds
 packets      what a packet says without being decoded
+signs        whether packets may not be the frames
+listing      whether they are, by decoding
 frame_index  which frames it has, and where decoding may begin
 decode       a range of frames, exactly
 collect      the asked frames of one pass of a decoder

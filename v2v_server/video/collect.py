@@ -14,7 +14,7 @@ from av.video.frame import VideoFrame
 from v2v_protocol.errors import VideoError
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
-from v2v_server.video.orientation import Orientation, Window
+from v2v_server.video.orientation import Window
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +56,7 @@ class Stack:
     def __init__(self, wanted: FrameRange, cuts: Sequence[Cut]) -> None:
         self.wanted = wanted
         self.index = index = wanted.index
+        self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
@@ -71,6 +72,8 @@ class Stack:
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
+        if frame.is_corrupt and not self.index.seekable and not self._seen:
+            return False  # frames are counted from the first sound one
         ordinal, self._seen = self._seen, self._seen + 1
         # A damaged or lost frame spoils what refers to it, until decoding starts afresh.
         lost = not self.sparse and self._after_a_gap(frame)
@@ -114,7 +117,7 @@ class Stack:
 
     def _copy(self, frame: VideoFrame) -> None:
         if not self._parts:
-            self._luma, self._orientation = LumaFormat.of(frame), Orientation.of(frame)
+            self._luma = LumaFormat.of(frame)
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
             self._parts = [self._part(cut) for cut in self._cuts]
         if (frame.height, frame.width) != self._size:

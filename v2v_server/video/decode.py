@@ -17,6 +17,7 @@ import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import av
 import numpy as np
@@ -122,12 +123,17 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
 
 def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
     """The cuts, [count, h, w] uint8 each, and the codec's name."""
+    stack = _filled(wanted, cuts)
+    return list(stack.grey()), stack.codec
+
+
+def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:
     for frames_of in (_from_keyframe_on, _from_beginning):
         stack = Stack(wanted, cuts)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass
-            return list(stack.grey()), stack.codec
+            return stack
         except _SeekFailed:
             continue
         except VideoError:
@@ -172,6 +178,20 @@ def stream_decoded(
                 raise
 
 
+def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> bool:
+    """Return whether the decoder delivers these frames, undamaged and all alike.
+
+    Raises:
+        UsageError: the range does not lie in the index.
+    """
+    index.position(start, count)
+    try:
+        _filled(FrameRange(path, index, start, 1), [Cut(count, (0, 0, 1, 1))])
+    except VideoError:
+        return False
+    return True
+
+
 def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
     """The frames from the last keyframe at or before the range, without those that nothing refers to.
 
@@ -208,10 +228,16 @@ def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
     wanted = stack.wanted
     with opened(wanted.path) as (container, stream):
         stack.codec = stream.codec_context.codec.canonical_name
-        try:
-            yield from _decoded(stream, packets(container, stream))
-        except av.FFmpegError as error:
-            stack.refuse(f"does not decode: {reason(error)}")
+        begun = False
+        for packet in chain(packets(container, stream), [None]):
+            try:
+                frames = stream.decode(packet)
+            except av.FFmpegError as error:
+                if begun:
+                    stack.refuse(f"does not decode: {reason(error)}")
+                continue  # a file may begin in the middle of a group of frames
+            begun |= any(not frame.is_corrupt for frame in frames)
+            yield from frames
 
 
 def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:

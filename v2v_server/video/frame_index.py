@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_server.video.orientation import Orientation
 
 NO_TIMESTAMP = -(2**63)
 """Stands for an unknown pts or dts (FFmpeg's AV_NOPTS_VALUE)."""
@@ -20,8 +21,10 @@ LARGEST_FRAMES = 2**24
 LARGEST_SIDE_PX = 2**16 - 1
 
 _MAGIC = b"VFI1"
-_HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, seekable
+_HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, flags
 _INT64 = np.dtype("<i8")
+_SEEKABLE, _TRANSPOSE, _FLIP_Y, _FLIP_X = 1, 2, 4, 8
+_UPRIGHT = Orientation()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +41,8 @@ class FrameIndex:
         height_px, width_px: size of the upright picture (rotation metadata applied).
         seekable: False when the time stamps are missing, not unique or not to be trusted (H.264 with B-frames in
             AVI): decoding then counts frames from the beginning of the file.
+        orientation: how the stored pictures are turned upright, as the first frame says: H.264 and HEVC may say it with
+            keyframes only.
     """
 
     first: int
@@ -48,6 +53,7 @@ class FrameIndex:
     height_px: int
     width_px: int
     seekable: bool
+    orientation: Orientation = _UPRIGHT
 
     def __len__(self) -> int:
         return len(self.pts)
@@ -91,6 +97,21 @@ class FrameIndex:
             keyframe_dts=self.keyframe_dts[kept],
         )
 
+    def only(self, kept: npt.NDArray[np.bool_]) -> FrameIndex:
+        """Return the index without some frames of the file.
+
+        Args:
+            kept: [n], whether each frame stays.
+        """
+        keys = kept[self.keyframes - self.first]
+        ordinals = self.first + np.cumsum(kept) - 1
+        return replace(
+            self,
+            pts=self.pts[kept],
+            keyframes=ordinals[self.keyframes - self.first][keys],
+            keyframe_dts=self.keyframe_dts[keys],
+        )
+
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Presentation times of frames start .. start + count - 1.
 
@@ -108,9 +129,11 @@ class FrameIndex:
 
     def to_bytes(self) -> bytes:
         """A compact encoding: a few bytes a frame at a varying rate, next to nothing at a constant one."""
+        lies = self.orientation
+        flags = _SEEKABLE * self.seekable | _TRANSPOSE * lies.transpose | _FLIP_Y * lies.flip_y | _FLIP_X * lies.flip_x
         head = _HEADER.pack(
             _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
-            self.height_px, self.width_px, self.seekable,
+            self.height_px, self.width_px, flags,
         )  # fmt: skip
         if not self.seekable:
             return head
@@ -126,15 +149,15 @@ class FrameIndex:
         """
         if len(data) < _HEADER.size:
             raise ProtocolError(f"frame index of {len(data)} bytes: shorter than its header of {_HEADER.size}")
-        magic, first, frames, keys, numerator, denominator, height, width, seekable = _HEADER.unpack_from(data)
+        magic, first, frames, keys, numerator, denominator, height, width, flags = _HEADER.unpack_from(data)
+        seekable = bool(flags & _SEEKABLE)
+        orientation = Orientation(bool(flags & _TRANSPOSE), bool(flags & _FLIP_Y), bool(flags & _FLIP_X))
         if magic != _MAGIC:
             raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r}")
         if not 1 <= frames <= most_frames or first + frames > LARGEST_FRAMES or keys > frames:
             raise ProtocolError(f"frame index: {frames} frames from {first}, {keys} keyframes; limit {most_frames}")
-        if not (numerator and denominator and height and width) or seekable > 1:
-            raise ProtocolError(
-                f"frame index: time base {numerator}/{denominator}, {width}x{height} px, seekable {seekable}"
-            )
+        if not (numerator and denominator and height and width) or flags > _SEEKABLE | _TRANSPOSE | _FLIP_Y | _FLIP_X:
+            raise ProtocolError(f"frame index: time base {numerator}/{denominator}, {width}x{height} px, flags {flags}")
         stored = (frames + 2 * keys) * _INT64.itemsize if seekable else 0
         values = np.frombuffer(_inflated(data[_HEADER.size :], stored), _INT64).astype(np.int64)
         if seekable:
@@ -150,14 +173,16 @@ class FrameIndex:
             raise ProtocolError(
                 f"frame index: keyframes outside frames {first} .. {first + frames - 1}, or in disorder"
             )
-        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, bool(seekable))
+        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, seekable, orientation)
 
 
-def unseekable(frames: int, time_base: tuple[int, int], height_px: int, width_px: int) -> FrameIndex:
+def unseekable(
+    frames: int, time_base: tuple[int, int], height_px: int, width_px: int, orientation: Orientation = _UPRIGHT
+) -> FrameIndex:
     """The index of a file whose frames can only be counted from its beginning."""
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
-    return FrameIndex(0, pts, none, none, time_base, height_px, width_px, seekable=False)
+    return FrameIndex(0, pts, none, none, time_base, height_px, width_px, False, orientation)
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

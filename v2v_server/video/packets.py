@@ -104,7 +104,7 @@ class Fields:
         return begins
 
     def _pictures(self, packet: memoryview) -> Iterator[_Picture]:
-        nals = _behind_lengths(packet, self._length_bytes) if self._length_bytes else _behind_start_codes(packet)
+        nals = behind_lengths(packet, self._length_bytes) if self._length_bytes else _behind_start_codes(packet)
         for nal in nals:
             if (kind := nal[0] & 0x1F) in (_SPS, _PPS):
                 self._learn(nal)
@@ -227,7 +227,8 @@ class _Bits:
         return (1 << zeros) - 1 + self.u(zeros)
 
 
-def _behind_lengths(packet: memoryview, length_bytes: int) -> Iterator[memoryview]:
+def behind_lengths(packet: memoryview, length_bytes: int) -> Iterator[memoryview]:
+    """Yield the NAL units of a packet in which a length stands in front of each."""
     at = 0
     while at + length_bytes < len(packet):
         size = int.from_bytes(packet[at : at + length_bytes], "big")

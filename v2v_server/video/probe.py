@@ -1,4 +1,4 @@
-"""Finding out what a video file holds: one pass over its packets, of which only the first few are decoded."""
+"""Finding out what a video file holds: one pass over its packets, of which few are decoded unless in doubt."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import os
 import time
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import av
@@ -19,10 +19,12 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
+from v2v_server.video.listing import Delivered, is_confirmed
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, is_hidden
-from v2v_server.video.source import opened, packets, pictures, reason, time_base
+from v2v_server.video.signs import PacketSigns, steps_and_gaps, times_are_doubtful
+from v2v_server.video.source import opened, packets, reason, time_base
 
 LONGEST_CPU_SECONDS = 1200.0
 """Processor time that listing the frames of a file may take: of the longest films it is seconds, and some minutes where
@@ -38,8 +40,8 @@ class VideoFacts:
         height_px, width_px: size of the upright picture.
         codec: FFmpeg's name of the format ("h264", "vp9"), whichever decoder is used.
         pixel_format: FFmpeg's name of the decoded format ("yuv420p10le").
-        frames_per_second: average rate: from the first and last time stamps, else the container's; NaN if unknown.
-        rotation_degrees: of the display matrix, counter-clockwise as FFmpeg reports it (-90 .. 180).
+        frames_per_second: average rate: from the time stamps, without gaps, else the container's; NaN if unknown.
+        rotation_degrees: of the first frame's display matrix, counter-clockwise as FFmpeg reports it (-90 .. 180).
         full_range: whether luma spans 0 .. 255 (see :mod:`v2v_server.video.luma`).
         index: the frames.
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
@@ -64,8 +66,8 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     """Open, decode the first frame, and walk over all packets.
 
     Frames that the decoder does not deliver are not counted: hidden reference frames, frames outside the edit list,
-    and those in front of the first one that can be decoded in a file cut in mid-GOP. Two fields are one frame. A file
-    whose time stamps cannot be trusted is decoded once to be counted, as far as it decodes.
+    those in front of the first one that can be decoded in a file cut in mid-GOP, and those behind a change of size or
+    luma format. Two fields are one frame. A file whose packets may not name its frames is decoded once.
 
     Raises:
         VideoError: the file does not open, has no video track, or not one frame of it decodes.
@@ -75,18 +77,25 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         with opened(name) as (container, stream):
             head, shown = _walk(name, container, stream)
             base = time_base(stream)
-            # Read before the container is closed: the stream's fields are gone after that.
-            rate = stream.average_rate or stream.guessed_rate
-            reorders = _reorders_without_pts(container, stream)
+            # Read before the container is closed: the stream's fields are gone after that. The average counts the
+            # fields of H.264 in AVI.
+            rate = stream.guessed_rate or stream.average_rate
+            reorders = bool(stream.codec_context.has_b_frames)
+            stores_pts = _stores_pts(container)
             codec = stream.codec_context.codec.canonical_name
     except av.FFmpegError as error:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
-    height, width = Orientation.of(head).size(head.height, head.width)
+    orientation = Orientation.of(head)
+    height, width = orientation.size(head.height, head.width)
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
         raise VideoError(name, None, f"its picture of {width}x{height} px is larger than {LARGEST_SIDE_PX} px a side")
-    index = None if reorders else _index(shown, head, base, (height, width))
-    if index is None:
-        index = unseekable(_count_by_decoding(name), base, height, width)
+    uncounted = unseekable(1, base, height, width, orientation)
+    index = _index(shown, head, uncounted) if stores_pts or not reorders else None
+    if index is None or _is_doubtful(shown, reorders) or not is_confirmed(name, index):
+        found = Delivered.of(name, head, _Effort(name).check)
+        index = None if index is None else found.confirmed(index, shown.signs.empty_pts)
+        if index is None:
+            index = unseekable(found.sound, base, height, width, orientation)
     if not len(index):
         raise VideoError(name, None, "holds no frame that decodes")
     return VideoFacts(
@@ -108,6 +117,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
 class _Shown:
     """The packets that begin a frame, in stored order: 17 bytes each. :data:`NO_TIMESTAMP` where there is none."""
 
+    signs: PacketSigns
     pts: array[int] = field(default_factory=lambda: array("q"))
     dts: array[int] = field(default_factory=lambda: array("q"))
     is_keyframe: bytearray = field(default_factory=bytearray)
@@ -126,13 +136,14 @@ def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[Vi
     fields = Fields(stream.codec_context.extradata) if codec == "h264" else None
     head: VideoFrame | None = None
     failure: av.FFmpegError | None = None
-    shown, effort = _Shown(), _Effort(name)
+    shown, effort = _Shown(PacketSigns(stream)), _Effort(name)
     for packet in packets(container, stream):
         effort.check(len(shown.pts))
         if head is None:
             head, failure = _first_sound(stream, packet, failure)
         content = memoryview(packet)
         shown.stored.update(content)
+        shown.signs.read(packet, content)
         begins = not is_hidden(codec, content) if fields is None else fields.begins_frame(content)
         if begins and not packet.is_discard:
             shown.add(packet)
@@ -170,17 +181,21 @@ def _first_sound(
     return next((frame for frame in frames if not frame.is_corrupt), None), failure
 
 
-def _reorders_without_pts(container: InputContainer, stream: VideoStream) -> bool:
-    """Whether the decoder reorders frames although the container stores no presentation time stamps.
+def _stores_pts(container: InputContainer) -> bool:
+    """Return whether the container stores presentation time stamps.
 
-    libavformat then guesses them from the stored order, wrongly.
+    libavformat guesses them from the stored order where it does not: wrongly, if the decoder reorders frames.
     """
     names = container.format.name.split(",")
-    stores_none = "avi" in names or bool(Flags(container.format.flags) & Flags.no_timestamps)
-    return stores_none and bool(stream.codec_context.has_b_frames)
+    return "avi" not in names and not Flags(container.format.flags) & Flags.no_timestamps
 
 
-def _index(shown: _Shown, head: VideoFrame, base: tuple[int, int], size: tuple[int, int]) -> FrameIndex | None:
+def _is_doubtful(shown: _Shown, reorders: bool) -> bool:
+    pts, dts = np.array(shown.pts, np.int64), np.array(shown.dts, np.int64)
+    return shown.signs.picture_changes or bool(shown.signs.empty_pts) or times_are_doubtful(pts, dts, reorders)
+
+
+def _index(shown: _Shown, head: VideoFrame, uncounted: FrameIndex) -> FrameIndex | None:
     """The index by presentation time; None when the time stamps do not name the frames."""
     pts = np.array(shown.pts, np.int64)
     if head.pts is None or np.any(pts == NO_TIMESTAMP):
@@ -192,42 +207,29 @@ def _index(shown: _Shown, head: VideoFrame, base: tuple[int, int], size: tuple[i
     if not len(pts) or pts[0] != head.pts or np.any(pts[1:] == pts[:-1]):
         return None
     keys = np.flatnonzero(np.frombuffer(shown.is_keyframe, np.uint8)[order])
-    return FrameIndex(
-        first=0,
+    return replace(
+        uncounted,
         pts=pts,
         keyframes=keys.astype(np.int64),
         keyframe_dts=np.array(shown.dts, np.int64)[order[keys]],
-        time_base=base,
-        height_px=size[0],
-        width_px=size[1],
         seekable=True,
     )
 
 
 def _content(shown: _Shown, index: FrameIndex) -> str:
     stored = shown.stored.copy()
+    if index.orientation != Orientation():
+        stored.update(f"{index.orientation};".encode())
     for part in (index.pts, index.keyframes):
         stored.update(b"%d;" % len(part) + part.astype("<i8").tobytes())
     return stored.hexdigest()[:32]
 
 
-def _count_by_decoding(name: str) -> int:
-    """How many sound frames the decoder delivers before the first error."""
-    count, effort = 0, _Effort(name)
-    with opened(name) as (container, stream):
-        try:
-            for frame in pictures(container, stream):
-                effort.check(count)
-                if frame.is_corrupt:
-                    break
-                count += 1
-        except av.FFmpegError:
-            return count  # what lies behind the error cannot be had; what lies before it can
-    return count
-
-
 def _rate(index: FrameIndex, stated: Fraction | None) -> float:
+    """Return frames per second: the average without gaps, else what the container states."""
     if index.seekable and len(index) > 1:
         numerator, denominator = index.time_base
-        return (len(index) - 1) * denominator / (int(index.pts[-1] - index.pts[0]) * numerator)
+        steps, are_gaps = steps_and_gaps(index.pts)
+        steps = steps[~are_gaps]
+        return len(steps) * denominator / (int(steps.sum()) * numerator)
     return float(stated) if stated else float("nan")

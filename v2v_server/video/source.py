@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
+from itertools import islice
 
 import av
 from av.container import InputContainer
@@ -18,8 +20,8 @@ from av.video.stream import VideoStream
 from v2v_protocol.errors import VideoError, VideoUnreadable
 
 FORMATS = (
-    "mov", "matroska", "avi", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264", "hevc",
-    "obu", "av1", "mjpeg", "yuv4mpegpipe",
+    "mov", "matroska", "avi", "dv", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264",
+    "hevc", "obu", "av1", "mjpeg", "yuv4mpegpipe",
 )  # fmt: skip
 """FFmpeg's names of the containers that are read ("mov" is mp4 as well, "matroska" webm). None of them names other
 files; playlists (concat, HLS, DASH), picture sequences and devices are not among them."""
@@ -45,14 +47,17 @@ _OPTIONS = {
     "max_pixels": str(LARGEST_PICTURE_PX),
 }
 _JPEG = b"\xff\xd8\xff"
-_STILL = Disposition.attached_pic | Disposition.timed_thumbnails
+_STILL = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
+_PACKETS_LOOKED_AT = 256
+"""Of a file with several tracks: enough to see which of them hold a single picture."""
 
 
 @contextmanager
 def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video track, closed at the end whatever happens.
 
-    Tracks whose pictures are cover art do not count; the decoder runs in the calling thread only. A file is opened by
+    Of several tracks it is one with a decoder and more than one frame, the default one before others, the first before
+    later ones. Stills such as cover art do not count. The decoder runs in the calling thread only. A file is opened by
     itself: nothing that it names.
 
     Args:
@@ -67,11 +72,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         # To open a named pipe waits for somebody to write into it, and a device may not end.
         if not stat.S_ISREG(os.stat(name).st_mode):
             raise VideoUnreadable(name, None, "is no regular file")
-        # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras
-        # and QuickTime write others.
-        container = av.open(
-            os.path.abspath(name), "r", format=_raw_format(name), options=_OPTIONS, metadata_errors="replace"
-        )
+        container = _open(name)
     except av.ArgumentError as error:
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
         raise VideoError(name, None, why) from error
@@ -84,7 +85,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         tracks = [track for track in container.streams.video if not track.disposition & _STILL]
         if not tracks:
             raise VideoError(name, None, "has no video track")
-        stream = tracks[0]
+        stream = _chosen(name, container, tracks)
         if stream.codec_context is None:
             raise VideoError(name, None, "holds a video codec that this build of FFmpeg cannot decode")
         decoder = stream.codec_context
@@ -104,9 +105,41 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         container.close()
 
 
+def _open(name: str) -> InputContainer:
+    # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras and
+    # QuickTime write others.
+    return av.open(os.path.abspath(name), "r", format=_raw_format(name), options=_OPTIONS, metadata_errors="replace")
+
+
+def _chosen(name: str, container: InputContainer, tracks: Sequence[VideoStream]) -> VideoStream:
+    """Return the track to serve, see :func:`opened`."""
+    if len(tracks) == 1:
+        return tracks[0]
+    readable = [track for track in tracks if track.codec_context and track.codec_context.codec.name in CODECS]
+    is_listed = "mov" in container.format.name.split(",")  # the counts of other containers are estimates, or missing
+    frames = {track.index: track.frames if is_listed else 0 for track in readable}
+    if len(readable) > 1 and 0 in frames.values():
+        frames |= _frames_at_the_beginning(name, [index for index, count in frames.items() if not count])
+    moving = [track for track in readable if frames[track.index] > 1]
+    return min(
+        moving or readable or tracks, key=lambda track: (not track.disposition & Disposition.default, track.index)
+    )
+
+
+def _frames_at_the_beginning(name: str, indexes: Sequence[int]) -> Counter[int]:
+    """Return how many packets of each track come early, by index, until each has two."""
+    found = Counter[int]()
+    with closing(_open(name)) as container, suppress(av.FFmpegError):
+        for packet in islice(container.demux(*(container.streams[at] for at in indexes)), _PACKETS_LOOKED_AT):
+            found[packet.stream_index] += packet.size > 0
+            if all(found[at] > 1 for at in indexes):
+                break
+    return found
+
+
 def _raw_format(name: str) -> str | None:
     """Return FFmpeg's name of the container where its own guess is wrong: raw JPEG pictures, for it a still."""
-    with open(name, "rb") as file:
+    with open(os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         return "mjpeg" if file.read(len(_JPEG)) == _JPEG else None
 
 

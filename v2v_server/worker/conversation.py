@@ -1,6 +1,6 @@
 """The worker's side of the conversation with its server: a state machine without I/O. Time is passed in.
 
-    start, on_messages, on_kernels_loaded, on_sample, on_failure ──► [Send ..., Say ...] and one step
+    start, on_messages, on_kernels_loaded, on_sample, on_failure ──► [Send, Reconnect, Say ...] and one step
 
 Every event returns a list of actions. The last action is the next step, and the result of that step is the next event.
 So the caller, which has the socket and the kernels (:mod:`v2v_server.worker.process`), takes no decisions:
@@ -46,7 +46,10 @@ from v2v_protocol.wire import Frames, decode, encode
 CREDIT = 2
 _PING_SECONDS = 5.0
 _LONGEST_PING_SECONDS = 320.0
-"""ZeroMQ queues pings to an absent server, which receives all of them when it returns. So the interval doubles."""
+"""A server that is away needs no new connection every few seconds: the waits double."""
+_RECONNECT_SECONDS = 10.0
+"""Silence after which a ping goes over a new connection. The server may hold the old one although the network cut it,
+and then ignores what ZeroMQ sends under the same routing id after it connected again."""
 _TOLD_SECONDS = 20.0
 """Silence of the server after which the worker logs it."""
 _TOGETHER_SECONDS = 0.1
@@ -59,6 +62,11 @@ class Send:
     """Send this message to the server."""
 
     frames: Frames
+
+
+@dataclass(frozen=True, slots=True)
+class Reconnect:
+    """Replace the connection by a new one, and drop what the old one has not sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +102,7 @@ class Leave:
     """End the conversation."""
 
 
-Action: TypeAlias = Send | Say | Listen | Load | Make | Leave
+Action: TypeAlias = Send | Reconnect | Say | Listen | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +254,10 @@ class WorkerConversation:
     def _handle_silence(self, now: float) -> list[Action]:
         actions: list[Action] = []
         if self._silence.ping_due(now):
-            self._unheard = False  # the hello may be lost
+            if self._silence.silence(now) >= _RECONNECT_SECONDS:
+                actions += [Reconnect(), self._say_hello()]
+            else:
+                self._unheard = False  # it may be lost
             actions.append(Send(encode(Ping())))
         if self._silence.silence(now) >= _TOLD_SECONDS and not self._silence_reported:
             self._silence_reported = True

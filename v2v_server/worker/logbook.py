@@ -29,12 +29,12 @@ class Logbook:
         return self._file.fileno()
 
     def lease(self) -> int | None:
-        """The lease in work, or IDLE; None if the worker never wrote anything."""
+        """Return the lease in work, or IDLE; None if the worker never wrote anything."""
         entry = os.pread(self.descriptor, _BYTES, 0)
         return int.from_bytes(entry, "little") if len(entry) == _BYTES else None
 
     def decodes(self) -> bool:
-        """Whether the worker was decoding a video."""
+        """Return whether the worker was decoding a video."""
         return os.pread(self.descriptor, 1, _BYTES) == _DECODES
 
     def close(self) -> None:

@@ -45,6 +45,7 @@ from v2v_server.worker.conversation import (
     Listen,
     Load,
     Make,
+    Reconnect,
     Say,
     Send,
     Timings,
@@ -64,7 +65,7 @@ LONGEST_LEASE_SECONDS = 3600.0
 """Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
 ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
-"""Bytes of an operator's name for a worker; a routing id has at most 255."""
+"""What an operator may call a worker; with what is added to it a name has 255 at most."""
 _MORE = int(zmq.SNDMORE)
 """A plain number: send_multipart combines flags of an enumeration, which takes longer than sending a small frame."""
 
@@ -77,7 +78,7 @@ class Worker:
     producing a stream that silently lacks samples.
 
     Args:
-        name: unique name, also its routing id.
+        name: unique name, see :func:`unshared_name`.
         root: the corpus folder on this host, or local copies of a corpus in object storage.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
@@ -105,6 +106,9 @@ class Worker:
         self._log = log or Log()
         self._logbook = logbook
         self._clips = Clips(root, cache)
+        self._at = IDLE  # the lease in work
+        if cache is not None:
+            cache.on_wait = self._note_wait
         self._copies = root if isinstance(root, Copies) else None
         self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
         self._is_remote = leaves_host(address)
@@ -112,7 +116,7 @@ class Worker:
         self._handover_seconds = 0.0  # not yet reported in a result
         self._memory_bytes, self._weigh_at = 0, -math.inf
         self._conversation = WorkerConversation(
-            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname()),
+            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname(), secrets.token_bytes(32)),
             address,
             Callbacks(
                 is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
@@ -124,27 +128,39 @@ class Worker:
             ),
             is_watched=logbook is not None,
         )
+        self._address, self._key = address, key
+        self._handshakes = Handshakes(address, key, "worker")
         self._context = zmq.Context()
+        try:
+            self._connect()
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+
+    def _connect(self) -> None:
+        """Open a socket under a new routing id, which no other peer knows."""
         self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.ROUTING_ID, name.encode())
+        self._socket.setsockopt(zmq.ROUTING_ID, b"\x01" + secrets.token_bytes(15))  # a first byte of 0 is ZeroMQ's own
         self._socket.setsockopt(zmq.LINGER, 5000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
         # Leases bound the queues: at most CREDIT samples in either direction.
         self._socket.setsockopt(zmq.SNDHWM, 0)
         self._socket.setsockopt(zmq.RCVHWM, 0)
-        self._socket.setsockopt(zmq.IPV6, int("[" in address))
-        if key is not None:
-            key.secure(self._socket)
-        self._handshakes = Handshakes(address, key, "worker")
+        self._socket.setsockopt(zmq.IPV6, int("[" in self._address))
+        if self._key is not None:
+            self._key.secure(self._socket)
         self._monitor = self._socket.get_monitor_socket(HANDSHAKE_EVENTS)
-        try:
-            self._socket.connect(address)
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
+        self._handshakes.begin()
+        self._socket.connect(self._address)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._monitor, zmq.POLLIN)
+
+    def _reconnect(self) -> None:
+        before = self._socket, self._monitor
+        self._connect()  # before the old ones are closed: the address of a monitor is made from a descriptor
+        for each in before:
+            each.close(linger=0)
 
     def stop(self) -> None:
         """Finish the current sample, return the other leases, and leave. Safe to call from a signal handler."""
@@ -176,6 +192,8 @@ class Worker:
                 self._socket.send(frame, _MORE, copy=False)
             self._socket.send(last, copy=False)
             self._handover_seconds += time.monotonic() - began
+        elif isinstance(action, Reconnect):
+            self._reconnect()
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -196,7 +214,8 @@ class Worker:
                 if not self._clips.has(lease):
                     give_way()  # processor caches are cold before a new clip, but warm within one
                 limit_processor_time(LONGEST_LEASE_SECONDS)
-                note(self._logbook, lease.lease, decodes=True)
+                self._at = lease.lease
+                note(self._logbook, self._at, decodes=True)
                 try:
                     made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
                 except VideoError as error:
@@ -209,6 +228,10 @@ class Worker:
                 return conversation.on_sample(frames, now, timings)
             case _:
                 return []  # Leave
+
+    def _note_wait(self, waits: bool) -> None:
+        """Note that a wait for other processes, inside of decoding, is no decoding."""
+        note(self._logbook, self._at, decodes=not waits)
 
     def _has_video(self, lease: Lease) -> bool:
         """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
@@ -292,15 +315,14 @@ class Worker:
 
 
 def unshared_name(beginning: str | None) -> str:
-    """Return a name that no other worker has. With equal names the server would hear one worker and the other would
-    wait.
+    """Return a name that no other worker has: the server refuses the second worker of a name.
 
     Args:
         beginning: the operator's name for the worker, which may be shared; None: host and process id, which may be
             equal in containers.
 
     Raises:
-        UsageError: the name with its suffix would be too long for a routing id.
+        UsageError: it is too long with what is added to it.
     """
     if beginning is not None and len(beginning.encode()) > MOST_NAME_BYTES:
         raise UsageError(f"--name has {len(beginning.encode())} bytes: give at most {MOST_NAME_BYTES}")

@@ -5,7 +5,6 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,6 +18,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
+from v2v_protocol.safe_json import parse_json
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.scene import Scene
@@ -215,7 +215,10 @@ def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[floa
 
 @lru_cache(maxsize=16)
 def _spec(canonical: bytes) -> StreamSpec:
-    return StreamSpec.from_dict(json.loads(canonical))
+    try:
+        return StreamSpec.from_dict(parse_json(canonical))
+    except ValueError as error:
+        raise ProtocolError(f"lease.spec is not JSON: {error}") from error
 
 
 @lru_cache(maxsize=16)

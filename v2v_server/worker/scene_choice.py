@@ -69,7 +69,7 @@ def plan_flow(
     """Choose the flow method of each voxel of one drawn sample.
 
     Args:
-        scene: statistics of the usable picture; they cover at least what the sample shows, as far as it was analysed.
+        scene: statistics of the usable picture; they cover at least what the sample shows, as far as analysed.
         start_frame: first frame of the sequence.
         params, spec: the draw, and the spec that it was drawn for.
         picture_height_px, picture_width_px: size of the usable picture before the resize.

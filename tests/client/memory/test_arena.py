@@ -1,5 +1,5 @@
-"""An arena from both ends: a sample that a worker makes there is a row of the consumer's batch, or the worker says that
-it could not."""
+"""Test an arena from both ends: a sample that a worker writes there is a row of the consumer's batch, or the worker
+reports that it could not write it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sample(seed: int) -> dict[str, np.ndarray]:
 
 
 def write(slot: Slot, seed: int) -> bool:
-    """What a worker does."""
+    """Write to a slot as a worker does."""
     there = slot_arrays(slot, LAYOUT)
     for name, array in sample(seed).items():
         if there is not None:
@@ -44,7 +44,7 @@ def holds(arrays: dict[str, np.ndarray], row: int, seed: int) -> bool:
     return all(np.array_equal(arrays[name][row], array) for name, array in sample(seed).items())
 
 
-def nobody() -> None:
+def ignore() -> None:
     pass
 
 
@@ -57,11 +57,11 @@ def allocated(arena: Arena) -> int:
     return os.stat(ArenaName.parse(arena.slot(0).arena).path).st_blocks * 512
 
 
-def test_what_workers_write_are_the_rows_of_the_batch(arena: Arena) -> None:
+def test_workers_write_the_rows_of_the_batch(arena: Arena) -> None:
     for row in (3, 1, 2, 0):
         assert write(arena.slot(row), row)
     arena.put(4, sample(4))  # came in a message
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert {name: (str(array.dtype), array.shape) for name, array in arrays.items()} == {
         name: (dtype, (ROWS, *shape)) for name, (dtype, shape) in LAYOUT.items()
     }
@@ -69,42 +69,42 @@ def test_what_workers_write_are_the_rows_of_the_batch(arena: Arena) -> None:
     assert all(array.flags.c_contiguous and array.flags.writeable for array in arrays.values())
 
 
-def test_what_the_holder_of_a_batch_writes_is_his_alone(arena: Arena) -> None:
+def test_writes_to_a_batch_are_private(arena: Arena) -> None:
     assert write(arena.slot(2), 2)
-    for array in arena.arrays(nobody).values():
+    for array in arena.arrays(ignore).values():
         array[...] = 111
-    again = arena.arrays(nobody)
+    again = arena.arrays(ignore)
     assert holds(again, 2, 2)
 
 
-def test_a_batch_is_mapped_once_while_nobody_writes_to_it(arena: Arena) -> None:
+def test_an_unwritten_mapping_is_reused(arena: Arena) -> None:
     assert write(arena.slot(2), 1)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     first = arrays["voxels"].ctypes.data
     assert holds(arrays, 2, 1)
     del arrays
     assert write(arena.slot(2), 2)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert arrays["voxels"].ctypes.data == first
     assert holds(arrays, 2, 2)
 
 
 @pytest.mark.parametrize("name", list(LAYOUT))
 @pytest.mark.parametrize("row", [0, ROWS - 1])
-def test_nothing_is_left_of_what_an_earlier_holder_wrote(arena: Arena, name: str, row: int) -> None:
+def test_writes_to_an_earlier_batch_do_not_reappear(arena: Arena, name: str, row: int) -> None:
     for other in range(ROWS):
         assert write(arena.slot(other), other)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     arrays[name][row].reshape(-1)[-1] += 1
     assert not holds(arrays, row, row)
     del arrays
     assert write(arena.slot(1), 7)
-    arrays = arena.arrays(nobody)
+    arrays = arena.arrays(ignore)
     assert [holds(arrays, other, 7 if other == 1 else other) for other in range(ROWS)] == [True] * ROWS
 
 
 @pytest.mark.parametrize("said", ["nothing", "zeros", "too little"])
-def test_a_kernel_that_does_not_say_who_wrote_is_no_reason_to_show_it(
+def test_without_pagemap_an_earlier_write_does_not_reappear(
     arena: Arena, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pread(descriptor: int, count: int, offset: int) -> bytes:
@@ -115,8 +115,8 @@ def test_a_kernel_that_does_not_say_who_wrote_is_no_reason_to_show_it(
     really = os.pread
     monkeypatch.setattr(os, "pread", pread)
     assert write(arena.slot(ROWS - 1), 5)
-    arena.arrays(nobody)["frames"].reshape(-1)[-1] += 1  # in the last page, of which it says too little
-    assert holds(arena.arrays(nobody), ROWS - 1, 5)
+    arena.arrays(ignore)["frames"].reshape(-1)[-1] += 1  # in the last page, which the short answer leaves out
+    assert holds(arena.arrays(ignore), ROWS - 1, 5)
 
 
 def test_a_row_can_be_copied_out(arena: Arena) -> None:
@@ -126,7 +126,7 @@ def test_a_row_can_be_copied_out(arena: Arena) -> None:
     assert all(np.array_equal(copied[name], array) for name, array in sample(8).items())
 
 
-def test_it_is_known_when_nothing_looks_at_a_batch_any_more(arena: Arena) -> None:
+def test_the_callback_runs_once_a_batch_is_unreferenced(arena: Arena) -> None:
     seen = []
     arrays = arena.arrays(lambda: seen.append("unused"))
     view = arrays["flow"][1:, ::2]
@@ -146,10 +146,10 @@ def test_another_process_of_this_user_can_write(arena: Arena) -> None:
     slot = arena.slot(3)
     command = [sys.executable, "-c", code, slot.arena, str(slot.number)]
     assert subprocess.run(command, timeout=60, check=False).returncode == 0
-    assert holds(arena.arrays(nobody), 3, 4)
+    assert holds(arena.arrays(ignore), 3, 4)
 
 
-def test_what_is_not_the_named_arena_is_not_touched(arena: Arena, tmp_path: Path) -> None:
+def test_a_file_that_is_not_the_named_arena_is_not_written(arena: Arena, tmp_path: Path) -> None:
     name = ArenaName.parse(arena.slot(0).arena)
     other = os.memfd_create("v2v-other")
     file = os.open(tmp_path / "file", os.O_RDWR | os.O_CREAT)
@@ -167,8 +167,8 @@ def test_what_is_not_the_named_arena_is_not_touched(arena: Arena, tmp_path: Path
 
 
 @pytest.mark.parametrize("flaw", ["not sealed", "too small", "of more slots"])
-def test_memory_that_could_end_its_writer_is_left_alone(flaw: str) -> None:
-    """A page that is not there, or is taken away while one writes to it, is a signal that kills."""
+def test_unsealed_memory_is_not_written(flaw: str) -> None:
+    """Writing to a page that is missing, or removed meanwhile, kills the process by a signal."""
     import fcntl
 
     good = ArenaName.parse(Arena(LAYOUT, ROWS).slot(0).arena)
@@ -192,7 +192,7 @@ def test_its_size_cannot_be_changed(arena: Arena) -> None:
             os.ftruncate(name.descriptor, size)
 
 
-def test_the_arena_of_a_consumer_that_is_gone_cannot_be_reached_and_leaves_no_descriptor() -> None:
+def test_the_arena_of_a_dead_consumer_cannot_be_opened() -> None:
     slot = Arena(LAYOUT, ROWS).slot(0)
     gc.collect()
     before = set(os.listdir("/proc/self/fd"))
@@ -200,7 +200,7 @@ def test_the_arena_of_a_consumer_that_is_gone_cannot_be_reached_and_leaves_no_de
     assert set(os.listdir("/proc/self/fd")) == before
 
 
-def test_a_worker_keeps_nothing_of_an_arena(arena: Arena) -> None:
+def test_a_worker_keeps_no_descriptor_of_an_arena(arena: Arena) -> None:
     before = set(os.listdir("/proc/self/fd"))
     assert write(arena.slot(0), 1)
     gc.collect()
@@ -219,13 +219,13 @@ def test_without_memfd_there_is_no_arena(monkeypatch: pytest.MonkeyPatch) -> Non
     slots=st.integers(1, MOST_SLOTS),
     token=st.binary(min_size=16, max_size=16),
 )
-def test_a_name_survives_its_text(pid: int, descriptor: int, slots: int, token: bytes) -> None:
+def test_arena_names_round_trip_through_text(pid: int, descriptor: int, slots: int, token: bytes) -> None:
     name = ArenaName(pid, descriptor, slots, token.hex())
     assert ArenaName.parse(str(name)) == name
 
 
 @given(st.text(max_size=60) | st.from_regex(r"[0-9]{1,3}:[0-9]{1,3}:[0-9]{0,7}:[0-9a-f]{32}", fullmatch=True))
-def test_other_text_names_no_arena(text: str) -> None:
+def test_other_texts_are_not_arena_names(text: str) -> None:
     try:
         name = ArenaName.parse(text)
     except ProtocolError:

@@ -62,7 +62,7 @@ def shaped(batch_size: int = 4, spare: int = 2) -> BatchBuffers:
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-def test_memory_is_not_used_again_while_anything_looks_at_it(hold):
+def test_referenced_memory_is_not_reused(hold):
     buffers = shaped()
     array = buffers.arrays()["voxels"].reshape(4, 6)
     array[:] = 7
@@ -76,10 +76,10 @@ def test_memory_is_not_used_again_while_anything_looks_at_it(hold):
     gc.collect()
     again = buffers.arrays()["voxels"]
     assert address(again) == first, "the last user is gone, yet the memory did not come back"
-    assert (again == 7).all(), "somebody wrote into memory that was held"
+    assert (again == 7).all(), "memory in use was written to"
 
 
-def test_arrays_have_the_asked_form():
+def test_arrays_have_the_requested_shapes():
     for name, array in shaped().arrays().items():
         dtype, shape = LAYOUT[name]
         assert array.shape == (4, *shape)
@@ -89,7 +89,7 @@ def test_arrays_have_the_asked_form():
         assert address(array) % array.dtype.alignment == 0
 
 
-def test_no_more_memory_is_kept_than_stated():
+def test_at_most_the_stated_memory_is_kept():
     buffers = shaped()
     arrays = [buffers.arrays()["voxels"] for _ in range(5)]
     addresses = {address(array) for array in arrays}
@@ -122,7 +122,7 @@ def arena_of(memory: BatchMemory) -> str:
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_batch_has_the_rows_that_were_put(shared):
+def test_a_batch_has_the_rows_written_to_it(shared):
     whole = filled(shaped().take(shared=shared))
     assert {name: (str(array.dtype), array.shape) for name, array in whole.items()} == {
         "voxels": ("int8", (4, 2, 3)),
@@ -131,8 +131,8 @@ def test_a_batch_has_the_rows_that_were_put(shared):
     assert all((array[row] == row).all() for array in whole.values() for row in range(4))
 
 
-def test_a_batch_leaves_its_arena_where_a_worker_may_still_write():
-    """With the samples that are there, and those that other workers put there yet."""
+def test_a_batch_leaves_its_arena_if_a_worker_may_still_write():
+    """It takes along the samples already there, and those that other workers still write there."""
     buffers = shaped()
     memory = buffers.take(shared=True)
     for row in range(4):
@@ -148,7 +148,7 @@ def test_a_batch_leaves_its_arena_where_a_worker_may_still_write():
     assert all((array[row] == row).all() for array in whole.values() for row in range(4))
 
 
-def test_memory_of_another_form_is_let_go():
+def test_memory_of_another_shape_is_released():
     buffers = shaped()
     place = address(buffers.arrays()["voxels"])
     buffers.shape(dict(LAYOUT), 4, spare=2)
@@ -158,7 +158,7 @@ def test_memory_of_another_form_is_let_go():
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-def test_an_arena_is_not_used_again_while_anything_looks_at_its_batch(hold):
+def test_an_arena_with_a_referenced_batch_is_not_reused(hold):
     buffers = shaped()
     memory = buffers.take(shared=True)
     name, whole = arena_of(memory), filled(memory)
@@ -172,7 +172,7 @@ def test_an_arena_is_not_used_again_while_anything_looks_at_its_batch(hold):
     assert arena_of(buffers.take(shared=True)) == name
 
 
-def test_an_arena_whose_batch_never_became_whole_is_not_used_again():
+def test_an_arena_with_an_incomplete_batch_is_not_reused():
     buffers = shaped()
     memory = buffers.take(shared=True)
     name = arena_of(memory)
@@ -183,7 +183,7 @@ def test_an_arena_whose_batch_never_became_whole_is_not_used_again():
 
 @contextmanager
 def forked(check):
-    """A process that was forked before the block, checks after it, and is to succeed."""
+    """Fork a process before the block, run its checks after the block, and require that they succeed."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -205,7 +205,7 @@ def forked(check):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
+def test_an_arena_in_use_during_a_fork_is_not_reused():
     buffers = shaped()
     memory = buffers.take(shared=True)
     name, mine = arena_of(memory), filled(memory)
@@ -226,7 +226,7 @@ def test_an_arena_that_a_forked_process_may_look_at_is_not_used_again():
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_process_does_not_use_the_arenas_of_its_parent():
+def test_a_forked_process_does_not_reuse_its_parents_arenas():
     buffers = shaped()
     memory = buffers.take(shared=True)
     name = arena_of(memory)

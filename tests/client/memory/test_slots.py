@@ -1,4 +1,4 @@
-"""Which slots a connection names, and what an arrival says of that of its sample."""
+"""Test which slots a connection's requests name, and what an arrival means for the slot of its sample."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ A, B = "arena a", "arena b"
 
 
 def offered(*indices: int) -> Slots:
-    """With a slot for each."""
+    """Return slots with one offered for each index."""
     slots = Slots()
     slots.offer({index: Slot(A, index + 1) for index in indices})
     return slots
@@ -22,35 +22,37 @@ def test_a_request_names_the_slots_that_were_offered() -> None:
     assert slots.want(4, [3, 2, 1, 5]) == Want(4, (3, 2, 1, 5), (A, B, A, ""), (4, 7, 2, NO_SLOT))
 
 
-def test_what_is_asked_again_is_asked_without_a_slot() -> None:
-    """The first worker may be writing to the one that was named."""
+def test_a_repeated_request_names_no_slot() -> None:
+    """The first worker may still be writing to the slot that was named."""
     slots = offered(3, 1, 7)
     slots.want(0, [3, 1])
     assert slots.want(0, [1, 7]) == Want(0, (1, 7), ("", A), (NO_SLOT, 8))
     assert slots.want(0, [1, 7]) == Want(0, (1, 7))
 
 
-def test_a_sample_in_its_slot_comes_once() -> None:
+def test_a_sample_is_accepted_from_its_slot_once() -> None:
     slots = offered(5)
     slots.want(0, [5])
     assert slots.record_arrival(5, 6, in_message=False) is Answer.THERE
     assert slots.record_arrival(5, 6, in_message=False) is Answer.NOWHERE
 
 
-def test_a_worker_that_could_not_reach_the_slot_writes_there_no_more() -> None:
+def test_a_sample_in_a_message_with_its_slot_frees_the_slot() -> None:
     slots = offered(5)
     slots.want(0, [5])
     assert slots.record_arrival(5, 6, in_message=True) is Answer.MESSAGE
 
 
-def test_a_sample_made_by_another_worker_leaves_its_slot_to_the_first() -> None:
+def test_a_sample_from_another_worker_abandons_the_slot() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE  # in another's slot: nobody may read that
+    assert (
+        slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE
+    )  # in another sample's slot, which must not be read
     assert slots.record_arrival(5, NO_SLOT, in_message=True) is Answer.ABANDONED
 
 
-def test_where_nothing_is_offered_nothing_is_lent() -> None:
+def test_without_offers_requests_name_no_slots() -> None:
     slots = Slots()
     assert slots.want(2, [4, 5]) == Want(2, (4, 5))
     assert slots.record_arrival(4, 1, in_message=False) is Answer.NOWHERE

@@ -1,4 +1,4 @@
-"""Several brokers: whose consumer is whose, and what happens when one is lost or serves something else."""
+"""Test several brokers: which consumer uses which, and what happens if one is lost or serves another stream."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 
 QUICK = Patience(timeout_seconds=2.0, ping_seconds=0.05, takeover_seconds=0.3)
-NOBODY = "tcp://127.0.0.1:9"
+UNUSED_ADDRESS = "tcp://127.0.0.1:9"
 
 
 @pytest.fixture
@@ -36,14 +36,14 @@ def dataset(brokers: object, **options: object) -> V2VStreamDataset:
 # --- the rule ---------------------------------------------------------------------------------------------------------
 
 
-def test_neighbours_take_from_the_same_broker_and_hosts_from_their_own() -> None:
+def test_neighbouring_consumers_share_a_broker_and_hosts_use_their_own() -> None:
     homes = [order("abcd", rank, 32)[0] for rank in range(32)]
     assert homes == [name for name in "abcd" for _ in range(8)]
 
 
 @pytest.mark.parametrize("brokers", range(1, 9))
 @pytest.mark.parametrize("consumers", [1, 2, 3, 7, 8, 24])
-def test_consumers_are_spread_evenly_also_those_of_a_lost_broker(brokers: int, consumers: int) -> None:
+def test_consumers_are_spread_evenly_even_after_a_broker_is_lost(brokers: int, consumers: int) -> None:
     names = "abcdefgh"[:brokers]
     orders = [order(names, consumer, consumers) for consumer in range(consumers)]
     assert all(sorted(each) == list(names) for each in orders)  # every broker comes once
@@ -55,12 +55,12 @@ def test_consumers_are_spread_evenly_also_those_of_a_lost_broker(brokers: int, c
 
 
 @pytest.mark.parametrize("given", ["tcp://a:1, tcp://b:2", ["tcp://a:1", "tcp://b:2"]])
-def test_addresses_come_in_a_list_or_with_commas(given: object) -> None:
+def test_addresses_are_a_list_or_comma_separated(given: object) -> None:
     assert addresses(given) == ("tcp://a:1", "tcp://b:2")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("given", ["", [], "tcp://a:1,", ["tcp://a:1", "tcp://a:1"]])
-def test_no_address_or_one_twice_is_refused(given: object) -> None:
+def test_no_address_or_a_repeated_one_is_refused(given: object) -> None:
     with pytest.raises(UsageError, match="address"):
         addresses(given)  # type: ignore[arg-type]
 
@@ -68,7 +68,7 @@ def test_no_address_or_one_twice_is_refused(given: object) -> None:
 # --- what it is for ---------------------------------------------------------------------------------------------------
 
 
-def test_a_broker_that_falls_silent_is_taken_over_and_every_sample_comes_once(
+def test_after_a_broker_falls_silent_every_sample_still_comes_once(
     servers: tuple[FakeServer, FakeServer],
 ) -> None:
     one, other = servers
@@ -86,11 +86,11 @@ def test_a_broker_that_falls_silent_is_taken_over_and_every_sample_comes_once(
     assert len(other.wants) > asked_before
 
 
-def test_one_that_never_answered_is_passed_over(servers: tuple[FakeServer, FakeServer]) -> None:
-    assert len(list(dataset([NOBODY, servers[0].address]))) == 6
+def test_a_broker_that_never_answers_is_skipped(servers: tuple[FakeServer, FakeServer]) -> None:
+    assert len(list(dataset([UNUSED_ADDRESS, servers[0].address]))) == 6
 
 
-def test_two_that_serve_different_videos_are_refused_with_both_named(servers: tuple[FakeServer, FakeServer]) -> None:
+def test_brokers_of_different_videos_are_refused_with_both_named(servers: tuple[FakeServer, FakeServer]) -> None:
     one, other = servers
     other.catalogue = "catalogue-2"
     for rank in (0, 1):
@@ -100,10 +100,10 @@ def test_two_that_serve_different_videos_are_refused_with_both_named(servers: tu
         assert other.address in str(refused.value)
 
 
-def test_one_that_takes_over_with_other_videos_is_refused_with_both_named(
+def test_a_broker_that_takes_over_with_other_videos_is_refused(
     servers: tuple[FakeServer, FakeServer],
 ) -> None:
-    """It may have been restarted on another folder since they were compared."""
+    """The broker may have been restarted on another folder since the comparison."""
     one, other = servers
     batches = iter(dataset([one.address, other.address]))
     next(batches)
@@ -115,13 +115,13 @@ def test_one_that_takes_over_with_other_videos_is_refused_with_both_named(
     assert other.address in str(refused.value)
 
 
-def test_all_are_lost_when_each_had_its_turn() -> None:
-    with pytest.raises(ServerLost, match="none of tcp") as lost:
+def test_the_server_is_lost_once_each_broker_had_its_turn() -> None:
+    with pytest.raises(ServerLost, match=r"^tcp.*no sample for") as lost:
         next(iter(dataset(["tcp://127.0.0.1:9", "tcp://127.0.0.1:11"], patience=QUICK, timeout_seconds=0.5)))
     assert "127.0.0.1:9, tcp://127.0.0.1:11" in str(lost.value)
 
 
-def test_one_without_workers_is_taken_over(servers: tuple[FakeServer, FakeServer]) -> None:
+def test_a_broker_without_workers_is_replaced_by_the_next(servers: tuple[FakeServer, FakeServer]) -> None:
     one, other = servers
     one.held, one.trouble = True, "no worker is connected"
     patience = dataclasses.replace(QUICK, timeout_seconds=0.4)

@@ -1,4 +1,4 @@
-"""A connection by itself, where the order of messages matters and no clock may help."""
+"""Test a connection alone, where the order of messages matters and timers must not help."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def server() -> Iterator[FakeServer]:
         yield running
 
 
-def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(server: FakeServer) -> None:
-    """Asked again while it was on its way, sample 0 is made twice, and for the server it is still due."""
+def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(server: FakeServer) -> None:
+    """Sample 0 is requested again while it is on its way, so it is made twice, and the server still counts it."""
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
@@ -57,8 +57,8 @@ def test_what_was_refused_for_credit_is_asked_again_when_a_sample_comes_twice(se
     assert server.refused_for_credit == 1
 
 
-def test_a_session_is_opened_again_under_the_newest_snapshot_of_any_sample_that_came(server: FakeServer) -> None:
-    """Be it one whose provenance nobody has opened yet."""
+def test_a_reopened_session_keeps_the_newest_quarantine_snapshot_received(server: FakeServer) -> None:
+    """This includes samples whose provenance was not decoded yet."""
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
@@ -73,8 +73,10 @@ def test_a_session_is_opened_again_under_the_newest_snapshot_of_any_sample_that_
         assert [again.quarantine for again in server.hellos[greeted:]] == [7]
 
 
-def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For hours perhaps, with its server: what it could not hear meanwhile is no silence of the server's."""
+def test_time_in_which_the_trainer_was_stopped_is_not_silence(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trainer may be stopped for hours together with its server; that time is not the server's silence."""
     stopped = [0.0]
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
@@ -92,10 +94,8 @@ def test_a_trainer_that_was_stopped_goes_on_waiting(server: FakeServer, monkeypa
         assert _next(connection) == 0
 
 
-def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
-    server: FakeServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A server that took most of the deadline to start, and is killed then, is missed after one deadline, not two."""
+def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a server needs most of the deadline to start, and is then killed, it counts as lost after one deadline."""
     waited: list[float] = []
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
 
@@ -121,8 +121,8 @@ def test_the_time_that_opening_took_is_none_that_the_server_is_waited_for_later(
     ("address", "kinds"),
     [("tcp://localhost:1", [0, 1, 0]), ("tcp://127.0.0.1:1", [0, 1, 0]), ("tcp://[::1]:1", [1] * 3)],
 )
-def test_a_name_is_tried_as_an_ipv4_address_and_then_in_turn(address: str, kinds: list[int]) -> None:
-    """Most hosts have "localhost" in both kinds, and a server listens on 127.0.0.1."""
+def test_a_host_name_is_tried_as_ipv4_then_ipv6_in_turn(address: str, kinds: list[int]) -> None:
+    """On most hosts "localhost" has an IPv4 and an IPv6 address, and a server listens on 127.0.0.1."""
     found = []
     with closing(link.Link(address)) as tried:
         for _ in kinds:
@@ -132,7 +132,7 @@ def test_a_name_is_tried_as_an_ipv4_address_and_then_in_turn(address: str, kinds
     assert found == kinds
 
 
-def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeServer) -> None:
+def test_a_reconnection_keeps_the_ip_version_that_worked(server: FakeServer) -> None:
     with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
         connection.open()
         made_anew = connection._open_link()
@@ -144,10 +144,10 @@ def test_a_connection_that_was_there_is_made_anew_in_its_own_kind(server: FakeSe
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("which", [1, 2])
-def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
+def test_a_signal_while_closing_raises_instead_of_hanging(
     server: FakeServer, monkeypatch: pytest.MonkeyPatch, which: int
 ) -> None:
-    """ZeroMQ's context waits for ever for a socket that nobody closed."""
+    """ZeroMQ's context waits indefinitely for a socket that was not closed."""
     connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
     connection.open()
     closing_socket, calls = zmq.Socket.close, iter(range(1, 100))
@@ -164,13 +164,15 @@ def test_a_signal_while_closing_ends_in_its_exception_and_not_in_a_hang(
 
 @pytest.mark.timeout(60)
 @pytest.mark.filterwarnings("ignore:Unclosed (socket|context):ResourceWarning")  # the collector closes some of them
-def test_a_signal_anywhere_in_opening_and_closing_ends_in_its_exception_and_not_in_a_hang(server: FakeServer) -> None:
-    """ZeroMQ's context waits for ever for a socket that nobody closed, be it one that is being made, or whose closing
-    has begun. The exception's traceback keeps it alive, as that of an interrupted program does."""
+def test_a_signal_at_any_line_of_opening_and_closing_raises_instead_of_hanging(server: FakeServer) -> None:
+    """ZeroMQ's context waits indefinitely for a socket that was not closed, even one that is being created or closed.
+
+    The exception's traceback keeps it alive, as that of an interrupted program does.
+    """
     sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
 
     def interrupted_at(line: int) -> bool:
-        """Whether as many lines were run as it takes to be interrupted at that one."""
+        """Return whether enough lines ran to reach the one to interrupt."""
         passed = 0
 
         def trace(frame: FrameType, event: str, argument: object) -> object:

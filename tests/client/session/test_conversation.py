@@ -1,4 +1,4 @@
-"""What a consumer says, and when: by a clock that jumps to whatever is due next, without a socket."""
+"""Test what a consumer sends, and when, without a socket, by a clock that jumps to the next timer."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def said(talk: Conversation) -> list[Message]:
 def timeline(
     talk: Conversation, until: float, answer: Callable[[Message], Message | None] = lambda _: None
 ) -> list[tuple[float, Any]]:
-    """What is done in a silence, and when."""
+    """Return the actions during a silence, with their times."""
     now, done = 0.0, []
     while now < until:
         now += talk.next_due(now)
         try:
             if talk.tick(now):
-                done.append((now, "anew"))
+                done.append((now, "reconnect"))
         except ServerLost as error:
             return [*done, (now, type(error))]
         messages = said(talk)
@@ -82,7 +82,7 @@ def test_every_state_can_be_reached_and_left() -> None:
 
 
 @given(st.lists(st.sampled_from(Event), max_size=20))
-def test_nothing_is_asked_before_the_server_knows_us(events: list[Event]) -> None:
+def test_requests_wait_for_the_welcome(events: list[Event]) -> None:
     talk = Conversation("tcp://x:1", HELLO, 0, pinned=STREAM, pinned_by="a test", patience=PATIENCE, now=0.0)
     talk.credit = 3
     talk.want([7, 8])
@@ -101,7 +101,7 @@ def test_nothing_is_asked_before_the_server_knows_us(events: list[Event]) -> Non
                     assert isinstance(message, Goodbye)
 
 
-def test_a_forgotten_session_is_opened_again_once_and_everything_is_asked_again() -> None:
+def test_a_forgotten_session_reopens_once_and_repeats_all_requests() -> None:
     talk = begun()
     for _ in range(2):  # each request is denied
         talk.handle_message(FORGOTTEN, [], 1.0)
@@ -113,38 +113,38 @@ def test_a_forgotten_session_is_opened_again_once_and_everything_is_asked_again(
 # --- silence ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_dead_server_is_pinged_then_connected_anew_ever_more_rarely_then_given_up() -> None:
+def test_a_dead_server_is_pinged_then_reconnected_with_backoff_then_lost() -> None:
     done = timeline(begun(), 100.0)
     assert at(done, Ping) == [2, 4, 6, 8]
-    assert at(done, "anew") == [10, 30]
+    assert at(done, "reconnect") == [10, 30]
     assert at(done, Hello)[0] == 10
     assert done[-1] == (60, ServerLost)
 
 
-def test_a_server_that_only_answers_pings_is_asked_again_ever_more_rarely_and_never_given_up() -> None:
+def test_requests_to_a_server_that_only_answers_pings_are_repeated_with_backoff() -> None:
     done = timeline(begun(), 200.0, pongs)
     asked = [now for now in at(done, Want) if now % 10 == 0]
     assert {10, 30, 70, 130, 190} <= set(asked)
-    assert "anew" not in [kind for _, kind in done]
+    assert "reconnect" not in [kind for _, kind in done]
     assert done[-1][0] >= 200
 
 
-def test_hello_is_said_again_ever_more_rarely() -> None:
+def test_hello_is_repeated_with_backoff() -> None:
     talk = begun(welcomed=False, patience=Patience(60, 2, 1000))
     assert said(talk) == [HELLO]
     assert at(timeline(talk, 60.0), Hello) == [2, 6, 14, 30]
 
 
 @pytest.mark.parametrize("timeout_seconds", [0.5, 2.0, 3.0])
-def test_nobody_is_given_up_unasked(timeout_seconds: float) -> None:
-    """However short the deadline is beside the time between pings: a server that is busy says nothing by itself."""
+def test_a_server_is_pinged_before_it_counts_as_lost(timeout_seconds: float) -> None:
+    """This holds for any deadline relative to the ping interval, because a busy server sends nothing by itself."""
     assert at(timeline(begun(patience=Patience(timeout_seconds)), 10.0), Ping)[0] < timeout_seconds
 
 
-# --- nobody who could -------------------------------------------------------------------------------------------------
+# --- no workers ---------------------------------------------------------------------------------------------------
 
 
-def test_a_server_without_workers_is_told_of_and_then_given_up(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_server_without_workers_is_logged_and_then_an_error(caplog: pytest.LogCaptureFixture) -> None:
     def troubled(message: Message) -> Message | None:
         return Pong("no worker is connected: start v2v-worker") if isinstance(message, Ping) else None
 
@@ -163,7 +163,7 @@ def timeline_raising(talk: Conversation, answer: Callable[[Message], Message | N
             talk.handle_message(reply, [], now)
 
 
-def test_trouble_that_passes_is_forgotten() -> None:
+def test_a_server_whose_workers_return_is_not_an_error() -> None:
     pings = 0
 
     def sometimes(message: Message) -> Message | None:
@@ -194,7 +194,7 @@ def test_a_time_in_which_this_process_was_stopped_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("name", ["timeout_seconds", "ping_seconds", "rewant_seconds"])
-def test_times_are_positive(name: str) -> None:
+def test_timeouts_must_be_positive(name: str) -> None:
     with pytest.raises(UsageError, match=name):
         Patience(**{name: 0.0})
 
@@ -203,7 +203,7 @@ def test_times_are_positive(name: str) -> None:
 
 
 class Queues:
-    """A link to a server in this thread, whose answers are lost until ``silent_until``; waiting passes the time."""
+    """Link to a server in this thread. Its answers are lost until ``silent_until``; waiting advances the clock."""
 
     def __init__(self, silent_until: float = 0.0) -> None:
         self.now = 0.0
@@ -253,8 +253,8 @@ def sample(index: int) -> Frames:
 
 
 @pytest.mark.parametrize(("silent_until", "made_anew"), [(0.0, 0), (25.0, 2)])
-def test_a_connection_works_over_queues_too(silent_until: float, made_anew: int) -> None:
-    """Without a socket or a thread; a silence of twenty-five seconds takes no time."""
+def test_a_connection_works_over_queues(silent_until: float, made_anew: int) -> None:
+    """It needs no socket and no thread, so a silence of 25 s takes no time."""
     link = Queues(silent_until)
     connection = Connection("tcp://x:1", HELLO, 0, patience=PATIENCE, clock=lambda: link.now, transport=lambda _: link)
     connection.open()
@@ -266,7 +266,7 @@ def test_a_connection_works_over_queues_too(silent_until: float, made_anew: int)
     assert link.left == 2  # to learn the layout, and at the end
 
 
-def test_a_wait_is_told_once_a_second_and_at_the_end() -> None:
+def test_waiting_time_is_reported_once_a_second_and_at_the_end() -> None:
     talk = begun()
     said(talk)
     for tenth in range(1, 35):
@@ -278,7 +278,7 @@ def test_a_wait_is_told_once_a_second_and_at_the_end() -> None:
     assert said(talk) == [Goodbye(pytest.approx(3.4))]
 
 
-def test_a_session_that_is_opened_again_begins_to_wait_anew() -> None:
+def test_a_reopened_session_restarts_the_waiting_time() -> None:
     talk = begun()
     talk.record_wait(5.0, 5.0)
     talk.handle_message(FORGOTTEN, [], 6.0)

@@ -26,7 +26,7 @@ def run(server, tmp_path, *flags):
     return loadtest.main(arguments), file
 
 
-def test_a_run_over_several_epochs_is_measured_and_faultless(server, tmp_path, capsys):
+def test_a_run_over_several_epochs_is_measured_without_faults(server, tmp_path, capsys):
     status, file = run(server, tmp_path, "--warmup-batches", "3", "--trainer-ms", "1", "--arrays", "voxels")
     assert status == 0
     (record,) = json.loads(file.read_text())
@@ -42,7 +42,7 @@ def test_a_run_over_several_epochs_is_measured_and_faultless(server, tmp_path, c
     assert "batch/s" in text
 
 
-def test_a_consumer_that_skips_batches_is_found_out(server, tmp_path, monkeypatch):
+def test_skipped_batches_are_detected(server, tmp_path, monkeypatch):
     class Skipping(loadtest.V2VStreamDataset):
         def __iter__(self):
             return (batch for number, batch in enumerate(super().__iter__()) if number != 0)
@@ -53,7 +53,7 @@ def test_a_consumer_that_skips_batches_is_found_out(server, tmp_path, monkeypatc
     assert json.loads(file.read_text())[0]["lost"] > 0
 
 
-def test_a_ctrl_c_ends_the_measurement_with_what_there_is(server, tmp_path, monkeypatch, capsys):
+def test_an_interrupt_ends_the_measurement_and_keeps_its_results(server, tmp_path, monkeypatch, capsys):
     class Interrupted(loadtest.V2VStreamDataset):
         def __iter__(self):
             for batch in super().__iter__():
@@ -92,7 +92,7 @@ def test_wrong_usage_is_one_line_and_status_2(server, tmp_path, capsys, flags, w
     assert error.count("\n") == 1
 
 
-def test_a_server_of_its_own_has_the_recipe_that_is_asked_for(server, monkeypatch):
+def test_a_local_server_gets_the_requested_recipe(server, monkeypatch):
     started = []
 
     class Local:

@@ -18,7 +18,7 @@ def counts(check):
     return check.lost, check.duplicated, check.foreign, check.out_of_order
 
 
-def test_a_faultless_run_over_epochs():
+def test_a_correct_run_over_epochs_has_no_faults():
     check = checked(epochs(3, 4)[:-2])
     assert counts(check) == (0, 0, 0, 0)
     assert check.faultless

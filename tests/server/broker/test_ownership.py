@@ -15,7 +15,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Want, Welcome, WorkerHello
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import FromConsumer, Sockets
+from v2v_server.broker.transport import FromConsumer, FromWorker, Sockets
 
 OURS, THEIRS = b"o" * 32, b"t" * 32
 
@@ -77,6 +77,60 @@ def test_another_key_cannot_act_for_a_session_even_with_its_secret() -> None:
 def test_a_secret_that_is_too_long_is_refused() -> None:
     at = peers()
     assert "65 bytes; the limit is 64" in refused(at.consumer_says(b"c", hello(b"x" * 65)), ErrorCode.MALFORMED)
+    assert "65 bytes; the limit is 64" in enter(at, b"w", "worker", b"x" * 65)
+
+
+def enter(at: Peers, identity: bytes, name: str, secret: bytes, user: str = "") -> str:
+    """Say hello as a worker; return the text of the denial, empty if there is none."""
+    at.leases[identity] = deque()
+    hello = WorkerHello(name, NUMERICS_VERSION, 2, secret=secret)
+    at.carry_out(at.dispatcher.from_worker(identity, encode(hello), at.now, user))
+    last = at.told.pop(identity, [Ping()])[-1]
+    return last.text if isinstance(last, Denied) else ""
+
+
+@pytest.mark.parametrize(
+    ("identity", "secret", "user"),
+    [(b"2", THEIRS, "gpu-1"), (b"2", b"", "gpu-1"), (b"2", OURS, "gpu-2"), (b"1", THEIRS, "gpu-1")],
+)
+def test_a_worker_that_knows_the_name_of_another_gets_none_of_its_work(
+    identity: bytes, secret: bytes, user: str
+) -> None:
+    at = peers()
+    assert enter(at, b"1", "worker", OURS, "gpu-1") == ""
+    at.consumer_says(b"c", hello(OURS))
+    at.want(0, 1)
+    held = list(at.leases[b"1"])
+    assert "'worker' is connected; both must be unique" in enter(at, identity, "worker", secret, user)
+    at.leases[b"1"] = deque(held)
+    at.work_off(b"1")
+    assert at.samples() == [(0, 0), (0, 1)]
+    assert at.dispatcher.counters.returned_leases == 0
+
+
+def test_the_secret_of_a_worker_moves_its_name_and_returns_its_leases() -> None:
+    at = peers()
+    enter(at, b"1", "worker", OURS)
+    at.consumer_says(b"c", hello(OURS))
+    at.want(0, 1)
+    assert enter(at, b"2", "worker", OURS) == ""
+    assert at.dispatcher.registry.identities() == [b"2"]
+    assert at.dispatcher.registry.named("worker") == b"2"
+    assert len(at.leases[b"2"]) == 2
+    at.work_off(b"2")
+    assert at.samples() == [(0, 0), (0, 1)]
+
+
+def test_no_key_holds_the_name_of_a_worker_of_this_host() -> None:
+    at = peers()
+    assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") == ""
+    assert enter(at, b"2", "w1-0.1", OURS) == ""
+    assert at.dispatcher.registry.identities() == [b"2"]
+    assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") != ""
+
+
+def test_a_name_that_is_too_long_is_refused() -> None:
+    assert "256 bytes; the limit is 255" in enter(peers(), b"w", "x" * 256, OURS)
 
 
 def test_a_peer_at_the_wrong_port_is_told() -> None:
@@ -98,7 +152,11 @@ def sockets() -> Iterator[Sockets]:
         yield made
 
 
-def test_a_second_connection_with_a_routing_id_in_use_gets_nothing(sockets: Sockets) -> None:
+@pytest.mark.parametrize("side", ["consumer", "worker"])
+def test_a_second_connection_with_a_routing_id_in_use_gets_nothing(sockets: Sockets, side: str) -> None:
+    kind, to = (FromConsumer, ToConsumer) if side == "consumer" else (FromWorker, ToWorker)
+    address = sockets.address if side == "consumer" else sockets.worker_address
+
     def dealer(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
         socket = context.socket(zmq.DEALER)
         socket.setsockopt(zmq.ROUTING_ID, b"\x01honest")
@@ -109,20 +167,20 @@ def test_a_second_connection_with_a_routing_id_in_use_gets_nothing(sockets: Sock
     def arrived() -> list[Message]:
         """Return what has come under the honest routing id, once something has."""
         while True:
-            came = [each for each in sockets.receive(1.0) if isinstance(each, FromConsumer)]
+            came = [each for each in sockets.receive(1.0) if isinstance(each, kind)]
             if honestly := [decode(each.frames[0]) for each in came if each.identity == b"\x01honest"]:
                 return honestly
 
     with zmq.Context() as context, dealer(context) as honest:
-        honest.connect(sockets.address)
+        honest.connect(address)
         honest.send_multipart(encode(Ping()))
         assert arrived() == [Ping()]
         with dealer(context) as thief, thief.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED) as shaken_hands:
-            thief.connect(sockets.address)
+            thief.connect(address)
             assert shaken_hands.poll(30_000)
             for _ in range(3):
                 thief.send_multipart(encode(Goodbye(0.0)))
-            assert sockets.send(ToConsumer(b"\x01honest", [b"sample"]))
+            assert sockets.send(to(b"\x01honest", [b"sample"]))
             assert honest.recv() == b"sample"
             honest.send_multipart(encode(Ping()))
             assert arrived() == [Ping()]

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import stat
 import subprocess
 import sys
 import threading
@@ -18,7 +19,6 @@ import pytest
 from hypothesis import given, settings
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.broker import quarantine as quarantine_module
 from v2v_server.broker.quarantine import (
     VERDICTS_PER_VIDEO,
     Quarantine,
@@ -269,7 +269,7 @@ def test_a_file_that_was_replaced_gives_no_number_twice(tmp_path: Path, keep: in
     file.unlink()
     write(file, *[verdict("a.mp4")][:keep], verdict("other.mp4"))
     before = file.read_bytes()
-    with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, and not the 2 known here"):
+    with pytest.raises(CorpusError, match=rf"it has {keep + 1} lines, which do not start with the 2 lines read before"):
         write_entry(file, verdict("c.mp4"), known)
     assert file.read_bytes() == before
 
@@ -310,14 +310,19 @@ def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
         assert [each.frame for each in lines if each.path == name] == list(range(20))
 
 
-def test_a_lock_that_somebody_keeps_stops_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever may read the file can take a shared lock on it."""
-    monkeypatch.setattr(quarantine_module, "_LONGEST_LOCK_SECONDS", 0.05)
+def test_other_users_cannot_lock_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "q.jsonl"
+    file.touch(0o644)
+    write(file, verdict("a.mp4"))
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
+def test_a_lock_that_another_process_keeps_is_not_waited_for(tmp_path: Path) -> None:
     file = tmp_path / "q.jsonl"
     file.touch()
     with file.open("rb") as reader:
         fcntl.flock(reader, fcntl.LOCK_SH)
-        with pytest.raises(OSError, match="another process has locked it"):
-            write_entry(file, verdict(), Quarantine())
+        with pytest.raises(OSError, match="another process keeps it locked"):
+            write_entry(file, verdict(), Quarantine(), wait_seconds=0.05)
     assert file.read_bytes() == b""
     assert len(write_entry(file, verdict(), Quarantine())) == 1

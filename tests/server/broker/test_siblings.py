@@ -82,7 +82,7 @@ def test_substitutes_are_shared_too() -> None:
 
 def test_a_schedule_needs_the_spacing() -> None:
     videos = corpus(video("a.mp4", frames=30)).videos
-    with pytest.raises(UsageError, match="sibling_spacing = 0: say how many samples"):
+    with pytest.raises(UsageError, match="sibling_spacing = 0: set sibling_spacing to the number"):
         Schedule.of(SequenceTable(videos, Rows.parse("full"), SIBLINGS), SIBLINGS)
 
 

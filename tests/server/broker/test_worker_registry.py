@@ -5,6 +5,8 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.messages import WorkerHello
 from v2v_server.broker.blame import ALONE_AFTER, runs_alone
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
@@ -20,7 +22,10 @@ class Table:
         self.workers = Workers(self.book)
         self.requests = 0
         for name, offered in credit.items():
-            self.workers.add(name.encode(), offered, 0.0)
+            self.add(name.encode(), offered, 0.0)
+
+    def add(self, identity: bytes, credit: int, now: float) -> None:
+        self.workers.add(identity, WorkerHello(identity.decode(), NUMERICS_VERSION, credit), now)
 
     def load(self, name: str, *, deaths: int = 0, session: bytes = b"c", now: float = 0.0) -> int:
         self.requests += 1
@@ -51,7 +56,7 @@ def test_credit_is_at_least_one_and_limited() -> None:
 def test_nobody_is_there_at_first_and_who_is_removed_is_gone() -> None:
     table = Table()
     assert (len(table.workers), table.next(), table.workers.for_lone_request()) == (0, None, None)
-    table.workers.add(b"a", 1, 0.0)
+    table.add(b"a", 1, 0.0)
     assert (len(table.workers), b"a" in table.workers, table.workers.identities()) == (1, True, [b"a"])
     table.workers.remove(b"a")
     table.workers.remove(b"a")
@@ -77,12 +82,12 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
     """The table looks only at workers whose load has changed: none is ever forgotten, nor kept in mind twice."""
     table, out = Table(), []
     for number in range(4):
-        table.workers.add(f"w{number}".encode(), 1 + number, 0.0)
+        table.add(f"w{number}".encode(), 1 + number, 0.0)
     for what, which, how in moves:
         name, session = f"w{which}", b"cd"[how % 2 :][:1]
         identity = name.encode()
         if what == "add" and identity not in table.workers:
-            table.workers.add(identity, 1 + how, 0.0)
+            table.add(identity, 1 + how, 0.0)
         elif what == "remove":
             table.workers.remove(identity)
             table.book.lost(identity)
@@ -122,7 +127,7 @@ def test_those_who_came_and_went_are_not_kept_in_mind() -> None:
     table = Table(**{f"a{number}": 2 for number in range(3)})
     for number in range(2000):
         name = f"b{number}".encode()
-        table.workers.add(name, 2, 0.0)
+        table.add(name, 2, 0.0)
         assert table.next() == b"a0"
         table.workers.remove(name)
     assert table.next() == b"a0"
@@ -218,7 +223,7 @@ def test_who_rests_gets_nothing_until_it_wakes() -> None:
     # Another process of that name has not failed.
     table.workers.rest(b"a", 20.0, "a.mp4: not there")
     table.workers.remove(b"a")
-    table.workers.add(b"a", 2, 20.0)
+    table.add(b"a", 2, 20.0)
     assert table.next() == b"a"
 
 
@@ -238,7 +243,7 @@ def test_a_hanging_worker_is_reported_once_and_gets_nothing_more() -> None:
     # It said hello again: another process, from the beginning.
     table.workers.remove(b"a")
     table.book.lost(b"a")
-    table.workers.add(b"a", 4, 100.0)
+    table.add(b"a", 4, 100.0)
     assert table.next() == b"a"
     table.load("a", now=100.0)
     assert table.workers.hanging(100.1 + DEADLINE) == [b"a"]

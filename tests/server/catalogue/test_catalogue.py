@@ -22,6 +22,7 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoC
 from v2v_server.catalogue import catalogue as catalogue_module
 from v2v_server.catalogue import survey as survey_module
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.catalogue.index.file import SCHEMA_VERSION
 from v2v_server.catalogue.manifest import MANIFEST_NAME
 from v2v_server.catalogue.refresh import index_path
 from v2v_server.catalogue.survey import Examine, survey
@@ -415,7 +416,7 @@ def test_a_full_disk(corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPat
     assert "full" in catalogue.notes[0]
 
 
-def test_an_index_of_another_version_is_made_anew(corpus: Path, opener: Opener) -> None:
+def test_an_index_of_another_version_is_replaced_with_a_note(corpus: Path, opener: Opener) -> None:
     opener(corpus).close()
     path = next(opener.cache.iterdir())
     database = sqlite3.connect(path)
@@ -423,21 +424,10 @@ def test_an_index_of_another_version_is_made_anew(corpus: Path, opener: Opener) 
     database.execute("PRAGMA user_version = 999")
     database.commit()
     database.close()
-    assert opener(corpus).notes == ()
+    (note,) = opener(corpus).notes
+    assert f"(version 999, this one has {SCHEMA_VERSION}): every video was probed again" in note
     assert opener(corpus).notes == ()
     assert opener.probed == [3, 3, 0]
-
-
-def test_what_version_3_refused_is_probed_again_and_the_rest_is_kept(corpus: Path, opener: Opener) -> None:
-    opener(corpus).close()
-    path = next(opener.cache.glob("*.sqlite3"))
-    database = sqlite3.connect(path)
-    database.execute("UPDATE video SET problem = 'refused' WHERE id = 'a.mp4'")
-    database.execute("PRAGMA user_version = 3")
-    database.commit()
-    database.close()
-    assert len(opener(corpus).videos) == 3
-    assert opener.probed == [3, 1]
 
 
 def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -105,7 +106,7 @@ def test_what_the_index_has_is_joined_with_what_was_asked() -> None:
 
 
 @pytest.mark.parametrize("all_usable", [False, True])
-def test_videos_are_the_usable_ones_and_have_the_digest_they_always_had(
+def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_samples(
     records: Records, monkeypatch: pytest.MonkeyPatch, all_usable: bool
 ) -> None:
     monkeypatch.setattr("v2v_server.catalogue.videos.CHUNK", 16)
@@ -122,11 +123,11 @@ def test_videos_are_the_usable_ones_and_have_the_digest_they_always_had(
     assert videos[-1] == videos[len(used) - 1]
     assert videos[:2] == (videos[0], videos[1])
     assert [videos[number].runs for number in (4, 5, 6)] == [(), ((0, 3), (4, 9)), ((0, videos[6].frames),)]
-    sha = hashlib.sha256(f"v2v catalogue 1\n{Rows()}\n".encode())
+    sha = hashlib.sha256(f"v2v catalogue 2\n{Rows()}\n".encode())
     for number, place in enumerate(used):
         is_ = ROWS[place]
-        fields = (
-            is_.id, is_.fingerprint, is_.frames, is_.width_px, is_.height_px, *thresholds.get(number, NO_THRESHOLDS)
-        )  # fmt: skip
+        rate = math.nan if is_.frames_per_second is None else is_.frames_per_second
+        limits = thresholds.get(number, NO_THRESHOLDS)
+        fields = is_.id, is_.fingerprint, is_.frames, is_.width_px, is_.height_px, rate, *limits
         sha.update("\0".join(map(str, fields)).encode() + b"\n")
     assert videos.digest(Rows()) == sha.hexdigest()[:32]

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
+import sqlite3
+import stat
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from v2v_server.catalogue import refresh
 from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.catalogue.index import copy as copy_module
 from v2v_server.catalogue.index import file as file_module
+from v2v_server.catalogue.index.columns import Records
 from v2v_server.catalogue.index.copy import NoCopy, copied, copy_path, read_copy
 from v2v_server.catalogue.index.file import IndexRow, Store
 from v2v_server.catalogue.refresh import index_path
@@ -146,13 +153,10 @@ def test_a_full_disk_costs_the_copy_and_nothing_else(
 
 
 def test_a_folder_that_takes_no_copy_is_no_fault(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(path: Path, *more: object, **options: object) -> None:
+    def refused(path: Path, flags: int) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), path)
 
-    opened = Path.open
-    monkeypatch.setattr(
-        Path, "open", lambda path, mode="r", **more: refused(path) if "w" in mode else opened(path, mode, **more)
-    )
+    monkeypatch.setattr(copy_module, "open_private", refused)
     assert len(facts(corpus.open())[1]) == 40
     assert sorted(os.listdir(corpus.cache)) == [corpus.index.name]
 
@@ -221,6 +225,57 @@ def test_a_small_index_has_no_copy(corpus: Corpus, tmp_path: Path) -> None:
     small = Corpus(tmp_path / "small", count=29)
     small.open().close()
     assert sorted(os.listdir(small.cache)) == [small.index.name]
+
+
+_WHOLE = ["size_bytes", "mtime_ns", "ctime_ns", "frames", "width_px", "height_px", "interlaced"]
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        *((column, value) for column in _WHOLE for value in ("x", b"x", 0.5, "", math.inf)),
+        *((column, value) for column in ("id", "fingerprint", "codec", "problem") for value in (b"x", 0.5)),
+        *((column, value) for column in ("frames", "width_px", "height_px") for value in (-5, 0, 2**40)),
+        *(("frames_per_second", value) for value in ("x", b"x", math.inf, -1.0)),
+        *(("frame_index", value) for value in (5, 0.5, "x")),
+    ],
+)
+def test_a_damaged_record_is_as_good_as_none(tmp_path: Path, column: str, value: object) -> None:
+    """SQLite takes any type in any column."""
+    row = IndexRow("a", 1, 2, 3, "f", 30, 64, 48, 25.0, "h264", frame_index=b"i")
+    with closing(Store(tmp_path / "index")) as store:
+        store.put([row, replace(row, id="b")])
+        (kept,) = [each for each in store.rows() if each[0] == "b"]
+        store._database.execute(f"UPDATE video SET {column} = ? WHERE id = 'a'", (value,))
+        if column in ("id", "fingerprint", "codec", "problem") and isinstance(value, float):
+            assert len(list(store.rows())) == 2  # it has become text
+        else:
+            assert list(store.rows()) == [kept]
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=50))
+def test_damage_costs_a_note_or_nothing(tmp_path: Path, damage: list[tuple[float, int]]) -> None:
+    path = tmp_path / "index"
+    path.unlink(missing_ok=True)
+    with closing(Store(path)) as store:
+        store.put(IndexRow(name, 1, 2, 3, name * 40, 30, 64, 48, 25.0, "h264", frame_index=b"i") for name in "abcd")
+    content = bytearray(path.read_bytes())
+    for place, byte in damage:
+        content[int(place * len(content))] = byte
+    path.write_bytes(content)
+    with suppress(sqlite3.Error, UnicodeDecodeError), closing(Store(path)) as store:
+        records = Records()
+        records.extend(list(store.rows()))
+        for name in "abcd":
+            store.frame_index(name, name * 40)
+
+
+def test_other_users_cannot_lock_an_index_or_its_copy(corpus: Corpus) -> None:
+    corpus.index.chmod(0o644)
+    corpus.open().close()
+    assert copy_path(corpus.index, "columns").exists()
+    assert {stat.S_IMODE(path.stat().st_mode) for path in corpus.cache.iterdir()} == {0o600}
 
 
 def test_a_mark_names_a_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,11 +6,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
+from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.catalogue.files import (
     MOST_PATHS,
     PSEUDO,
@@ -201,3 +204,28 @@ def test_other_endings_are_counted_but_for_those_of_no_videos(tmp_path: Path) ->
     listed = tmp_path / "list.txt"
     listed.write_text("b.264\nc.ASF 5\n")
     assert [entry.id for entry in read_list(listed)] == ["b.264", "c.ASF"]
+
+
+@pytest.mark.parametrize(
+    ("name", "container", "codec"),
+    [
+        ("a.asf", "asf", "wmv2"), ("a.264", "h264", "libx264"), ("a.m2t", "mpegts", "libx264"),
+        ("a.3g2", "3g2", "libx264"), ("a.f4v", "f4v", "libx264"), ("a.divx", "avi", "mpeg4"), ("a.qt", "mov", "mjpeg"),
+        ("a.mp4v", "m4v", "mpeg4"), ("a.m2v", "mpeg2video", "mpeg2video"), ("a.mod", "vob", "mpeg2video"),
+        ("a.dv", "dv", "dvvideo"), ("without_ending", "mp4", "libx264"),
+    ],
+)  # fmt: skip
+def test_a_video_of_another_ending_is_served_where_it_is_named(
+    tmp_path: Path, name: str, container: str, codec: str
+) -> None:
+    """A folder's files with such endings are left out: listing them would change every corpus that has some."""
+    size, pixel_format = ((576, 720), "yuv420p") if codec == "dvvideo" else ((48, 64), "yuv420p")
+    write_clip(
+        tmp_path / name, panned_luma(20, *size), codec=codec, container=container,
+        pixel_format="yuvj420p" if codec == "mjpeg" else pixel_format, full_range=codec == "mjpeg",
+    )  # fmt: skip
+    (tmp_path / "list.txt").write_text(f"{name}\n")
+    sources = [tmp_path / name, tmp_path / "list.txt"] if "." in name else [tmp_path / name]
+    for source in sources:
+        with closing(open_catalogue(source, cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+            assert [video.frames for video in catalogue.videos] == [20]

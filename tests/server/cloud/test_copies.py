@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import multiprocessing
 import pickle
+import stat
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ import pytest
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoChanged, VideoUnreadable
 from v2v_server.cloud import bucket as bucket_module
+from v2v_server.cloud import copies as copies_module
 from v2v_server.cloud.bucket import AccessDenied, Bucket, ObjectGone, StoreFault, is_url
 from v2v_server.cloud.copies import Copies, copies_of
 from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
@@ -92,6 +96,30 @@ def test_a_video_is_fetched_once(store: Path) -> None:
     with made.open_local("a.mp4", mark) as path:
         assert path.stat().st_size == SIZE
     assert [each.name for each in (made.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+
+
+def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(copies_module, "_SLOT_SECONDS", 0.0)
+    made, mark = copies(store), fingerprint(store / "a.mp4")
+    with ExitStack() as held:
+        for number in range(63):
+            lock = held.enter_context((made.folder / PARTIAL / f"{number:02}.lock").open("wb"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        made.fetch("a.mp4", mark)
+        assert made.has("a.mp4", mark)
+        last = held.enter_context((made.folder / PARTIAL / "63.lock").open("wb"))
+        fcntl.flock(last, fcntl.LOCK_EX)
+        with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
+            made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+    made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+
+
+def test_other_users_cannot_lock_a_copy(store: Path) -> None:
+    made = copies(store)
+    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    found = [path for path in made.folder.rglob("*") if path.is_file()]
+    assert {path.suffix for path in found} >= {".mp4", ".lock"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}
 
 
 def test_an_object_that_is_gone_or_changed(store: Path) -> None:

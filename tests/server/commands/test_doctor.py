@@ -1,8 +1,9 @@
-"""`v2v-doctor` finds what is in the way, says what to change, and its status tells."""
+"""`v2v-doctor` finds problems, says what to change, and reports them in its exit status."""
 
 from __future__ import annotations
 
 import socket
+import struct
 import subprocess
 import sys
 from importlib import metadata
@@ -40,7 +41,7 @@ def test_nothing_is_in_the_way_where_tests_run(capsys: pytest.CaptureFixture[str
     assert status == 0
     assert "is free" in said
     assert f"\n{BAD} " not in said
-    assert said.endswith("nothing is in the way\n")
+    assert said.endswith("no problems found\n")
 
 
 def test_a_port_that_is_taken_is_worth_a_note(capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,7 +63,7 @@ def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str
     flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe)]
     status, said = told(capsys, *flags)
     assert status == 0
-    assert "2 videos: 2 h264" in said
+    assert "2 videos: 2 h264; 33 frames that decode" in said
     assert "1 files cannot be used: broken.mp4" in said
     assert "1 videos give no sequence" in said
     assert "voxels_per_clip=2 admits" in said
@@ -111,7 +112,7 @@ def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys
     status, said = told(capsys, "--port", str(free_port()))
     assert status == 0
     assert "torch" not in said
-    assert "nothing is in the way" in said
+    assert "no problems found" in said
 
 
 @pytest.mark.parametrize(("longest", "said"), [(0, ""), (1, "leave the short ones out"), (30, "voxels_per_clip=30")])
@@ -155,3 +156,32 @@ def test_it_starts_where_nothing_else_is_installed() -> None:
     program = f"import sys, v2v_server.commands.doctor\nprint(*sorted(set({others!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.split() == []
+
+
+def test_how_videos_are_stored_is_said_where_it_matters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clip(tmp_path / "plain.mp4", panned_luma(60, 140, 160))
+    write_clip(tmp_path / "raw.h264", panned_luma(60, 140, 160), b_frames=2)
+    with_clean_aperture(tmp_path / "plain.mp4", tmp_path / "framed.mp4", 150, 130)
+    with_clean_aperture(tmp_path / "plain.mp4", tmp_path / "whole.mp4", 160, 140)
+    (tmp_path / "recipe.yaml").write_text("voxels_per_clip: 4\n")
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(tmp_path / "recipe.yaml")]
+    status, said = told(capsys, *flags)
+    assert status == 0
+    assert "1 videos have no time stamps that name their frames (raw.h264)" in said
+    assert "run v2v-prepare once" in said
+    assert "1 videos state a clean aperture" in said
+    assert "(framed.mp4: 150x130 px): it is not applied" in said
+
+
+def with_clean_aperture(source: Path, target: Path, width: int, height: int) -> None:
+    """Add a clap box to an MP4 file whose moov box comes last."""
+    content = bytearray(source.read_bytes())
+    clap = struct.pack(">I4s8I", 40, b"clap", width, 1, height, 1, 0, 1, 0, 1)
+    moov = content.index(b"moov")
+    at = content.index(b"avcC", moov) - 4
+    content[at:at] = clap
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"):
+        begin = content.index(name, moov) - 4
+        (size,) = struct.unpack_from(">I", content, begin)
+        struct.pack_into(">I", content, begin, size + len(clap))
+    target.write_bytes(content)

@@ -35,7 +35,7 @@ def fill(corpus: Path, *frames: int) -> Path:
 
 def test_nothing_is_in_quarantine_at_first(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(corpus)
-    assert capsys.readouterr().out.startswith("snapshot 0 holds 0 verdicts (")
+    assert capsys.readouterr().out.startswith("snapshot 0 holds 0 entries (")
     assert not (corpus.parent / "cache").exists()
 
 
@@ -51,7 +51,7 @@ def test_verdicts_are_listed_with_whether_they_hold(corpus: Path, capsys: pytest
     assert second.startswith("not now   snapshot 2 (")
     assert second.endswith("): cleared")
     assert third == "in force  snapshot 3 " + said.format(80)
-    assert last == f"snapshot 3 holds 1 verdicts ({file})"
+    assert last == f"snapshot 3 holds 1 entries ({file})"
 
 
 def test_clearing_begins_a_snapshot_only_when_there_is_something_to_clear(
@@ -61,7 +61,7 @@ def test_clearing_begins_a_snapshot_only_when_there_is_something_to_clear(
     file = fill(corpus, 40, 80)
     for _ in range(2):
         run(corpus, "--clear")
-        assert capsys.readouterr().out.splitlines()[-1].startswith("snapshot 3 holds 0 verdicts")
+        assert capsys.readouterr().out.splitlines()[-1].startswith("snapshot 3 holds 0 entries")
     quarantine = read_quarantine(file)
     assert [len(quarantine.entries(number)) for number in range(4)] == [0, 1, 2, 0]
 
@@ -96,7 +96,7 @@ def test_the_corpus_is_found_as_a_server_finds_it(
     (corpus / "list.txt").touch()
     path = corpus / {"folder": ".", "video": "v.mp4", "list": "list.txt"}[source]
     main(["--videos", str(path), "--cache-dir", str(corpus.parent / "cache")])
-    assert "snapshot 1 holds 1 verdicts" in capsys.readouterr().out
+    assert "snapshot 1 holds 1 entries" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_failures_end_in_one_line_and_a_status(
     assert captured.err.startswith("v2v-quarantine: ")
     assert text in captured.err
     assert len(captured.err.splitlines()) == 1
-    assert ("snapshot 1 holds 1 verdicts" in captured.out) == (damage == "json is a folder")
+    assert ("snapshot 1 holds 1 entries" in captured.out) == (damage == "json is a folder")
     if damage == "unwritable":
         monkeypatch.undo()
         assert read_quarantine(file).latest == 1

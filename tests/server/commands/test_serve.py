@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from tests.clips import panned_luma, write_clip
+from tests.server.page.test_child import free_port
+from tests.waiting import until
 from v2v_server.commands import serve as command
 from v2v_server.config import ServeConfig
 
@@ -27,6 +32,28 @@ def test_an_error_that_ends_it_is_an_object_too_where_programs_read(
 ) -> None:
     missing = str(tmp_path / "missing")
     assert command.main(["--videos", missing, "--log-format", "json"]) == command.main(["--videos", missing])
-    as_object, for_people, again = capsys.readouterr().err.splitlines()
+    as_object, for_people = capsys.readouterr().err.splitlines()
     assert (json.loads(as_object)["level"], json.loads(as_object)["text"] in for_people) == ("error", True)
-    assert again == for_people
+
+
+def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
+    """Started with what gives most lines: refused files, a page, a flag that is questioned; and ended by a signal."""
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    for name, frames in ("long", 60), ("short", 5):
+        write_clip(videos / f"{name}.mp4", panned_luma(frames, 72, 96))
+    (videos / "damaged.mp4").write_bytes(b"no video")
+    (videos / "other.foo").write_bytes(b"")
+    flags = [
+        *("--videos", str(videos), "--bind", "tcp://127.0.0.1:*", "--workers", "0", "--log-format", "json"),
+        *("--page", str(free_port()), "--cache-dir", str(tmp_path / "cache"), "--port-file", str(tmp_path / "port")),
+        *("--set", "crop_height_px=48", "--set", "crop_width_px=64", "--set", "voxels_per_clip=4"),
+    ]
+    command_line = [sys.executable, "-m", "v2v_server.commands.serve", *flags]
+    with subprocess.Popen(command_line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
+        until((tmp_path / "port").exists)
+        server.terminate()
+        lines = server.communicate()[0].splitlines()
+    texts = [json.loads(line)["text"] for line in lines]
+    for said in ("have endings", "short.mp4: 5 frames", "damaged.mp4: ", "page: http", "ready: ", "the end"):
+        assert [text for text in texts if said in text], said

@@ -9,6 +9,7 @@ import pytest
 from tests.server.console.watched import service
 from tests.server.peers import answer_to, peers
 from v2v_protocol.messages import Goodbye, Result, Want
+from v2v_server.broker.leases import Stall
 from v2v_server.console.waiting import Shares, who_waits
 
 FULL = {"seconds": 10.0, "consumers": 0.8, "idle": 0.02, "broker": 0.2}
@@ -25,6 +26,9 @@ CASES: list[tuple[dict[str, Any], str, str, str]] = [
     ({"decode": 0.2, "simulate": 0.2, "handover": 0.5}, "handover", "which hand over 50% of theirs", "shared memory"),
     ({"broker": 0.95, "idle": 0.5, "decode": 0.4}, "broker", "busy 95% of its", "two servers"),
     ({"broker": 0.95, "idle": 0.0, "decode": 0.4}, "broker", "busy 95% of its", "two servers"),
+    ({"decode": 0.9, "queued": 0.75, "cores": 0.15}, "cores", "75% of theirs for a core and get 0.15 of a core each",
+     "more workers on this host would not help"),
+    ({"decode": 0.9, "queued": 0.3, "cores": 0.6}, "decode", "which decode 90% of theirs", "start more workers"),
     ({"idle": 0.5, "decode": 0.4}, "way", "although workers are idle 50%", "network"),
 ]  # fmt: skip
 
@@ -61,6 +65,7 @@ def test_the_shares_are_of_the_time_that_was_noted() -> None:
         lease = at.leases[b"busy"].popleft()
         result = Result(lease.lease, 0, decode_seconds=0.25, simulate_seconds=0.5, handover_seconds=0.125)
         at.worker_says(b"busy", result, *answer_to(lease))
+        at.dispatcher.worker_stalled(b"busy", Stall(queued_seconds=0.5))
         waited = at.dispatcher.sessions.get(b"waits").waited_seconds + 0.5  # type: ignore[union-attr]
         at.consumer_says(b"waits", Want(0, (lease.indices[0] + 1,), waited_seconds=waited))
     shares = watched.state().waiting.shares
@@ -69,6 +74,7 @@ def test_the_shares_are_of_the_time_that_was_noted() -> None:
     assert shares.broker == pytest.approx(0.4, abs=0.01)
     assert (shares.decode, shares.simulate, shares.handover) == pytest.approx((0.1, 0.2, 0.05))
     assert shares.idle == pytest.approx((20.0 - 8.0) / 20.0)
+    assert (shares.queued, shares.cores) == pytest.approx((0.2, 0.04))
 
 
 def test_what_was_long_ago_counts_no_more() -> None:

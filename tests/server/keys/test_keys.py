@@ -143,7 +143,7 @@ def test_a_revoked_key_loses_its_open_connection(
     other.send(encode(Ping()))
     assert len(arrivals(sockets, 1.5)) == 1  # the other's
     said = refusal(link)
-    assert "refuses consumer key 'gpu1': it was revoked" in said
+    assert "refuses consumer key 'gpu1': the key was revoked" in said
     assert not other.has_reconnected()
 
 
@@ -215,9 +215,9 @@ def test_a_folder_that_others_may_write_to_is_refused(folder: KeyFolder, which: 
 def test_what_is_written_as_no_key_is_none(folder: KeyFolder, tmp_path: Path, half: str | None) -> None:
     for file, name in ((tmp_path / "gpu1.key", "secret"), (folder.path / "server.key", "secret")):
         file.write_text(json.dumps(json.loads(file.read_text()) | {name: half}))
-    with pytest.raises(KeyRefused, match=r"gpu1.key is no key file"):
+    with pytest.raises(KeyRefused, match=r"gpu1.key is not a key file"):
         read_key(tmp_path / "gpu1.key")
-    with pytest.raises(KeyRefused, match=r"server.key is no key file"):
+    with pytest.raises(KeyRefused, match=r"server.key is not a key file"):
         folder.server_keys()
 
 
@@ -290,7 +290,7 @@ def test_what_is_no_key_file(content: str, tmp_path: Path) -> None:
     file = tmp_path / "a.key"
     file.write_text(content)
     file.chmod(0o600)
-    with pytest.raises(KeyRefused, match=r"a.key is no key file"):
+    with pytest.raises(KeyRefused, match=r"a.key is not a key file"):
         read_key(file)
 
 

@@ -72,7 +72,7 @@ def digests(said: str) -> list[str]:
 
 
 def looked_into(said: str) -> int:
-    return int(re.findall(r"looked into (\d+) files", said)[-1])
+    return int(re.findall(r"probed (\d+) files", said)[-1])
 
 
 @pytest.mark.slow
@@ -169,9 +169,9 @@ def test_parts_that_cannot_be_put_together_are_said(tmp_path: Path, run: Run) ->
     [
         (["--shard", "0/3", "--out", "parts"], "give NUMBER/COUNT from 1/COUNT"),
         (["--shard", "4/3", "--out", "parts"], "give NUMBER/COUNT from 1/COUNT"),
-        (["--shard", "1/3"], "--shard K/N and --out DIR go together"),
-        (["--out", "parts"], "--shard K/N and --out DIR go together"),
-        (["--shard", "1/3", "--out", "parts", "--merge", "parts"], "one at a time"),
+        (["--shard", "1/3"], "--shard K/N needs --out DIR"),
+        (["--out", "parts"], "--shard K/N needs --out DIR"),
+        (["--shard", "1/3", "--out", "parts", "--merge", "parts"], "give one of them"),
         (["--workers", "0"], "give at least 1"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import av
@@ -88,13 +89,15 @@ def test_the_command_compares_recipes_on_one_clip(
     )
     assert seen == [("paper", 0), ("noise-free", 0), ("own", 0)]
     assert np.asarray(Pictures.open(out)).ndim == 3
-    assert capsys.readouterr().out == f"{out}: 3 cameras\n"
+    chosen, said = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"seed \d+: chosen because their crops show motion; --seed 0 takes what chance gives", chosen)
+    assert said == f"{out}: 3 cameras"
 
 
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--out", "p.bmp"], "--out p.bmp: give a name that ends in .png, .mp4, .gif, .html"),
+        (["--out", "p.bmp"], "--out p.bmp: unknown ending; give a name that ends in .png, .mp4, .gif, .html"),
         (["--out", "p.png", "--seeds", "0"], "--seeds 0: give 1 to 32"),
         (["--out", "p.png", "--moments", "99"], "--moments 99: give 1 to 32"),
         (["--out", "nowhere/p.png"], "--out nowhere/p.png: there is no folder nowhere"),
@@ -122,7 +125,7 @@ def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
 
 
 def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("v2v_server.offline.preview._TOLD_SECONDS", 0.0)
+    monkeypatch.setattr("v2v_server.offline.preview._REPORT_SECONDS", 0.0)
     said: list[str] = []
     shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
     preview(
@@ -139,17 +142,19 @@ def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypat
     assert len(said) == 15
 
 
-def _shares(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: dict[str, object]) -> list[float]:
+def _shares(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: dict[str, object]
+) -> list[float | None]:
     cameras: list[Camera] = []
 
-    def keep(shown: list[Camera], title: str, *, moments: int) -> npt.NDArray[np.uint8]:
+    def keep(shown: list[Camera], title: str, *, moments: int, whole: Camera) -> npt.NDArray[np.uint8]:
         cameras.extend(shown)
         return np.zeros((8, 8, 3), np.uint8)
 
     monkeypatch.setattr("v2v_server.offline.preview.draw_sheet", keep)
     shots = [Shot("a", TINY | recipe, 0)]
     preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
-    return [camera.noise_share for camera in cameras if camera.noise_share is not None]
+    return [camera.noise_share([0, 1, 2]) for camera in cameras]
 
 
 def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

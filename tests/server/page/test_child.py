@@ -76,10 +76,10 @@ def test_a_package_that_is_missing_is_said_with_its_extra(monkeypatch: pytest.Mo
 
 
 def test_a_page_that_others_can_reach_is_typed_out() -> None:
-    with pytest.raises(UsageError, match="the page asks nobody for a key"):
+    with pytest.raises(UsageError, match="the page requires no key"):
         ServeConfig(videos="a", page=5580, page_host="0.0.0.0")
     # Keys are for consumers and workers; a browser has none.
-    with pytest.raises(UsageError, match="the page asks nobody for a key"):
+    with pytest.raises(UsageError, match="the page requires no key"):
         ServeConfig(videos="a", page=5580, page_host="0.0.0.0", keys="keys/")
     assert ServeConfig(videos="a", page=5580, page_host="0.0.0.0", insecure=True).page == 5580
     assert ServeConfig(videos="a", page_host="0.0.0.0").page == 0
@@ -111,9 +111,7 @@ def test_a_process_that_ends_is_said_and_started_again_ever_more_slowly(monkeypa
         now += 0.5
     page.stop()
     assert started == [0.0, 1.5, 4.0, 8.5, 17.0]
-    assert said[0] == (
-        "the page's process was ended by SIGKILL; samples are not affected, and it is started again in 1 s"
-    )
+    assert said[0] == ("the page's process was ended by SIGKILL; samples are not affected; it is restarted in 1 s")
     assert page.watch(now) == []
 
 

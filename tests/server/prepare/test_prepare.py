@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
@@ -280,10 +282,10 @@ def test_refused_places(source: Path, prepared: tuple[Path, Report], tmp_path: P
     corpus.mkdir()
     shutil.copy(source / "b.mp4", corpus)
     for target in (corpus, corpus / "inside", tmp_path):
-        with pytest.raises(CorpusError, match="in one another"):
+        with pytest.raises(CorpusError, match="overlap; choose a destination outside the source"):
             run(corpus, target)
     (tmp_path / "alias").symlink_to(corpus)
-    with pytest.raises(CorpusError, match="in one another"):
+    with pytest.raises(CorpusError, match="overlap; choose a destination outside the source"):
         run(corpus, tmp_path / "alias" / "inside")
     assert sorted(path.name for path in corpus.rglob("*")) == ["b.mp4"]
     (tmp_path / "foreign").mkdir()
@@ -314,7 +316,7 @@ def test_one_video_may_be_prepared_in_its_own_folder(
     (films / "list.txt").write_text("b.mp4\n")
     for place, target in ((films / "b.mp4", films), (films / "b.mp4", tmp_path), (films / "list.txt", films / "more")):
         assert prepare_main([str(place), str(target), *more]) == 2
-        assert "in one another" in capsys.readouterr().err
+        assert "overlap; choose a destination outside the source" in capsys.readouterr().err
     (films / "list.txt").unlink()
     assert snapshot(films) == before
     with pytest.raises(CorpusError, match="prepared is a prepared folder"):  # and the whole is no corpus unnoticed
@@ -345,7 +347,7 @@ def test_other_settings_need_another_folder(source: Path, prepared: tuple[Path, 
     for encoding, rows in ((Encoding.of("h264", quality=20, gop=12), "top:0.54"), (H264, "full")):
         with pytest.raises(
             CorpusError,
-            match=r"was prepared with .*which its 4 prepared videos are not; choose another folder, or delete",
+            match=r"holds 4 videos prepared with .* is requested; choose another folder, or delete",
         ):
             run(source, prepared[0], encoding, rows)
 
@@ -386,10 +388,28 @@ def test_a_manifest_that_makes_no_sense(prepared: tuple[Path, Report], tmp_path:
         (f"{header}\n{json.dumps(video | {'id': '../x.mp4'})}\n", "line 2.*leads out"),
         (f"{header}\n{json.dumps(video | {'frames': 0})}\n", "0 frames"),
         (f"{header}\n{json.dumps(video | {'colour': 1})}\n", "unknown fields colour"),
+        (f"{header}\n{json.dumps({'id': 'a.mp4'})}\n", "line 2: field 'source_fingerprint' is missing"),
+        (f"{header}\n{json.dumps(video | {'fingerprint': 5})}\n", "line 2: fingerprint = 5: expected str"),
+        (f"{header}\n{json.dumps(video | {'psnr_db': 'x'})}\n", r"psnr_db = 'x': expected float \| None"),
+        (f"{header}\n{json.dumps(video | {'frames_per_second': float('nan')})}\n", "frames_per_second = nan"),
+        (f"{json.dumps(json.loads(header) | {'rows': [1]})}\n", r"line 1: rows = \[1\]: expected str"),
     ):
         (tmp_path / MANIFEST_NAME).write_text(text)
         with pytest.raises(CorpusError, match=complaint):
             read_manifest(tmp_path)
+    fields = st.sampled_from([*json.loads(header), *video])
+    values = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.integers()) | st.just({})
+
+    @given(st.integers(1, 2), fields, values)
+    @settings(max_examples=300, suppress_health_check=[HealthCheck.differing_executors])
+    def any_value_is_taken_or_refused_in_words(line: int, field: str, value: object) -> None:
+        written = [json.loads(header), dict(video)]
+        written[line - 1][field] = value
+        (tmp_path / MANIFEST_NAME).write_text("".join(json.dumps(each) + "\n" for each in written))
+        with suppress(CorpusError):
+            read_manifest(tmp_path)
+
+    any_value_is_taken_or_refused_in_words()
     (tmp_path / MANIFEST_NAME).write_text(f"{header}\n{lines[0]}\n{lines[1][:20]}")
     assert list(read_manifest(tmp_path).videos) == [video["id"]]
 

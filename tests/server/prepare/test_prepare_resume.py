@@ -187,7 +187,7 @@ def test_what_is_cut_off_forgets_nothing(source: Path, tmp_path: Path) -> None:
     assert [replace(record, scene="") for _, record in sorted(records.items())] == list(first.videos)
     last = run(source, out, scene=True)
     assert (last.kept, last.looked_at, last.complete) == (1, 4, True)
-    assert "4 were prepared earlier: only the statistics" in summary(last, H264, 0.0)[1]
+    assert "4 were prepared earlier; only statistics" in summary(last, H264, 0.0)[1]
     assert inodes(out) == before
 
 
@@ -234,7 +234,7 @@ def test_ctrl_c_says_that_the_same_command_goes_on(
 
     monkeypatch.setattr("v2v_server.prepare.prepare.prepare", interrupted)
     assert main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"]) == 130
-    assert capsys.readouterr().err == "v2v-prepare: interrupted; the same command goes on from here\n"
+    assert capsys.readouterr().err == "v2v-prepare: interrupted; run the same command to continue\n"
 
 
 def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
@@ -377,7 +377,7 @@ def test_command_line(
     assert "2 of 2 videos prepared as lossless dense" in capsys.readouterr().out
     for arguments, status, message in (
         ([str(source), str(out), *settings, "--floor", "99"], 1, "below the floor of 99 dB"),
-        ([str(source), str(source / "in")], 2, "in one another"),
+        ([str(source), str(source / "in")], 2, "overlap; choose a destination outside the source"),
         ([str(source), str(out), "--codec", "h264", "--quality", "99"], 2, "quality 99"),
         ([str(source), str(out), "--workers", "0"], 2, "--workers 0"),
         ([str(tmp_path / "none"), str(out)], 2, "no such folder"),
@@ -390,4 +390,4 @@ def test_command_line(
     assert main([str(source), str(out), *settings]) == 1
     shown = capsys.readouterr().out
     assert "6 of 6 videos prepared" in shown
-    assert "1 cannot be used at all:\n  6.mp4: " in shown
+    assert "1 cannot be used:\n  6.mp4: " in shown

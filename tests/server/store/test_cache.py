@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -95,6 +96,16 @@ def test_first_a_miss_then_hits(source: Path, folder: Path, stride: int) -> None
     assert epoch(source, Cache(folder, 1 << 30, 0), 8, spec) == ["hit"] * 8
     assert used_bytes(folder) == sum(path.stat().st_size for path in pieces(folder))
     assert not list((folder / "partial").iterdir())
+
+
+def test_waits_for_other_processes_are_told_and_its_files_are_private(source: Path, folder: Path) -> None:
+    """Each piece is decoded, then counted: the wait for the lock of the count is no decoding."""
+    cache = Cache(folder, 1 << 30, 0)
+    told: list[bool] = []
+    cache.on_wait = told.append
+    assert epoch(source, cache, 1) == ["miss"]
+    assert told == [True, False] * len(pieces(folder))
+    assert {stat.S_IMODE(path.stat().st_mode) for path in pieces(folder)} == {0o600}
 
 
 def test_siblings_are_read_at_once(source: Path, folder: Path) -> None:

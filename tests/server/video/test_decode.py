@@ -11,6 +11,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 import pytest
+from av.bitstream import BitStreamFilterContext
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -19,6 +20,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video import decode
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import decode_cuts, decode_luma
+from v2v_server.video.frame_index import unseekable
 from v2v_server.video.luma import range_table
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -222,6 +224,28 @@ def test_rotation_metadata(tmp_path: Path, degrees: int, hflip: bool) -> None:
     np.testing.assert_array_equal(window, upright[2:7, 3:14, 7:20])
 
 
+@pytest.mark.parametrize("turn", ["rotate=90", "rotate=180", "flip=horizontal", "flip=vertical"])
+def test_an_orientation_that_is_stated_with_keyframes_only_holds_for_all_frames(tmp_path: Path, turn: str) -> None:
+    plain = write_clip(tmp_path / "plain.mp4", panned_luma(36), b_frames=2, options={"x264-params": "scenecut=0"})
+    path = tmp_path / "turned.mp4"
+    with av.open(str(plain)) as source, av.open(str(path), "w") as output:
+        track = source.streams.video[0]
+        copy = output.add_stream_from_template(track)
+        insert = BitStreamFilterContext(f"h264_metadata=display_orientation=insert:{turn}", track, copy)
+        for packet in source.demux(track):
+            for changed in insert.filter(packet if packet.size else None):
+                changed.stream = copy
+                output.mux(changed)
+    facts, stored = probe(path), decode_luma(plain, probe(plain).index, 0, 36).frames
+    turned = {
+        "rotate=90": np.rot90(stored, axes=(1, 2)), "rotate=180": np.rot90(stored, 2, axes=(1, 2)),
+        "flip=horizontal": stored[:, :, ::-1], "flip=vertical": stored[:, ::-1],
+    }[turn]  # fmt: skip
+    for start, count in ((0, 36), (5, 10), (13, 20), (30, 6)):
+        got = decode_luma(path, facts.index, start, count).frames
+        np.testing.assert_array_equal(got, turned[start : start + count])
+
+
 def test_a_seek_is_really_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_clip(tmp_path / "clip.mp4", panned_luma(60), b_frames=2)
     index = probe(path).index
@@ -299,9 +323,11 @@ def test_the_size_changes_in_mid_file(tmp_path: Path) -> None:
     path = tmp_path / "joined.h264"
     path.write_bytes(b"".join(part.read_bytes() for part in parts))
     index = probe(path).index
+    assert len(index) == 20
     assert decode_luma(path, index, 0, 20).frames.shape == (20, 48, 64)
-    with pytest.raises(VideoError) as caught:
-        decode_luma(path, index, 10, 20)
+    longer = unseekable(40, index.time_base, 48, 64)
+    with pytest.raises(VideoError, match="96x32 px here and 64x48 px at first") as caught:
+        decode_luma(path, longer, 10, 20)
     assert caught.value.frame == 20
 
 
@@ -351,5 +377,7 @@ def test_a_range_that_is_stated_only_later_ends_no_clip(tmp_path: Path) -> None:
     assert decode_luma(path, probe(path).index, 12, 24).frames.shape[0] == 24
     (tmp_path / "changed.h264").write_bytes(limited + full)
     path = tmp_path / "changed.h264"
+    assert probe(path).frames == 24
+    longer = unseekable(48, (1, 25), 48, 64)
     with pytest.raises(VideoError, match=r"from yuv420p \(8 bits, limited range\) to yuvj?420p \(8 bits, full range\)"):
-        decode_luma(path, probe(path).index, 12, 24)
+        decode_luma(path, longer, 12, 24)

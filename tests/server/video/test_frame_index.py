@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex, unseekable
+from v2v_server.video.orientation import Orientation
 
 steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=60)
 
@@ -22,11 +23,12 @@ def indices(draw: st.DrawFn) -> FrameIndex:
     keys = np.array(sorted(draw(st.sets(st.integers(first, first + len(pts) - 1)))), np.int64)
     dts = np.array([draw(st.sampled_from([NO_TIMESTAMP, -5, 0, 2**50])) for _ in keys], np.int64)
     base = (draw(st.integers(1, 2**32 - 1)), draw(st.integers(1, 2**32 - 1)))
-    return FrameIndex(first, pts, keys, dts, base, 336, 596, seekable=True)
+    lies = Orientation(draw(st.booleans()), draw(st.booleans()), draw(st.booleans()))
+    return FrameIndex(first, pts, keys, dts, base, 336, 596, True, lies)
 
 
 def assert_equal(one: FrameIndex, other: FrameIndex) -> None:
-    for name in ("first", "time_base", "height_px", "width_px", "seekable"):
+    for name in ("first", "time_base", "height_px", "width_px", "seekable", "orientation"):
         assert getattr(one, name) == getattr(other, name)
     for name in ("pts", "keyframes", "keyframe_dts"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -41,6 +43,24 @@ def test_unseekable_round_trip() -> None:
     index = unseekable(10_000, (1, 25), 48, 64)
     assert len(index.to_bytes()) < 64
     assert_equal(FrameIndex.from_bytes(index.to_bytes()), index)
+
+
+def test_an_upright_index_keeps_its_bytes() -> None:
+    upright = unseekable(5, (1, 25), 48, 64)
+    turned = unseekable(5, (1, 25), 48, 64, Orientation(transpose=True, flip_x=True))
+    assert (upright.to_bytes()[-1], turned.to_bytes()[-1]) == (0, 10)
+    with pytest.raises(ProtocolError, match="flags 16"):
+        FrameIndex.from_bytes(upright.to_bytes()[:-1] + b"\x10")
+
+
+@given(indices(), st.data())
+def test_a_part_of_the_frames(index: FrameIndex, data: st.DataObject) -> None:
+    kept = np.array(data.draw(st.lists(st.booleans(), min_size=len(index), max_size=len(index))), bool)
+    part = index.only(kept)
+    np.testing.assert_array_equal(part.pts, index.pts[kept])
+    keys = [at for at, key in enumerate(index.keyframes) if kept[key - index.first]]
+    np.testing.assert_array_equal(part.pts[part.keyframes - part.first], index.pts[index.keyframes - index.first][keys])
+    np.testing.assert_array_equal(part.keyframe_dts, index.keyframe_dts[keys])
 
 
 def test_a_constant_rate_costs_next_to_nothing() -> None:

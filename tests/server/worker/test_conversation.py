@@ -32,6 +32,7 @@ from v2v_server.worker.conversation import (
     Listen,
     Load,
     Make,
+    Reconnect,
     Say,
     Send,
     WorkerConversation,
@@ -57,6 +58,7 @@ class Talk:
         heard: what it said since the last look.
         told: what it told people.
         step: what it wants to do next.
+        connections: how many it had.
         unready: leases whose kernels are not loaded.
         compiled: whether they are compiled.
         decoded: leases that need no decoding.
@@ -66,6 +68,7 @@ class Talk:
         self.now = 1000.0
         self._said: list[Message] = []
         self.told: list[str] = []
+        self.connections = 1
         self.unready: set[int] = set()
         self.compiled = True
         self.decoded: set[int] = set()
@@ -85,6 +88,8 @@ class Talk:
         for action in before:
             if isinstance(action, Send):
                 self._said.append(decode(action.frames[0]))
+            elif isinstance(action, Reconnect):
+                self.connections += 1
             else:
                 assert isinstance(action, Say)
                 self.told.append(action.text)
@@ -199,10 +204,21 @@ def test_a_server_that_is_away_does_not_find_a_ping_for_every_five_seconds(is_wa
         assert isinstance(talk.step, Listen)
         assert 0.0 < talk.step.seconds <= 5.0
         talk.now += talk.step.seconds
-        if talk.hears() == [Ping()]:
+        if Ping() in talk.hears():
             pings.append(talk.now - begun)
     assert pings == [5.0, 15.0, 35.0, 75.0, 155.0, 315.0, 635.0, 955.0, 1275.0, 1595.0, 1915.0]
     assert talk.told == ([] if is_watched else ["tcp://there has not answered for 20 s; waiting"])
+
+
+def test_a_silent_server_is_greeted_over_a_new_connection() -> None:
+    talk = Talk()
+    talk.now += 5.0
+    assert (talk.hears(), talk.connections) == ([Ping()], 1)
+    talk.now += 10.0
+    assert (talk.hears(), talk.connections) == ([HELLO, Ping()], 2)
+    assert talk.hears(Pong()) == []
+    talk.now += 5.0
+    assert (talk.hears(), talk.connections) == ([Ping()], 2)
 
 
 def test_the_time_that_a_sample_takes_is_no_silence() -> None:

@@ -16,12 +16,13 @@ import zmq
 
 from tests.protocol.wire_messages import example
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Result, Stop, WorkerHello
+from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.simulation.variants import Variant
 from v2v_server.worker import process as worker_module
+from v2v_server.worker.conversation import Reconnect, Send
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.output_buffer import OutputBuffer
 from v2v_server.worker.process import Worker, run_worker
@@ -37,17 +38,18 @@ class Server:
 
     def __init__(self, router: zmq.Socket[bytes]) -> None:
         self._router = router
+        self.worker = b""
         self.did: list[str] = []
 
     def heard(self) -> Message:
         """The next message of the worker."""
         assert self._router.poll(WAIT_MS), "the worker says nothing"
-        _, header, *_ = self._router.recv_multipart()
+        self.worker, header, *_ = self._router.recv_multipart()
         return decode(header)
 
     def says(self, *messages: Message) -> None:
         for message in messages:
-            self._router.send_multipart([b"w", *encode(message)])
+            self._router.send_multipart([self.worker, *encode(message)])
 
 
 @pytest.fixture
@@ -108,6 +110,27 @@ def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> No
     ]
     server.says(Stop())
     assert server.heard() == Goodbye()
+
+
+def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        router.setsockopt(zmq.LINGER, 0)
+        at = Server(router)
+        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+        found = []
+        try:
+            for _ in range(2):
+                worker._do(Send(encode(Ping())))
+                assert at.heard() == Ping()
+                at.says(Pong())
+                assert worker._socket.poll(WAIT_MS)
+                assert [decode(frame) for frame in worker._messages(0.0)] == [Pong()]
+                found.append(at.worker)
+                worker._do(Reconnect())
+        finally:
+            worker._context.destroy(linger=0)
+    assert len(set(found)) == 2
+    assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
 def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Writes aedat4 files as DV does: flatbuffers put together by hand, nothing compressed.
+"""Write aedat4 files as DV does: flatbuffers assembled by hand, uncompressed.
 
 A flatbuffer table is: i32 distance back to its vtable, then its fields; the vtable is u16 own size, u16 table size,
 u16 offset of each field (0 where it is absent). A vector is u32 count and its elements; a field refers to it by u32
@@ -20,7 +20,7 @@ HALF_EXPOSURE_US = 1000
 
 
 def table(identifier: bytes, scalars: list[tuple[int, str, int]], slots: int, vector: tuple[int, int, bytes]) -> bytes:
-    """A size-prefixed buffer of one table with scalar fields and one vector.
+    """Return a size-prefixed buffer of one table with scalar fields and one vector.
 
     Args:
         identifier: four bytes.
@@ -86,7 +86,7 @@ def frame_packet(pixels: np.ndarray, t_us: int) -> bytes:
 
 
 def write_aedat4(path: Path, scene: Scene) -> None:
-    """Events in two packets, the frames after them."""
+    """Write events in two packets, then the frames."""
     half = len(scene.t_us) // 2
     packets = [(0, event_packet(scene, slice(0, half))), (0, event_packet(scene, slice(half, None)))]
     packets += [(1, frame_packet(*pair)) for pair in zip(scene.pictures, scene.picture_us.tolist(), strict=True)]

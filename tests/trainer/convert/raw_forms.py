@@ -1,4 +1,4 @@
-"""Writes the scene in each raw form. Nothing here is the readers' code; the rosbags package serialises bags."""
+"""Write the scene in each raw form, without code of the readers. The rosbags package serialises bags."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def ijrr_members(scene: Scene) -> dict[str, bytes]:
 
 
 def evaid_members(scene: Scene) -> dict[str, bytes]:
-    """Events in eleven files, so that 10.txt comes after 2.txt only if names are compared as numbers."""
+    """Write events in eleven files, so that 10.txt comes after 2.txt only if names are compared as numbers."""
     members = {
         "shape.txt": f"{WIDTH} {HEIGHT}\n".encode(),
         "timestamps.txt": "\n".join(map(str, scene.picture_us)).encode(),
@@ -43,7 +43,7 @@ def evaid_members(scene: Scene) -> dict[str, bytes]:
 
 
 def with_macos_notes(members: dict[str, bytes]) -> dict[str, bytes]:
-    """As the Finder packs: what its file system knows of each file lies beside, in files of the same ending."""
+    """Add files as the Finder does when it packs: metadata of each file, in a file with the same ending."""
     notes = {f"__MACOSX/{Path(name).parent / f'._{Path(name).name}'}": b"\0\5\x16\7" for name in members}
     return members | notes
 
@@ -75,8 +75,9 @@ def write_mvsec(path: Path, scene: Scene) -> None:
 def write_bag(
     path: Path, scene: Scene, *, packets: bool = False, front: bytes = b"", image_encoding: str = "mono8"
 ) -> None:
-    """Two messages of events, one of each picture; ``packets``: EventPackets of EVT 3 instead of EventArrays, the first
-    of them with the words ``front`` in front.
+    """Write two messages of events, and one of each picture.
+
+    ``packets`` writes EventPackets of EVT 3 instead of EventArrays; the first starts with the words ``front``.
     """
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -1,4 +1,4 @@
-"""A small recording whose voxel grids are known without computing anything, and its parts in arrays.
+"""Define a small recording whose voxel grids are known without computation, and its parts as arrays.
 
 Five pictures, 10 ms apart. The events of window w lie at 0, 900, 2700, 4500, 6300, 8100, 9000 us after its picture: the
 first and the last fix the span of 9000 us, the five between are at the middle of each fifth.
@@ -32,7 +32,7 @@ INTERPOLATED = (
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Events in order of time, t in us; pictures and their times."""
+    """Hold events sorted by time, t in us; pictures and their times."""
 
     t_us: npt.NDArray[np.int64]
     x: npt.NDArray[np.int64]

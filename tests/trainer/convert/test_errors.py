@@ -1,4 +1,4 @@
-"""Damaged, incomplete and mistaken sources: one clear message, and no file."""
+"""Test damaged, incomplete and wrong sources: each gives one clear message, and no file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def evaid(path: Path, **changes: bytes) -> Path:
 
 
 def patched_zip(path: Path, *, flags: int = 0, method: int = 8) -> Path:
-    """The same bytes under other flags or another method, in both headers of every member."""
+    """Write the same bytes with other flags or another method, in both headers of every member."""
     source = ijrr(path)
     content = bytearray(source.read_bytes())
     for signature, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
@@ -85,7 +85,7 @@ def short_bag(path: Path) -> Path:
 
 
 def bag_with(path: Path, **changes: bytes) -> Path:
-    """A bag in which fields in the header of the first message begin with other values."""
+    """Write a bag in which header fields of the first message begin with other values."""
     raw_forms.write_bag(path / "a.bag", scene())
     content = bytearray((path / "a.bag").read_bytes())
     for name, value in changes.items():
@@ -114,51 +114,51 @@ def evt21(path: Path, header: bytes) -> Path:
     ("make", "message"),
     [
         (lambda path: path / "absent.zip", "no file or folder"),
-        (lambda path: written(path / "a.bin", b"nothing"), "is no recording that can be read.*--form"),
-        (lambda path: written(path / "a.zip", b"nothing"), "neither a folder nor a whole zip"),
-        (lambda path: cut_short(ijrr(path), 0.6), "neither a folder nor a whole zip"),
-        (lambda path: patched_zip(path, method=9), "images.txt cannot be read: That compression method.*unpack it"),
-        (lambda path: patched_zip(path, flags=1), "images.txt cannot be read: .*encrypted.*unpack it"),
+        (lambda path: written(path / "a.bin", b"nothing"), "is not a known recording.*--form"),
+        (lambda path: written(path / "a.zip", b"nothing"), "neither a folder nor a complete zip"),
+        (lambda path: cut_short(ijrr(path), 0.6), "neither a folder nor a complete zip"),
+        (lambda path: patched_zip(path, method=9), "images.txt cannot be read: That compression method.*unpack"),
+        (lambda path: patched_zip(path, flags=1), "images.txt cannot be read: .*encrypted.*unpack the file"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2\n"), r"line 2: '0.2 1 2' is not `t x y p`"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2 2\n"), r"line 2: '0.2 1 2 2' is not `t x y p`"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 x 0\n"), r"line 2: '0.2 1 x 0' is not"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\nnan 1 2 0\n"), r"line 2: 'nan 1 2 0' is not"),
         (lambda path: ijrr(path, events=b"a b\n0.2 1 2 1\n"), r"the first line is b'a b'"),
-        (lambda path: ijrr(path, events=b""), "holds no events"),
+        (lambda path: ijrr(path, events=b""), "has no events"),
         (
             lambda path: ijrr(path, events=b"1468939993067416.0 1 2 1\n"),
-            r"events.txt: a time of 1.468939993e\+15 s.*--time-unit",
+            r"events.txt: a time is 1.468939993e\+15 s.*--time-unit",
         ),
-        (lambda path: ijrr(path, events=b"1468939993067416019 1 2 1\n"), r"a time of 1.468939993e\+12 s"),
+        (lambda path: ijrr(path, events=b"1468939993067416019 1 2 1\n"), r"a time is 1.468939993e\+12 s"),
         (
             lambda path: ijrr(path, images=b"1e15 images/frame_00000000.png\n"),
-            r"images.txt, line 1: a time of 1e\+15 s",
+            r"images.txt, line 1: a time is 1e\+15 s",
         ),
-        (lambda path: ijrr(path, frame=None), r"line 3 names images/frame_00000002.png, which is not there"),
-        (lambda path: ijrr(path, frame=b"no picture"), r"frame_00000002.png is no picture"),
+        (lambda path: ijrr(path, frame=None), r"line 3 names images/frame_00000002.png, which does not exist"),
+        (lambda path: ijrr(path, frame=b"no picture"), r"frame_00000002.png is not a readable picture"),
         (lambda path: ijrr(path, images=b"one two three\n"), r"line 1: 'one two three' is not `seconds path`"),
         (lambda path: several(path, raw_forms.ijrr_members(scene())), r"holds 2 recordings \(one/slow, two/slow"),
         (lambda path: several(path, raw_forms.evaid_members(scene())), r"holds 2 recordings \(one, two"),
         (lambda path: evaid(path, timestamps=b"1 2 3"), r"5 pictures in gt/, but 3 times"),
-        (lambda path: evaid(path, timestamps=b"1 2 x"), r"something else than numbers"),
+        (lambda path: evaid(path, timestamps=b"1 2 x"), r"text that is not a number"),
         (lambda path: evaid(path, shape=b"24"), r"shape.txt holds \[24\]"),
         (lambda path: evaid(path, shape=b"20 18"), r"the sensor is SensorSize\(width=20"),
         (lambda path: mvsec(path, events=np.zeros((4, 3))), r"is \[4, 3\], not \[N, 4\]"),
         (lambda path: mvsec(path, image_raw_ts=np.zeros(2)), "5 pictures, but 2 times"),
-        (lambda path: mvsec(path, image_raw_ts=np.full(5, np.nan)), "a time of nan s"),
+        (lambda path: mvsec(path, image_raw_ts=np.full(5, np.nan)), "a time is nan s"),
         (lambda path: mvsec(path, image_raw=np.zeros((5, 18, 24))), "not uint8"),
         (lambda path: cut_short(mvsec(path), 0.6), "fly_data.hdf5 cannot be read as HDF5: .*truncated"),
         (lambda path: mvsec(path, image_raw_ts=None), "fly_data.hdf5 cannot be read as HDF5: .*image_raw_ts"),
         (short_bag, "the bag cannot be read"),
-        (lambda path: bag_with(path, time=b"\1\1"), r"the bag cannot be read, it is damaged: AssertionError\(\)"),
-        (lambda path: bag_with(path, conn=b"\x77"), r"the bag cannot be read, it is damaged: KeyError\(119\)"),
+        (lambda path: bag_with(path, time=b"\1\1"), r"the bag is damaged and cannot be read: AssertionError\(\)"),
+        (lambda path: bag_with(path, conn=b"\x77"), r"the bag is damaged and cannot be read: KeyError\(119\)"),
         (short_aedat4, "cannot be decoded"),
         (evt2_without_size, "give --size WIDTHxHEIGHT"),
-        (lambda path: evt21(path, b"% evt 2.1"), "a.raw is in EVT 2.1, which is not read here"),
+        (lambda path: evt21(path, b"% evt 2.1"), "a.raw is in EVT 2.1, which is not supported"),
         (lambda path: evt21(path, b"% evt 2.1\n% format EVT21;height=18;width=24"), 'decoded: unknown version "EVT21"'),
     ],
 )
-def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: str) -> None:
+def test_errors_name_the_fault(tmp_path: Path, make: object, message: str) -> None:
     source = make(tmp_path)  # type: ignore[operator]
     with pytest.raises(UsageError, match=message):
         convert(source, tmp_path / "out" / "a.h5")
@@ -166,7 +166,7 @@ def test_the_message_says_what_is_wrong(tmp_path: Path, make: object, message: s
 
 
 class PanicException(BaseException):
-    """As Rust's is seen from here: by its name and base only."""
+    """Stand in for Rust's panic, which Python code can recognise only by its name and base class."""
 
 
 @pytest.mark.parametrize(
@@ -176,21 +176,21 @@ class PanicException(BaseException):
         (KeyboardInterrupt("index out of bounds"), KeyboardInterrupt),
     ],
 )
-def test_a_panic_of_the_decoder_is_told_as_damage(raised: BaseException, expected: type[BaseException]) -> None:
+def test_a_panic_of_the_decoder_is_reported_as_damage(raised: BaseException, expected: type[BaseException]) -> None:
     with pytest.raises(expected, match="index out of bounds"), _errors_of_faery(Path("a.aedat4")):
         raise raised
 
 
-def test_size_given_where_the_file_has_none(tmp_path: Path) -> None:
+def test_a_size_may_be_given_if_the_file_has_none(tmp_path: Path) -> None:
     done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=ConvertOptions(size=SensorSize(30, 20)))
     assert done.written.size == SensorSize(30, 20)
 
 
-def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> None:
+def test_a_bag_with_several_topics_needs_a_choice(tmp_path: Path) -> None:
     raw_forms.write_bag(tmp_path / "a.bag", scene())
     for options, message in (
         (ConvertOptions(events_topic="/none"), r"0 topics of events; .*/dvs/events \(dvs_msgs/msg/EventArray\)"),
-        (ConvertOptions(images_topic="/none"), r"no pictures on /none; they are on /dvs/image_raw"),
+        (ConvertOptions(images_topic="/none"), r"no pictures on /none; topics with pictures: /dvs/image_raw"),
     ):
         with pytest.raises(UsageError, match=message):
             convert(tmp_path / "a.bag", tmp_path / "a.h5", options=options)
@@ -199,7 +199,7 @@ def test_topics_have_to_be_chosen_where_there_are_several(tmp_path: Path) -> Non
         convert(tmp_path / "b.bag", tmp_path / "b.h5")
 
 
-def test_source_and_destination_are_kept_apart(tmp_path: Path) -> None:
+def test_source_and_destination_must_differ(tmp_path: Path) -> None:
     folder = tmp_path / "slow"
     raw_forms.write_folder(folder, raw_forms.ijrr_members(scene()))
     with pytest.raises(UsageError, match="lies in the source folder"):
@@ -226,9 +226,7 @@ def test_blocks_may_end_anywhere(monkeypatch: pytest.MonkeyPatch, block: int) ->
         list(read_text_events(io.BytesIO(broken), "a.txt"))
 
 
-def test_it_is_said_where_the_size_is_that_of_the_events_area(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_guessed_size_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "own.txt").write_text("10 3 2 1\n20 7 4 0\n")
     for name, flags, size, guessed in (("a", [], "8 x 5", True), ("b", ["--size", "24x18"], "24 x 18", False)):
         cli.main([str(tmp_path / "own.txt"), "--out", str(tmp_path / f"{name}.h5"), *flags])

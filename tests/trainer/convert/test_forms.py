@@ -1,4 +1,4 @@
-"""Every raw form, written by the tests, gives the same recording: its events, its pictures, the known voxel grids."""
+"""Test that every raw form gives the same recording: its events, its pictures, the known voxel grids."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def check_events(path: Path, expected: Scene) -> None:
 
 @pytest.mark.parametrize("case", WITH_PICTURES)
 @pytest.mark.parametrize("kind", ["discrete", "interpolated"])
-def test_conversion_reader_and_voxels(tmp_path: Path, case: str, kind: str) -> None:
+def test_every_raw_form_gives_the_known_voxel_grids(tmp_path: Path, case: str, kind: str) -> None:
     form, name, write = WITH_PICTURES[case]
     source, destination = tmp_path / name, tmp_path / "out" / "sequence.h5"
     original = scene()
@@ -108,7 +108,7 @@ def test_conversion_reader_and_voxels(tmp_path: Path, case: str, kind: str) -> N
 
 
 @pytest.mark.parametrize("case", WITHOUT)
-def test_events_alone(tmp_path: Path, case: str) -> None:
+def test_events_without_pictures_are_converted(tmp_path: Path, case: str) -> None:
     form, name, write = WITHOUT[case]
     original = scene()
     write(tmp_path / name, original)
@@ -128,8 +128,8 @@ def test_events_alone(tmp_path: Path, case: str) -> None:
             np.testing.assert_array_equal(grid, expected_voxels(number, "discrete"))
 
 
-def test_the_published_event_index_is_kept_beside_ours(tmp_path: Path) -> None:
-    """HQF's script pairs a picture with the event before; MVSEC's takes the index in the raw file."""
+def test_the_published_event_index_is_written_as_well(tmp_path: Path) -> None:
+    """HQF's script pairs a picture with the event before it; MVSEC's takes the index in the raw file."""
     original = scene()
     raw_forms.write_bag(tmp_path / "desk.bag", original)
     raw_forms.write_mvsec(tmp_path / "fly_data.hdf5", original)
@@ -151,7 +151,7 @@ def test_the_right_camera_of_a_stereo_recording(tmp_path: Path) -> None:
 
 
 def test_text_units_and_header(tmp_path: Path) -> None:
-    """Whole numbers are us, numbers with a point seconds, unless a user says otherwise; a header states the size."""
+    """Integers are us and numbers with a point are s, unless the user gives the unit. A header states the size."""
     for text, unit, seconds in (
         ("5000000 1 2 1\n5000300 1 2 0\n", None, 300e-6),
         ("5.0 1 2 1\n5.0003 1 2 -1", None, 300e-6),

@@ -1,4 +1,4 @@
-"""How far a conversion is, where there is no terminal."""
+"""Test the progress of a conversion without a terminal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from io import StringIO
 from trainer.convert.cli import log_progress
 
 
-def test_a_line_every_thirty_seconds_and_none_of_what_is_done() -> None:
+def test_progress_prints_a_line_every_thirty_seconds_until_done() -> None:
     out, times = StringIO(), iter([0.0, 10.0, 40.0, 60.0, 75.0])
     progress = log_progress("a.bag", out, clock=lambda: next(times))
     for done in (1, 4, 6, 5):

@@ -1,4 +1,4 @@
-"""Real recordings of four raw forms, where they are at hand."""
+"""Test real recordings of four raw forms, if they are available."""
 
 from __future__ import annotations
 

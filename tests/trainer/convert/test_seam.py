@@ -1,4 +1,4 @@
-"""A form of recording is a file that yields items, and one line in ``FORMS``."""
+"""Test that a new form of recordings needs only a file that yields items, and one line in ``FORMS``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    """Lines of ``t_ns x y p``, between two grey pictures."""
+    """Yield events from lines of ``t_ns x y p``, between two grey pictures."""
     t, x, y, p = np.loadtxt(path, dtype=np.int64).T
     yield SensorSize(6, 4)
     yield Picture(0, np.zeros((4, 6), np.uint8))
@@ -44,7 +44,7 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
         assert (np.asarray(events.p) > 0).tolist() == [True, False, True]
 
 
-def test_what_no_form_recognises_is_refused_with_those_that_could(tmp_path: Path) -> None:
+def test_an_unknown_form_is_refused_with_a_list_of_forms(tmp_path: Path) -> None:
     (tmp_path / "raw.toy").write_text("")
-    with pytest.raises(conversion.UsageError, match="is no recording that can be read"):
+    with pytest.raises(conversion.UsageError, match="is not a known recording"):
         recognise(tmp_path / "raw.toy")

@@ -1,4 +1,4 @@
-"""The writer: order, pairing of pictures, bounds, and that only whole files appear."""
+"""Test the writer: order, pairing of pictures, bounds, and that only complete files appear."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write(path: Path, items: list[Item], size: SensorSize | None = None) -> Writ
 def test_pictures_are_paired_and_late_events_sorted_whatever_the_chunks(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """Against sorting and searching in one piece; buffers of a few events, so that every boundary is crossed."""
+    """Compare with sorting and searching in one piece. Buffers hold few events, so that every boundary is crossed."""
     times = sorted(data.draw(st.lists(st.integers(0, 200), min_size=1, max_size=60)))
     # Late by fewer than the four events that the buffer holds back.
     keys = [position + data.draw(st.integers(0, 3)) for position in range(len(times))]
@@ -85,7 +85,7 @@ def test_events_later_than_the_buffer_reaches_are_refused(tmp_path: Path, monkey
         ([SensorSize(5, 5), chunk([0]), picture(0)], None, r"the sensor is SensorSize\(width=5"),
     ],
 )
-def test_what_cannot_be_is_refused_and_leaves_nothing(
+def test_invalid_items_are_refused_and_leave_no_file(
     tmp_path: Path, items: list[Item], size: SensorSize | None, message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):

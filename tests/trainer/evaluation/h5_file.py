@@ -1,4 +1,4 @@
-"""Writes recordings in the h5 layout, as the published conversions do or otherwise."""
+"""Write recordings in the h5 layout, as the published conversions do or with faults."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def random_recording(
     period: float = 0.02,
     seed: int = 0,
 ) -> Path:
-    """Uniformly random events and pictures; the first picture at 1 s."""
+    """Write uniformly random events and pictures, the first picture at 1 s."""
     rng = np.random.default_rng(seed)
     height, width = size
     times = 1.0 + period * np.arange(images)

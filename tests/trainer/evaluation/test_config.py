@@ -1,4 +1,4 @@
-"""Configurations, the paper's data sets, and its results."""
+"""Test configurations, the paper's data sets, and its results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_default_metrics_tell_a_picture_from_constant_grey() -> None:
     assert "correlation" in EvaluationConfig(()).metrics
 
 
-def test_sequences_and_cuts_of_the_paper() -> None:
+def test_sequences_and_time_ranges_of_the_paper() -> None:
     assert {name: len(data_set.time_ranges) for name, data_set in DATA_SETS.items()} == {
         "HQF": 14, "EVAID": 11, "IJRR": 7, "MVSEC": 6
     }  # fmt: skip
@@ -44,7 +44,7 @@ def test_sequences_and_cuts_of_the_paper() -> None:
     assert not DATA_SETS["EVAID"].time_ranges.keys() & {"blocks", "umbrella", "room2"}
 
 
-def test_the_page_converts_to_where_the_data_sets_are_looked_for() -> None:
+def test_the_documented_conversions_write_to_the_data_sets_folders() -> None:
     page = (Path(__file__).parents[3] / "docs" / "evaluation.md").read_text(encoding="utf-8")
     converted = set(re.findall(r"v2v-convert raw/\S+ --out data/(\w+)", page))
     assert converted == {data_set.folder for data_set in DATA_SETS.values()}
@@ -92,9 +92,9 @@ def test_folders_and_files(tmp_path: Path) -> None:
         ({"data": ["HQF"], "colour": 1}, "unknown key 'colour'"),
         ({}, "x: data: None should be a list"),
         ({"data": ["KITTI"]}, "'KITTI' is none of the paper's: HQF, EVAID, IJRR, MVSEC"),
-        ({"data": ["HQF", {"name": "HQF", "sequences": ["b"]}]}, "two sets of the name HQF"),
-        ({"data": [{"name": "a"}]}, "has a name and sequences"),
-        ({"data": [{"name": "a", "sequences": "b"}]}, "sequences are a list"),
+        ({"data": ["HQF", {"name": "HQF", "sequences": ["b"]}]}, "two data sets are named HQF"),
+        ({"data": [{"name": "a"}]}, "needs a name and sequences"),
+        ({"data": [{"name": "a", "sequences": "b"}]}, "sequences .b.: give a list"),
         ({"data": [{"name": "a", "sequences": {"b": [1]}}]}, r"b: \[1\] is not \[first second"),
         ({"data": [{"name": "a", "sequences": {"b": [3, 2]}}]}, r"b: \[3, 2\] s"),
         ({"data": ["HQF"], "voxels": {"kind": "square"}}, "kind 'square'"),
@@ -110,8 +110,8 @@ def test_mistakes_are_named(content: Any, message: str) -> None:
         parse_config(content, "x")
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no file absent; configurations that ship .*paper-discrete"):
+def test_missing_or_malformed_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no file absent; shipped configurations: .*paper-discrete"):
         read_config("absent")
     (tmp_path / "a.yaml").write_text("data: [HQF")
     with pytest.raises(UsageError, match="is not YAML"):

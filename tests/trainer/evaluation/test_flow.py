@@ -1,4 +1,4 @@
-"""Flow of recordings with known flow: the analytic errors, in both conventions."""
+"""Test scores of flow on recordings with known flow: the analytic errors, in both conventions."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ def run(network: EVFlowNet | ERAFT, *, as_published: bool) -> FlowRun:
 
 
 def test_the_field_at_the_start_of_a_window_is_its_flow(tmp_path: Path) -> None:
-    """Indoors nothing is cut off: a twentieth of the rows has ten times the flow."""
+    """Indoors all rows count: a twentieth of them has ten times the flow."""
     found = evaluate_flow(run(constant(0.6, 0.8), as_published=False), recording(tmp_path / "indoor.h5"), None)
     share = 1 - HOOD_ROW / HEIGHT
     expected = {
         "network": (LENGTHS[:3], lambda length: (length - 1) * (1 - share) + (10 * length - 1) * share),
         "zeros": (LENGTHS[:3], lambda length: length * (1 - share) + 10 * length * share),
     }
-    for who, (lengths, of) in expected.items():
+    for predictor, (lengths, of) in expected.items():
         for kind in ("dense", "sparse"):
-            assert found[who].means[f"aee_{kind}"] == pytest.approx(
+            assert found[predictor].means[f"aee_{kind}"] == pytest.approx(
                 np.mean([of(length) for length in lengths]), rel=1e-5
             )
     # Errors of the network: 0, 3 and 1 px above, 9, 39 and 19 px below; 3 is not more than 3.
@@ -88,7 +88,7 @@ def test_outdoors_the_hood_does_not_count_unless_as_published(tmp_path: Path) ->
     assert published["zeros"].means["aee_dense"] == pytest.approx(later, rel=1e-5)
 
 
-def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path) -> None:
+def test_a_window_without_counted_pixels_is_left_out_or_scores_0(tmp_path: Path) -> None:
     path = recording(tmp_path / "outdoor_day2.h5", empty=1)
     right = evaluate_flow(run(constant(0, 0), as_published=False), path, None)["zeros"]
     assert (right.windows, right.means["aee_sparse"]) == (3, pytest.approx((1 + 2) / 2, rel=1e-5))
@@ -96,7 +96,7 @@ def test_a_window_in_which_nothing_counts_is_left_out_or_scores_0(tmp_path: Path
     assert published.means["aee_dense"] == pytest.approx((0 + 2 + 8) / 3 * (1 + 9 * 0.05), rel=1e-5)
 
 
-def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
+def test_without_pictures_a_time_range_counts_from_the_first_field(tmp_path: Path) -> None:
     path = recording(tmp_path / "a.h5")
     assert evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.11))["zeros"].windows == 1
     with pytest.raises(UsageError, match=r"1 flow fields in the time range .*v2v-convert reads MVSEC's"):
@@ -104,7 +104,7 @@ def test_a_cut_counts_from_the_first_field(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(
+def test_a_network_that_uses_the_previous_window_has_an_output_for_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
@@ -113,7 +113,7 @@ def test_a_network_that_looks_at_the_window_before_has_an_output_for_each(
     assert found["network"].windows == 3
 
 
-def test_the_command_shows_the_paper_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "data" / "mvsec").mkdir(parents=True)
     recording(tmp_path / "data" / "mvsec" / "indoor_flying1.h5")
     torch.save(constant(0, 0).state_dict(), tmp_path / "a.pth")
@@ -129,7 +129,7 @@ def test_the_command_shows_the_paper_beside_it(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_flow_of_mvsec_is_converted_with_its_recording(tmp_path: Path) -> None:
-    """True flow and predicted no motion: the numbers of the raw file come out of the evaluation."""
+    """With a prediction of no motion, the scores are the lengths of the raw file's flow."""
     rng = np.random.default_rng(0)
     times, lengths = 100.0 + 0.05 * np.arange(3), (2.0, 5.0, 1.0)
     with h5py.File(tmp_path / "indoor_flying1_data.hdf5", "w") as file:

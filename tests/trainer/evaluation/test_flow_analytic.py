@@ -1,4 +1,4 @@
-"""Known flow in files of MVSEC's layout, through converter and command: AEE and 3PE by hand, in both conventions.
+"""Test AEE and 3PE for known flow in files of MVSEC's layout, through converter and command, in both conventions.
 
 columns   0: no depth   1: no flow   2-5: flow (length, 0), by field and part of the rows
 events    window 0, 1: rows 0-49 of column 2 (part A), rows 100-119 of column 3 (part B), rows 190-199 of column 4
@@ -77,7 +77,7 @@ def by_hand(predicted: float, fields: tuple[int, ...], counted: tuple[str, ...])
 
 @pytest.mark.parametrize("name", ["indoor_flying1", "outdoor_day1"])
 @pytest.mark.parametrize("as_published", [False, True])
-def test_aee_and_3pe_of_a_constant_prediction_and_of_none(tmp_path: Path, name: str, as_published: bool) -> None:
+def test_aee_and_3pe_of_a_constant_and_a_zero_prediction(tmp_path: Path, name: str, as_published: bool) -> None:
     data, weights, out = tmp_path / "data" / "mvsec", tmp_path / "a.pth", tmp_path / "a.json"
     assert not convert([str(write_raw(tmp_path, name)), "--out", str(data)])
     torch.save(constant(PREDICTED, 0.0).state_dict(), weights)
@@ -87,16 +87,16 @@ def test_aee_and_3pe_of_a_constant_prediction_and_of_none(tmp_path: Path, name: 
     found = {record["predictor"]: record for record in json.loads(out.read_text())}
     whole = as_published or name.startswith("indoor")
     counted = ("A", "B", "hood") if whole else ("A", "B")
-    for who, predicted in (("network", PREDICTED), ("zeros", 0.0)):
+    for predictor, predicted in (("network", PREDICTED), ("zeros", 0.0)):
         expected = by_hand(predicted, (1, 2, 3) if as_published else (0, 1, 2), counted)
         if as_published:  # the window without events scores 0
             expected = {key: value * 2 / 3 if "sparse" in key else value for key, value in expected.items()}
-        assert found[who]["windows"] == 3
-        assert {key: found[who][key] for key in expected} == pytest.approx(expected, rel=1e-5)
+        assert found[predictor]["windows"] == 3
+        assert {key: found[predictor][key] for key in expected} == pytest.approx(expected, rel=1e-5)
 
 
 class Late(EVFlowNet):
-    """Also takes the window before, as E-RAFT does, and has no use for it."""
+    """Take the previous window as well, as E-RAFT does, and ignore it."""
 
     lead_voxels = 1
 
@@ -121,8 +121,8 @@ def test_as_published_the_events_of_eraft_are_those_of_the_window_before(tmp_pat
         assert found["zeros"].means[name] == pytest.approx(share * of_zeros[name], rel=1e-5), "it is no E-RAFT"
 
 
-def test_zeros_by_hand() -> None:
-    """What the test above expects, for two cases in plain numbers."""
+def test_zeros_match_values_computed_by_hand() -> None:
+    """State the expectation of the test above as plain numbers, for two cases."""
     # Dense, outdoors: 400 px of A, 360 of B; fields 0, 1, 2.
     right = by_hand(0.0, (0, 1, 2), ("A", "B"))
     assert right["aee_dense"] == pytest.approx(

@@ -1,4 +1,4 @@
-"""Metrics against float64 numpy that follows the formulas, window by window."""
+"""Compare metrics with float64 NumPy that follows the formulas, window by window."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def pair(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def slow_ssim(a: np.ndarray, b: np.ndarray, data_range: float) -> float:
-    """Every 7 x 7 window on its own; variances divided by 48."""
+    """Compute SSIM for each 7 x 7 window separately, with variances divided by 48."""
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     values = []
     for top in range(a.shape[0] - 6):
@@ -48,7 +48,7 @@ def test_ssim(height: int, width: int, seed: int, data_range: float) -> None:
     )
 
 
-def test_the_wider_range_flatters() -> None:
+def test_a_wider_data_range_raises_ssim() -> None:
     """Range 2 doubles both constants' roots, which pulls every window towards 1."""
     prediction, target = pair(20, 20, 0)
     assert ssim(prediction, target, data_range=1.0) < ssim(prediction, target, data_range=2.0) < 1
@@ -81,7 +81,7 @@ def test_lpips_from_files(tmp_path: Path, net: str) -> None:
     )
 
 
-def test_what_cannot_be_computed_is_refused(tmp_path: Path) -> None:
+def test_metrics_that_cannot_be_computed_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--lpips alex BACKBONE HEADS .*alexnet.*--metrics"):
         make_metrics(["lpips_alex"], {"squeeze": ("a", "b")})
     with pytest.raises(UsageError, match=f"give some of {', '.join(METRICS)}"):
@@ -90,7 +90,7 @@ def test_what_cannot_be_computed_is_refused(tmp_path: Path) -> None:
         ssim(np.zeros((6, 9)), np.zeros((6, 9)), data_range=1)
 
 
-def test_means_over_sequences_have_no_weights() -> None:
+def test_means_over_sequences_are_unweighted() -> None:
     def score(frames: int, **means: float) -> SequenceScore:
         return SequenceScore("a", "b", frames, 0, 0, 0, means)
 
@@ -98,7 +98,7 @@ def test_means_over_sequences_have_no_weights() -> None:
     assert mean_over_sequences([]) == {}
 
 
-def test_correlation_knows_no_brightness_or_contrast_and_a_blank_has_none() -> None:
+def test_correlation_ignores_brightness_and_contrast_and_is_0_for_a_blank() -> None:
     rng = np.random.default_rng(0)
     picture, other = rng.random((2, 9, 11))
     (metric,) = make_metrics(["correlation"], {}).values()
@@ -108,7 +108,7 @@ def test_correlation_knows_no_brightness_or_contrast_and_a_blank_has_none() -> N
     assert metric(np.full_like(picture, 0.5), picture) == 0
 
 
-def test_a_blank_is_scored_beside_every_network() -> None:
+def test_a_blank_is_scored_as_a_baseline() -> None:
     target = np.random.default_rng(1).integers(0, 256, (9, 11), dtype=np.uint8)
     scorer = SequenceScorer(make_metrics(["mse", "correlation"], {}))
     window = EventWindow(0, 0, 0.0, 1.0, Image("a", 1.0, 0))

@@ -1,4 +1,4 @@
-"""Recordings in the layout of each data set, with the faults that published files have."""
+"""Test recordings in the layout of each data set, with the faults of published files."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_an_event_at_the_time_of_a_picture_belongs_to_the_window_after_it(tmp_pa
         assert [opened.events(window).t.tolist() for window in picture_windows(opened)] == [[1.0, 1.1], [1.2, 1.3]]
 
 
-def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path) -> None:
+def test_event_indices_one_early_are_repaired_or_kept_as_published(tmp_path: Path) -> None:
     path = recording(tmp_path, stamped(1.05, 1.25, 1.45, shift=-1))
     with Recording(path) as opened:
         assert [len(opened.events(window)) for window in picture_windows(opened)] == [2, 2]
@@ -73,7 +73,7 @@ def test_event_indices_one_early_are_mended_or_kept_as_published(tmp_path: Path)
         assert opened.events(picture_windows(opened)[0]).t.tolist() == [1.0, 1.1]
 
 
-def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Path) -> None:
+def test_a_time_stamp_that_goes_back_is_repaired_or_kept_as_published(tmp_path: Path) -> None:
     """Pictures at 1.05, 1.25, [1.15], 1.45: the third is moved to 1.35. Published: an empty window, then 3 events."""
     path = recording(tmp_path, stamped(1.05, 1.25, 1.15, 1.45))
     with Recording(path) as opened:
@@ -91,28 +91,28 @@ def test_a_time_stamp_that_goes_back_is_mended_or_kept_as_published(tmp_path: Pa
         assert opened.images[-1].time == pytest.approx(1.35)
 
 
-def test_clocks_that_do_not_fit_are_refused_or_taken_as_published(tmp_path: Path) -> None:
+def test_different_clocks_are_refused_or_accepted_as_published(tmp_path: Path) -> None:
     """The released aedat4 script searches microseconds in seconds: every event_idx is the number of events."""
     attributes = [{"timestamp": 1.6e15 + step, "event_idx": 6} for step in range(2)]
     path = recording(tmp_path, attributes)
-    with pytest.raises(UsageError, match=r"not one clock.*v2v-convert.*--as-published"):
+    with pytest.raises(UsageError, match=r"different clocks.*v2v-convert.*--as-published"):
         Recording(path)
     with Recording(path, as_published=True) as opened:
         assert [len(opened.events(window)) for window in picture_windows(opened)] == [0]
 
 
 @pytest.mark.parametrize("shift", [0, -1])
-def test_clocks_of_another_unit_are_refused_although_they_overlap(tmp_path: Path, shift: int) -> None:
-    """Both count from the first picture, one in microseconds."""
+def test_clocks_of_different_units_are_refused_even_if_they_overlap(tmp_path: Path, shift: int) -> None:
+    """Both clocks start at the first picture, but one counts microseconds."""
     attributes = stamped(1.05, 1.25, 1.45, shift=shift)
     for attribute in attributes:
         attribute["timestamp"] = 1.05 + (attribute["timestamp"] - 1.05) * 1e6
-    with pytest.raises(UsageError, match="not one clock"):
+    with pytest.raises(UsageError, match="different clocks"):
         Recording(recording(tmp_path, attributes))
 
 
 @pytest.mark.parametrize("index", [5, 6])
-def test_pictures_before_and_after_all_events_are_taken(tmp_path: Path, index: int) -> None:
+def test_pictures_before_and_after_all_events_are_accepted(tmp_path: Path, index: int) -> None:
     """The released conversion of HQF writes one event less."""
     attributes = [{"timestamp": time, "event_idx": index if time > 2 else 0} for time in (-2.0, 1.25, 3.0, 4.0)]
     with Recording(recording(tmp_path, attributes)) as opened:
@@ -126,13 +126,13 @@ def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
         assert [image.time for image in opened.images] == [1.1, 1.4]
 
 
-def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
+def test_time_ranges_count_from_the_first_picture(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
     with Recording(path) as opened:
         windows = picture_windows(opened, (1.0, 3.0))
         assert len(windows) == 19
         assert windows[0].begin == pytest.approx(2.0)
-        assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a cut is not in it, as released
+        assert windows[-1].end == pytest.approx(3.9)  # the picture at the end of a time range is not in it, as released
         assert len(picture_windows(opened, (0.0, 60.0))) == 50
         with pytest.raises(UsageError, match=r"lasts 5\.00 s, and the time range is from 5 to 20 s.*--cuts none"):
             picture_windows(opened, (5.0, 20.0))
@@ -140,7 +140,7 @@ def test_cuts_count_from_the_first_picture(tmp_path: Path) -> None:
             picture_windows(opened, (4.96, 5.5))
 
 
-def test_a_later_cut_begins_and_ends_so_many_pictures_on(tmp_path: Path) -> None:
+def test_a_shifted_time_range_moves_by_pictures(tmp_path: Path) -> None:
     with Recording(random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)) as opened:
         for time_range, first, last in (((1.05, 3.05), 12, 31), ((0.0, 60.0), 1, 50)):
             windows = picture_windows(opened, time_range, later=1)
@@ -176,7 +176,7 @@ def test_windows_of_time_have_the_picture_nearest_to_their_end(tmp_path: Path) -
             windows_of_seconds(opened, 2.0)
 
 
-def test_windows_of_events_have_as_many_each(tmp_path: Path) -> None:
+def test_windows_of_events_have_equal_numbers(tmp_path: Path) -> None:
     with Recording(recording(tmp_path, stamped(1.05, 1.21, 1.4))) as opened:
         windows = windows_of_events(opened, 2)
         assert [(window.start, window.stop) for window in windows] == [(0, 2), (2, 4), (4, 6)]
@@ -192,7 +192,7 @@ def test_windows_of_events_have_as_many_each(tmp_path: Path) -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(1, 400), st.floats(0.005, 0.2), st.booleans())
-def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
+def test_windows_are_consecutive_and_a_picture_is_scored_once(
     tmp_path_factory: pytest.TempPathFactory, events: int, seconds: float, is_cut: bool
 ) -> None:
     path = random_recording(tmp_path_factory.mktemp("any") / "a.h5", images=21)
@@ -217,14 +217,14 @@ def test_any_windows_follow_each_other_and_a_picture_is_scored_once(
             assert set(keys) <= allowed
 
 
-def test_a_size_may_be_given_where_nothing_states_it(tmp_path: Path) -> None:
+def test_a_size_may_be_given_if_the_file_states_none(tmp_path: Path) -> None:
     numbers = np.arange(6)
     path = write_h5(tmp_path / "a.h5", T, numbers % 4, numbers % 3, numbers % 2, [])
-    with pytest.raises(UsageError, match="say the sensor's size with --size WxH"):
+    with pytest.raises(UsageError, match="give the sensor's size with --size WxH"):
         Recording(path)
     with Recording(path, size=(3, 4)) as opened:
         assert opened.size == (3, 4)
-    write_h5(path, T, numbers % 4, numbers % 3, numbers % 2, [], sensor_resolution=(4, 3))  # x, y: the wrong way round
+    write_h5(path, T, numbers % 4, numbers % 3, numbers % 2, [], sensor_resolution=(4, 3))  # x, y swapped
     with Recording(path, size=(3, 4)) as opened:
         assert opened.size == (3, 4)
 
@@ -310,15 +310,15 @@ def broken(path: Path, kind: str) -> Path:
         ("columns", r"columns of events have \[2, 6\]"),
         ("rows", r"events/xs is int64 \[6, 1\], not a column"),
         ("scalar", r"events/xs is int64 \[\], not a column"),
-        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], of whole numbers"),
+        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], which for coordinates"),
         ("raw", r"no events/ts.*v2v-convert"),
-        ("no images or size", "say the sensor.s size with --size WxH"),
+        ("no images or size", "give the sensor.s size with --size WxH"),
         ("no index", "without the attribute event_idx"),
         ("colour", r"is \[3, 4, 3\], not \[H, W\]"),
-        ("twice back", "only single ones can be mended"),
+        ("twice back", "only single times can be repaired"),
     ],
 )
-def test_what_cannot_be_read_is_refused(tmp_path: Path, kind: str, message: str) -> None:
+def test_unreadable_recordings_are_refused(tmp_path: Path, kind: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Recording(broken(tmp_path, kind))
 
@@ -330,7 +330,7 @@ def disordered(path: Path, order: list[int]) -> Path:
     return write_h5(path / "a.h5", T[numbers], numbers % 4, numbers % 3, numbers % 2, pictures)
 
 
-def test_late_events_are_sorted_in(tmp_path: Path) -> None:
+def test_late_events_are_sorted(tmp_path: Path) -> None:
     with Recording(disordered(tmp_path, [0, 2, 1, 4, 3, 5])) as opened:
         for window, times, columns in zip(
             picture_windows(opened), ([1.1, 1.2], [1.3, 1.4]), ([1, 2], [3, 0]), strict=True
@@ -341,7 +341,7 @@ def test_late_events_are_sorted_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", [[0, 1, 5, 3, 4, 2], [5, 4, 3, 2, 1, 0]])
-def test_events_without_an_order_are_refused(tmp_path: Path, order: list[int]) -> None:
+def test_unsorted_events_are_refused(tmp_path: Path, order: list[int]) -> None:
     with (
         Recording(disordered(tmp_path, order)) as opened,
         pytest.raises(UsageError, match=r"event \d, at .*Sort the file"),
@@ -349,7 +349,7 @@ def test_events_without_an_order_are_refused(tmp_path: Path, order: list[int]) -
         opened.events(EventWindow(0, len(T), 1.05, 1.25, None))
 
 
-def test_times_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+def test_nan_times_are_refused(tmp_path: Path) -> None:
     pictures = [(PIXELS, given) for given in stamped(1.05, 1.45)]
     path = write_h5(tmp_path / "a.h5", np.where(T == 1.2, np.nan, T), T, T, T, pictures)
     with Recording(path) as opened, pytest.raises(UsageError, match="event 2, at nan s"):
@@ -357,7 +357,7 @@ def test_times_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def damaged(path: Path, name: str) -> Path:
-    """A recording in which the compressed bytes of one dataset are none."""
+    """Write a recording in which one dataset's compressed bytes are invalid."""
     import h5py
 
     file = recording(path, stamped(1.05, 1.25, 1.45))
@@ -371,7 +371,7 @@ def damaged(path: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", ["events/ts", "events/xs", "images/image000000002"])
-def test_damage_is_told(tmp_path: Path, name: str) -> None:
+def test_damage_is_reported(tmp_path: Path, name: str) -> None:
     file = damaged(tmp_path, name)
 
     def read() -> None:
@@ -383,7 +383,7 @@ def test_damage_is_told(tmp_path: Path, name: str) -> None:
         read()
 
 
-def test_a_compression_that_is_not_installed_is_told(tmp_path: Path) -> None:
+def test_a_missing_compression_plugin_is_reported(tmp_path: Path) -> None:
     import h5py
 
     file = recording(tmp_path, stamped(1.05, 1.25))

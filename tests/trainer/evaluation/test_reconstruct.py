@@ -1,4 +1,4 @@
-"""Running a network over a recording: memory, padding, windows without pictures; and which network a file is of."""
+"""Test running a network over a recording: memory, padding, windows without pictures, recognising weight files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def small_e2vid(**options: object) -> E2VID:
 
 @pytest.mark.parametrize("network", [small_e2vid(), FireNet(base_channels=4)], ids=["e2vid", "firenet"])
 def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelNetwork) -> None:
-    """More windows than one call takes, and a size that the network has to pad (37 x 43)."""
+    """There are more windows than one call takes, and the network must pad the size (37 x 43)."""
     count = 2 * WINDOWS_PER_CALL + 3
     path = random_recording(tmp_path / "a.h5", size=(37, 43), images=count + 1, events=4000)
     with Recording(path) as recording:
@@ -43,7 +43,7 @@ def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelN
     np.testing.assert_allclose(np.stack([step.prediction for step in steps]), whole, rtol=0, atol=1e-6)
 
 
-def test_the_memory_is_new_for_every_sequence(tmp_path: Path) -> None:
+def test_the_memory_is_reset_for_every_sequence(tmp_path: Path) -> None:
     network = small_e2vid()
     first = random_recording(tmp_path / "a.h5", seed=1)
     second = random_recording(tmp_path / "b.h5", seed=2)
@@ -69,11 +69,11 @@ def test_windows_without_a_picture_show_the_latest(tmp_path: Path) -> None:
             assert step.camera_time <= step.window.end < step.camera_time + 0.1 + 1e-9
 
 
-def test_what_the_network_cannot_take_or_gives_is_refused(tmp_path: Path) -> None:
+def test_wrong_bins_and_non_finite_outputs_are_refused(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5")
     network = FireNet(base_channels=2)
     with Recording(path) as recording:
-        with pytest.raises(UsageError, match="voxels of 4 bins, and the network takes 5"):
+        with pytest.raises(UsageError, match="voxels have 4 bins, but the network takes 5"):
             next(reconstruct(recording, picture_windows(recording), network, VoxelSettings(bins=4)))
         with torch.no_grad():
             network.net.pred.conv2d.bias.fill_(float("nan"))  # type: ignore[union-attr]
@@ -107,7 +107,7 @@ def test_networks_are_recognised(tmp_path: Path) -> None:
             assert torch.equal(loaded.state_dict()[key], tensor)
 
 
-def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
+def test_own_checkpoints_name_their_network(tmp_path: Path) -> None:
     network = FireNet(base_channels=4, normalize_voxels=True)
     config = {"network": {"name": "firenet", "options": {"base_channels": 4, "normalize_voxels": True}, "weights": ""}}
     save_checkpoint(
@@ -119,7 +119,7 @@ def test_own_checkpoints_say_what_they_are(tmp_path: Path) -> None:
     assert not load_network(tmp_path / "last.pt", options={"normalize_voxels": False})[0].normalizes
 
 
-def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
+def test_unknown_networks_are_refused(tmp_path: Path) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
     with pytest.raises(UsageError, match=r"is none of e2vid, .*--model"):
         load_network(tmp_path / "a.pth")
@@ -132,7 +132,7 @@ def test_what_is_no_network_is_refused(tmp_path: Path) -> None:
 
 
 def test_equalized_pictures_have_every_grey_value_as_often() -> None:
-    """Whatever the order-preserving curve that a network's pictures went through."""
+    """This holds after any monotonic mapping of the network's pictures."""
     ramp = np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(1, 64, 64)
     (equal,) = _stretch(ramp**1.3, "equalized")
     counts, _ = np.histogram(equal, 8, (0, 1))

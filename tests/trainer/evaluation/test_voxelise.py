@@ -1,4 +1,4 @@
-"""Voxel grids: a slow oracle in exact fractions, conservation, time reversal, the two kinds of span."""
+"""Test voxel grids: a slow oracle in exact fractions, conservation, time reversal, the two kinds of span."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def grid(rows: list[tuple[int, int, int, int]], kind: str, bins: int = 5, **opti
 
 
 def oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> np.ndarray:
-    """The module's formulas, event by event, in exact fractions."""
+    """Compute the module's formulas event by event, in exact fractions."""
     result = [[[Fraction(0)] * SIZE[1] for _ in range(SIZE[0])] for _ in range(bins)]
     delta = Fraction(1, 1000 if kind == "discrete" else 10_000)
     for t, x, y, p in rows:
@@ -47,7 +47,7 @@ def oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> np.nd
 
 
 @given(recorded, st.sampled_from(("discrete", "interpolated")), st.integers(1, 7))
-def test_equals_the_oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> None:
+def test_voxel_grids_equal_the_oracle(rows: list[tuple[int, int, int, int]], kind: str, bins: int) -> None:
     np.testing.assert_allclose(grid(rows, kind, bins), oracle(rows, kind, bins), rtol=0, atol=1e-5)
 
 
@@ -79,7 +79,7 @@ def test_reversed_time_reverses_interpolated_bins(rows: list[tuple[int, int, int
 
 @given(st.lists(st.integers(0, 999), min_size=1, max_size=40), st.integers(1, 7))
 def test_reversed_time_reverses_discrete_bins(steps: list[int], bins: int) -> None:
-    """With the events inside the bins: at an edge an event belongs to the later bin, in either direction."""
+    """Events lie inside the bins, because at an edge an event belongs to the later bin in both directions."""
     # Odd multiples of 1 us in a span of bins * 2000 us are never on an edge; 0 and the end fix the span.
     times = [0, *sorted(2 * bins * step + 1 for step in steps), 2000 * bins]
     inside = [t for t in times if t % 2000 or t in (0, 2000 * bins)]
@@ -115,7 +115,7 @@ def test_truncation_moves_an_event_that_is_just_below_its_microsecond(truncate: 
 
 @pytest.mark.parametrize("kind", ["discrete", "interpolated"])
 @pytest.mark.parametrize("span", ["events", "window"])
-def test_no_event_and_events_at_one_time(kind: str, span: str) -> None:
+def test_no_events_and_simultaneous_events_are_valid(kind: str, span: str) -> None:
     nothing = Events(np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
     settings = VoxelSettings(kind=kind, span=span)  # type: ignore[arg-type]
     assert not voxel_grid(nothing, SIZE, settings, (0, 1)).any()

@@ -1,4 +1,4 @@
-"""Warp, temporal consistency, L1 and their sum: analytic motion, a numpy oracle, signs, gradients."""
+"""Test warp, temporal consistency, L1 and their sum: analytic motion, a NumPy oracle, signs, gradients."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ HEIGHT, WIDTH = 20, 24
 
 
 def uniform(x: float, y: float, count: int = 1, height: int = HEIGHT, width: int = WIDTH) -> torch.Tensor:
-    """The same displacement everywhere: [count, 2, height, width] float64."""
+    """Return a constant displacement, [count, 2, height, width] float64."""
     return torch.tensor([x, y], dtype=torch.float64).view(1, 2, 1, 1).expand(count, 2, height, width)
 
 
 def moving(velocity: tuple[float, float], steps: int, *, offset: float = 0.5) -> torch.Tensor:
-    """A texture that moves ``velocity`` px a step: [1, steps, 1, H, W] float64 in 0 .. 1."""
+    """Return a texture that moves ``velocity`` px per step: [1, steps, 1, H, W] float64 in 0 .. 1."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
     frames = []
     for step in range(steps):
@@ -104,7 +104,7 @@ def test_warp_refuses_other_shapes() -> None:
 
 @given(x=st.integers(-3, 3), y=st.integers(-3, 3), scale=st.floats(-2, 2), shift=st.floats(-1, 1))
 def test_zero_for_a_pair_that_moves_with_the_flow(x: int, y: int, scale: float, shift: float) -> None:
-    """Whatever brightness the reconstruction has, negative ones included, as long as it moves as the truth does."""
+    """The reconstruction may have any brightness, even negative, if it moves like the truth."""
     target = moving((x, y), 3)
     loss = TemporalConsistency(first_step=1)(scale * target + shift, target, backward_flow((x, y), 2))
     assert loss.item() < 1e-9
@@ -113,7 +113,7 @@ def test_zero_for_a_pair_that_moves_with_the_flow(x: int, y: int, scale: float, 
 @pytest.mark.parametrize("velocity", [(2, 0), (-2, 0), (0, 2), (0, -2), (1, -2)])
 @pytest.mark.parametrize("as_published", [False, True])
 def test_the_sign_is_right_for_motion_both_ways(velocity: tuple[int, int], as_published: bool) -> None:
-    """A blob on black, so that the edge of the picture plays no part in the published form."""
+    """The picture is a blob on black, so that its edge does not matter in the published form."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     frames = [
         np.clip(1 - ((x - 12 - velocity[0] * t) ** 2 + (y - 10 - velocity[1] * t) ** 2) / 9, 0, 1) for t in range(3)
@@ -180,7 +180,7 @@ def test_gradient_is_finite_for_a_black_prediction() -> None:
 
 
 def test_the_mask_forgives_what_the_truth_does_not_do() -> None:
-    """Where the true picture jumps, a reconstruction that does not costs next to nothing."""
+    """Where the true picture changes abruptly, a reconstruction that does not has almost no loss."""
     target = torch.zeros(1, 2, 1, HEIGHT, WIDTH, dtype=torch.float64)
     target[:, 1] = 1
     prediction = torch.rand_like(target)
@@ -257,7 +257,7 @@ def test_the_sum_is_weighted_and_its_terms_are_reported() -> None:
     assert prediction.grad is not None
 
 
-def test_nothing_waits_for_the_device() -> None:
+def test_computing_does_not_synchronise_with_the_device() -> None:
     """Fake tensors have no values: reading one raises."""
     loss = ReconstructionLoss(
         lpips=LPIPS("squeeze"), temporal=TemporalConsistency(first_step=1), lpips_weight=1, temporal_weight=1

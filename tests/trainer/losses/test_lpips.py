@@ -1,4 +1,4 @@
-"""LPIPS against a float64 numpy network (all three backbones) and against the published package (SqueezeNet)."""
+"""Compare LPIPS with a float64 NumPy network (all three backbones) and with the published package (SqueezeNet)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def picture(kind: int, height: int, width: int) -> torch.Tensor:
 
 
 def random_metric(net: str, seed: int = 0) -> tuple[LPIPS, dict[str, np.ndarray], list[np.ndarray]]:
-    """The metric in float64 with random weights, and the same weights in numpy."""
+    """Return the metric in float64 with random weights, and the same weights in NumPy."""
     metric = LPIPS(net).double()
     # Constants of float32 turned into float64 would be off by 1e-8.
     metric.shift.copy_(torch.tensor(SHIFT, dtype=torch.float64).view(3, 1, 1))
@@ -81,7 +81,7 @@ def squeeze() -> LPIPS:
     return metric
 
 
-def test_a_picture_is_at_distance_zero_of_itself_and_the_distance_is_symmetric(squeeze: LPIPS) -> None:
+def test_the_distance_is_symmetric_and_zero_for_equal_pictures(squeeze: LPIPS) -> None:
     first, second = picture(0, 24, 24), picture(1, 24, 24)
     assert squeeze(first, first).item() == 0
     assert squeeze(first, second).item() > 0
@@ -115,14 +115,14 @@ def test_gradients_reach_the_prediction_only(squeeze: LPIPS) -> None:
 
 
 def test_the_gradient_is_that_of_finite_differences() -> None:
-    """Of the smooth parts; the network's own is PyTorch's."""
+    """This checks the smooth parts; PyTorch computes the gradient of the network itself."""
     torch.manual_seed(0)
     features = torch.rand(2, 4, 3, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(unit_length, (features,))
 
 
 def test_dead_features_give_gradient_zero_not_nan() -> None:
-    """Where all channels are 0 the published formula gives NaN, for every pixel below."""
+    """Where all channels are 0, the published formula gives NaN for every pixel in the receptive field."""
     dead = torch.zeros(1, 4, 2, 2, requires_grad=True)
     published = dead / (dead.square().sum(1, keepdim=True).sqrt() + 1e-10)
     (published.sum()).backward()
@@ -177,13 +177,13 @@ def test_wrong_shapes_are_refused(squeeze: LPIPS) -> None:
 
 
 def torchvision_like(metric: LPIPS) -> dict[str, torch.Tensor]:
-    """A whole state dict as torchvision saves it."""
+    """Return a complete state dict as torchvision saves it."""
     whole = {f"features.{name}": tensor for name, tensor in metric.features.state_dict().items()}
     return whole | {"classifier.1.weight": torch.zeros(2, 2)}
 
 
 def heads_file(metric: LPIPS) -> dict[str, torch.Tensor]:
-    """The heads as LPIPS publishes them."""
+    """Write the heads as LPIPS publishes them."""
     layers = range(len(metric.backbone.channels))
     return {f"lin{layer}.model.1.weight": metric.get_buffer(f"head{layer}")[None, :, None, None] for layer in layers}
 

@@ -1,7 +1,7 @@
-"""The networks and losses again, one picture and one time step at a time, in float64 numpy.
+"""Reimplement the networks and losses in float64 NumPy, one picture and one time step at a time.
 
-What the tests compare with: written from the equations and key lists, sharing no code with the trainer. Pictures are
-[C, H, W].
+Tests compare the trainer with these. They follow the equations and key lists and share no code with the trainer.
+Pictures are [C, H, W].
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Weights = Mapping[str, Array]
 
 
 def counts(shape: tuple[int, ...], seed: int = 0) -> npt.NDArray[np.int8]:
-    """Signed event counts, mostly 0, as they come from the stream."""
+    """Return signed event counts, mostly 0, as in the stream."""
     rng = np.random.default_rng(seed)
     return (rng.integers(-3, 4, shape) * (rng.random(shape) < 0.3)).astype(np.int8)
 
 
 def random_weights(network: torch.nn.Module, seed: int) -> dict[str, Array]:
-    """Weights of the scale of an initialised network, drawn key by key; put into ``network`` as well, in float64."""
+    """Draw weights of an initialised network's scale, key by key, and load them into ``network`` in float64."""
     rng = np.random.default_rng(seed)
     state = {}
     for name, tensor in network.state_dict().items():

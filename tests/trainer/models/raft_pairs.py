@@ -1,4 +1,4 @@
-"""What RAFT is compared on: two pictures, and weights that are a formula, so that no file of a network is needed."""
+"""Define the inputs of the RAFT comparison: two pictures, and weights from a formula instead of a file."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ def pictures() -> tuple[Tensor, Tensor]:
 
 
 def formula_weights(like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Numbers for every entry of a state: spread over -1 .. 1 by multiplication with the golden ratio (mod 1), scaled
-    to keep activations about as large from layer to layer, and a little smaller, so that rounding does not grow."""
+    """Return numbers for every entry of a state dict, spread over -1 .. 1 by multiples of the golden ratio (mod 1).
+
+    They are scaled so that activations shrink slightly from layer to layer, which keeps rounding errors from growing.
+    """
     made = {}
     for number, (name, value) in enumerate(like.items()):
         turns = (np.arange(1, value.numel() + 1, dtype=np.float64) * 0.6180339887498949 + number * 0.37) % 1.0

@@ -1,4 +1,4 @@
-"""Records what torchvision's RAFT makes of the pictures of ``raft_pairs.py``, for the tests, which do without it.
+"""Record the output of torchvision's RAFT for the pictures of ``raft_pairs.py``, so that tests do not need torchvision.
 
     python -m tests.trainer.models.record_raft raft-small_princeton.pth tests/trainer/raft_torchvision.npz
 
@@ -18,7 +18,7 @@ from tests.trainer.models.raft_pairs import SAMPLED, formula_weights, pictures
 
 
 def torchvision_networks() -> dict[str, torch.nn.Module]:
-    """Its two networks, without weights."""
+    """Return torchvision's two networks, without weights."""
     library = torch.library.Library("torchvision", "DEF")
     for operator in ("nms", "qnms"):
         library.define(f"{operator}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
@@ -32,7 +32,7 @@ def torchvision_networks() -> dict[str, torch.nn.Module]:
 
 @torch.no_grad()
 def flow(network: torch.nn.Module, first: Tensor, second: Tensor) -> np.ndarray:
-    """The last prediction, cropped to the pictures' size and thinned out."""
+    """Return the last prediction, cropped to the pictures' size and subsampled."""
     height, width = first.shape[2:]
 
     def prepared(frames: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""``compute.compile: step``: a network whose loops are compiled turn by turn is the network."""
+"""Test ``compute.compile: step``: compiling one iteration of each loop does not change a network."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NETWORKS = {
 
 
 def compared(network: VoxelNetwork) -> None:
-    """Outputs, gradients and statistics of two training steps; and what it says when it is not in training."""
+    """Compare outputs, gradients and statistics of two training steps, and the output outside training."""
     eager = copy.deepcopy(network)
     network.compile_turns()
     torch.manual_seed(0)
@@ -61,8 +61,8 @@ def close(network: VoxelNetwork, eager: VoxelNetwork) -> None:
     "name",
     [pytest.param(name, marks=[] if name == "firenet" else [pytest.mark.slow]) for name in NETWORKS],
 )
-def test_a_turn_is_traced_as_it_is(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All that ``torch.compile`` does but the making of machine code."""
+def test_one_iteration_is_traced_without_changes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This runs all of ``torch.compile`` except code generation."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
     torch.manual_seed(3)

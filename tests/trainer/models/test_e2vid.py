@@ -1,4 +1,4 @@
-"""E2VID against a float64 numpy network, and its published keys."""
+"""Compare E2VID with a float64 NumPy network, and with its published keys."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_keys_shapes_and_size_are_the_published_ones() -> None:
 
 
 def test_equals_the_numpy_network() -> None:
-    """Full size, two clips of two steps, sides that need padding."""
+    """The network has its full size; the input is two clips of two steps with sides that need padding."""
     model = E2VID()
     weights = oracle.random_weights(model, seed=1)
     voxels = counts((2, 2, 5, 13, 18))
@@ -87,7 +87,7 @@ def test_unknown_settings_are_refused(options: dict[str, str]) -> None:
         E2VID(**options)  # type: ignore[arg-type]
 
 
-def test_padding_is_cut_off_again() -> None:
+def test_padding_is_cropped_from_the_output() -> None:
     model = E2VID(base_channels=4, encoders=2)
     voxels = torch.from_numpy(counts((1, 2, 5, 16, 32)))
     voxels[..., 13:, :] = 0

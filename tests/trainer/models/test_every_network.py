@@ -1,4 +1,4 @@
-"""What holds for every network: published keys and sizes, memory, batches, sizes of pictures, no waits."""
+"""Test properties of every network: published keys and sizes, memory, batches, picture sizes, no synchronisation."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(autouse=True)
 def _two_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of E-RAFT, whose other ten say nothing new here."""
+    """Limit E-RAFT to two updates; the other ten would test nothing more."""
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
 
 
 @pytest.fixture
 def network(name: str) -> VoxelNetwork:
-    """Each network, small, with weights that let the memory matter."""
+    """Return each network at a small size, with weights for which the memory matters."""
     torch.manual_seed(0)
     return NETWORKS[name](**SMALL[name]).eval()
 
@@ -183,7 +183,7 @@ def test_published_files_are_recognised_and_load_strictly(
 
 
 def test_pieces_with_their_state_equal_the_whole(name: str, network: VoxelNetwork) -> None:
-    """Sides that divide by nothing."""
+    """The sides are not multiples of any size that a network needs."""
     voxels = torch.from_numpy(counts((2, 5, 5, 17, 23)))
     with torch.no_grad():
         whole, last = network(voxels)
@@ -257,8 +257,8 @@ def test_wrong_shapes_are_refused(network: VoxelNetwork, shape: tuple[int, ...])
 
 
 @pytest.mark.parametrize("padding", ["bottom-right", "centred", "top-left"])
-def test_padding_is_zeros_where_it_is_said(name: str, padding: str) -> None:
-    """As a picture that has these zeros itself."""
+def test_padding_is_zeros_at_the_stated_sides(name: str, padding: str) -> None:
+    """The output equals that for an input which contains these zeros."""
     torch.manual_seed(0)
     network = NETWORKS[name](**SMALL[name], padding=padding).eval()  # type: ignore[arg-type]
     left, right, top, bottom = network._edges(19, 21)
@@ -275,7 +275,7 @@ def test_padding_is_zeros_where_it_is_said(name: str, padding: str) -> None:
         torch.testing.assert_close(network.forward_sequence(voxels), expected, rtol=0, atol=1e-5)
 
 
-def test_nothing_waits_for_the_device(name: str, network: VoxelNetwork) -> None:
+def test_computing_does_not_synchronise_with_the_device(name: str, network: VoxelNetwork) -> None:
     """Fake tensors have no values: reading one (``item``, ``if tensor``, boolean indexing) raises."""
     network.normalizes = True
     guide = Guide(torch.zeros(2, 3, 1, 17, 20), 0.5)

@@ -1,4 +1,4 @@
-"""FireNet against a float64 numpy network, and its published weights."""
+"""Compare FireNet with a float64 NumPy network, and test its published weights."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_equals_the_numpy_network(normalizes: bool) -> None:
         np.testing.assert_allclose(pictures.numpy(), expected, rtol=0, atol=1e-5)
 
 
-def test_starts_grey() -> None:
+def test_an_untrained_network_predicts_grey() -> None:
     torch.manual_seed(0)
     pictures = FireNet().forward_sequence(torch.zeros(1, 2, 5, 8, 8))
     assert abs(pictures.mean() - 0.5) < 0.2
@@ -50,7 +50,7 @@ def test_starts_grey() -> None:
 
 @pytest.mark.parametrize("name", ["firenet_evreal.pth", "firenet_plus_state_dict.pth"])
 def test_published_weights_load_strictly_and_follow_an_edge(published: Path, name: str) -> None:
-    """A bright bar moving right: where it stands the reconstruction is brighter than behind and ahead of it."""
+    """A bright bar moves right: the reconstruction is brighter at the bar than behind and ahead of it."""
     model = FireNet(normalize_voxels=name == "firenet_evreal.pth")
     report = load_into(model, published / name)
     assert len(report.used) == len(model.state_dict()) == 24

@@ -1,4 +1,4 @@
-"""The operators of HyperE2VID, ET-Net and E-RAFT against slow float64 versions, written from their equations."""
+"""Compare the operators of HyperE2VID, ET-Net and E-RAFT with slow float64 versions of their equations."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def bilinear(plane: np.ndarray, x: float, y: float) -> float:
 
 
 def test_correlations_are_looked_up_around_where_the_flow_points() -> None:
-    """Also where the coarsest plane is one pixel high."""
+    """This includes a coarsest plane that is one pixel high."""
     height, width, radius = 8, 11, 2
     one, other = RNG.standard_normal((2, 1, 6, height, width))
     flow = 3 * RNG.standard_normal((1, 2, height, width))
@@ -159,7 +159,7 @@ def test_correlations_are_looked_up_around_where_the_flow_points() -> None:
 
 
 def test_splatting() -> None:
-    """The order of the published code: every vector on the four pixels around its end, then divided by the weights."""
+    """As in the published code, each vector is added to the four pixels around its end, then divided by the weights."""
     flow = 2 * RNG.standard_normal((2, 2, 5, 7))
     flow[0, :, 2, 3] = (1.0, -1.0)  # ends on a pixel
     expected = np.zeros_like(flow)
@@ -186,7 +186,7 @@ def test_uniform_flow_is_carried_along_and_leaves_a_hole() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("by_window", [False, True])
 def test_batch_norm_of_the_context_is_that_of_one_window_only_if_asked(by_window: bool) -> None:
-    """In training, as a loop over windows has it."""
+    """In training the result equals that of a loop over windows."""
     torch.manual_seed(0)
     network = ERAFT(bins=2, context_by_window=by_window, warm_start=False).train()
     looped = copy.deepcopy(network)

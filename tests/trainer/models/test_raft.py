@@ -1,4 +1,4 @@
-"""RAFT against recordings of torchvision's (``record_raft.py``), and the two layouts of its weights."""
+"""Compare RAFT with recordings of torchvision's (``record_raft.py``), and test both layouts of its weights."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _TO_AUTHORS = (
 
 
 def in_the_authors_layout(state: dict[str, Tensor], size: str) -> dict[str, Tensor]:
-    """As princeton-vl/RAFT saves it, from DataParallel: the norm of each shortcut stands there twice."""
+    """Rename a state dict as princeton-vl/RAFT saves it, from DataParallel, with the norm of each shortcut twice."""
     renamed = {}
     for name, value in state.items():
         for pattern, replacement in _TO_AUTHORS:
@@ -93,7 +93,7 @@ def test_parameters(size: str) -> None:
     assert set(map(torchvision_name, RAFT(size).state_dict())) == set(RAFT(size).state_dict())
 
 
-def test_batches_are_cut_without_a_trace_and_bytes_are_as_good_as_floats(tmp_path: Path) -> None:
+def test_chunking_and_dtype_do_not_change_the_flow(tmp_path: Path) -> None:
     path = saved(tmp_path, "small")
     first, second = pictures()
     whole = RaftFlow("small", path)(first, second)
@@ -117,14 +117,14 @@ def test_small_pictures_are_padded_to_what_the_pyramid_needs(tmp_path: Path) -> 
 @pytest.mark.skipif(not PUBLISHED.is_file(), reason=f"no {PUBLISHED}; set V2V_TEST_WEIGHTS")
 @pytest.mark.slow
 def test_bfloat16_stays_near() -> None:
-    """With weights that estimate flow: those of the formula amplify every rounding."""
+    """It uses weights that estimate flow, because those of the formula amplify every rounding."""
     exact = RaftFlow("small", PUBLISHED)(*pictures())
     near = RaftFlow("small", PUBLISHED, bfloat16=True)(*pictures())
     assert near.dtype == torch.float32
     assert 0 < (near[0] - exact[0]).norm(dim=0).median() < 0.1
 
 
-def test_the_neighbourhood_is_read_where_it_should_be() -> None:
+def test_correlations_are_sampled_at_the_right_positions() -> None:
     """Against plain indexing: offsets in x vary slowest, those in y fastest."""
     plane = torch.arange(35.0).reshape(1, 1, 5, 7).repeat(35, 1, 1, 1)
     y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
@@ -137,7 +137,7 @@ def test_the_neighbourhood_is_read_where_it_should_be() -> None:
     np.testing.assert_allclose(found[0], expected, atol=1e-4)
 
 
-def test_weights_that_do_not_serve_are_refused_with_a_source(tmp_path: Path) -> None:
+def test_unsuitable_weights_are_refused_with_a_source(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no file .*none\.pth.*download\.pytorch\.org.*raft_small"):
         RaftFlow("small", tmp_path / "none.pth")
     (tmp_path / "text.pth").write_text("hello")

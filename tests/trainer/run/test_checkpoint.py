@@ -78,7 +78,7 @@ def test_calls_in_a_pickle_become_placeholders(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_whole_objects_beside_the_weights_do_no_harm(tmp_path: Path, zipped: bool) -> None:
+def test_pickled_objects_beside_the_weights_are_ignored(tmp_path: Path, zipped: bool) -> None:
     """As event_cnn_minimal and V2V save: optimiser and scheduler as objects, a ConfigParser."""
     model = small()
     optimizer = torch.optim.Adam(model.parameters(), amsgrad=True)
@@ -150,7 +150,7 @@ def test_absent_files_and_files_without_weights_are_refused(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "module._orig_mod.", "_orig_mod.module."])
 @pytest.mark.parametrize("container", ["bare", "state_dict", "model"])
-def test_wrappers_leave_no_trace(tmp_path: Path, prefix: str, container: str) -> None:
+def test_prefixes_of_wrappers_are_removed(tmp_path: Path, prefix: str, container: str) -> None:
     model = small()
     wrapped = OrderedDict((prefix + name, tensor) for name, tensor in model.state_dict().items())
     torch.save(wrapped if container == "bare" else {container: wrapped, "epoch": 1}, tmp_path / "wrapped.pth")
@@ -199,7 +199,7 @@ def test_firenet_plus_names(tmp_path: Path) -> None:
     assert same(other.state_dict(), model.state_dict())
 
 
-def test_a_misfit_is_refused_whole_and_reported(tmp_path: Path) -> None:
+def test_a_misfit_is_reported_and_leaves_the_network_unchanged(tmp_path: Path) -> None:
     model = small()
     state = dict(model.state_dict())
     del state["unetrecurrent.head.conv2d.bias"]

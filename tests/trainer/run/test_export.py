@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,7 @@ def test_the_averaged_weights_are_exported_where_there_are_any(
         assert torch.equal(tensor, (average if is_averaged else model)[key])
 
 
-def test_what_is_no_checkpoint_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(SHIPPED), str(tmp_path / "firenet.pt")]) == 2
     assert "is no checkpoint of a training run" in capsys.readouterr().err
     assert not (tmp_path / "firenet.pt").exists()
@@ -44,3 +45,21 @@ def test_the_shipped_network_loads_and_is_small() -> None:
     assert (name, found.bins) == ("firenet", 5)
     assert SHIPPED.stat().st_size < 1_000_000
     assert all(bool(tensor.isfinite().all()) for tensor in found.state_dict().values())
+
+
+@pytest.mark.parametrize("refusal", ["No space left on device", "File exists"])
+def test_a_file_that_cannot_be_written_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, refusal: str
+) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    config = {"network": {"name": "firenet", "options": {"base_channels": 4}, "weights": ""}}
+    save_checkpoint(tmp_path / "last.pt", Checkpoint(7, 0, network(0).state_dict(), {}, None, None, config))
+    target = tmp_path / "firenet.pt"
+    if refusal == "File exists":
+        target = tmp_path / "last.pt" / "firenet.pt"
+    else:
+        monkeypatch.setattr(os, "fsync", full)
+    assert main([str(tmp_path / "last.pt"), str(target)]) == 2
+    assert f"{target}: {refusal}; give another FILE, or free space there" in capsys.readouterr().err

@@ -21,7 +21,7 @@ from trainer.run.reporting import METRICS, read_metrics
 from trainer.train import main
 
 
-def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
+def test_a_held_out_batch_is_scored(
     server: FakeServer, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=12, run__judge_every=5)
@@ -32,7 +32,7 @@ def test_a_held_out_batch_is_judged_and_says_more_than_a_step(
     assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
 
 
-def test_the_network_that_does_best_on_recordings_is_kept(server: FakeServer, whole: Path, tmp_path: Path) -> None:
+def test_the_best_network_on_recordings_is_kept(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     """Scored at the ends of epochs, without changing the training; a resumed run knows what was best before."""
     for seed in range(2):
         random_recording(tmp_path / "recordings" / f"{seed}.h5", seed=seed)
@@ -108,7 +108,7 @@ def trainer_evaluation_means(weights: Path, recordings: Path) -> dict[str, float
 
 
 @pytest.mark.parametrize("network", ["firenet", "evflownet"])
-def test_recordings_that_cannot_be_scored_are_said_before_the_first_step(
+def test_unusable_recordings_are_reported_before_the_first_step(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], network: str
 ) -> None:
     flow = {"loss__flow": "stream"} if network == "evflownet" else {}

@@ -18,7 +18,7 @@ from trainer.train import main
 from v2v_protocol.errors import UsageError
 
 
-def test_a_folder_with_a_run_is_not_written_over(
+def test_a_folder_with_a_run_is_not_overwritten(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trained(tmp_path, server.address, "run", run__steps=1)
@@ -26,7 +26,7 @@ def test_a_folder_with_a_run_is_not_written_over(
 
 
 @pytest.mark.parametrize("out", ["file", "file/run"])
-def test_a_folder_that_cannot_be_written_is_said_before_anything_is_asked(
+def test_an_unwritable_folder_is_reported_before_connecting(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
 ) -> None:
     (tmp_path / "file").touch()
@@ -36,7 +36,7 @@ def test_a_folder_that_cannot_be_written_is_said_before_anything_is_asked(
     assert len(server.hellos) == before
 
 
-def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_inaccessible_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def denied(_: Path) -> bool:
         raise PermissionError(13, "Permission denied")
 
@@ -45,7 +45,7 @@ def test_a_folder_that_may_not_be_entered_is_said(tmp_path: Path, monkeypatch: p
         require_fresh(tmp_path)
 
 
-def test_a_run_goes_on_in_its_own_folder(server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_resumes_in_its_own_folder(server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     without_out = ["small.yaml", "--connect", server.address, "--set", "run.steps=1"]
     trained(tmp_path, server.address, "elsewhere", run__steps=1)
@@ -113,7 +113,7 @@ def test_a_refused_resume_writes_nothing(tmp_path: Path, capsys: pytest.CaptureF
         ({"network__weights": "no.pt"}, "no file no.pt"),
     ],
 )
-def test_what_is_missing_is_said_before_anything_is_asked_of_the_server(
+def test_missing_files_are_reported_before_connecting(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, object], message: str
 ) -> None:
     before = len(server.hellos)
@@ -122,7 +122,7 @@ def test_what_is_missing_is_said_before_anything_is_asked_of_the_server(
     assert not (tmp_path / "run").exists()
 
 
-def test_without_videos_or_address_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_videos_or_address_training_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--videos DIR, or --connect ADDRESS" in refused(tmp_path, "", capsys)
 
 
@@ -140,7 +140,7 @@ def test_a_diverged_run_keeps_the_checkpoint_before(
     assert same(load_checkpoint(run / LAST).model, good.model)
 
 
-def test_a_disk_that_refuses_is_said(
+def test_disk_errors_are_reported(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -168,7 +168,7 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
     assert (tmp_path / "run" / METRICS).is_file()
 
 
-def test_a_server_that_never_was_there_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unreachable_server_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(tmp_path, f"ipc://{tmp_path}/nobody", capsys, stream__timeout_seconds=0.1)
     assert "nothing received" in message
     assert not (tmp_path / "run" / LAST).exists()

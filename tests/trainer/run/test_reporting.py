@@ -20,7 +20,7 @@ from v2v_protocol.errors import UsageError
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
-def test_the_meter_gives_means_and_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_meter_returns_means_and_resets(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [10.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     meter = Meter(ALONE)
@@ -48,7 +48,7 @@ def test_metrics_are_lines_of_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn", ['{"step": 3, "to', "{", "\0\0\0", "\ufffd"])
-def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path, torn: str) -> None:
+def test_a_truncated_last_line_is_ignored(tmp_path: Path, torn: str) -> None:
     path = tmp_path / "m.jsonl"
     path.write_text('{"step": 1}\n{"step": 2}\n' + torn)
     assert read_metrics(path) == [{"step": 1}, {"step": 2}]
@@ -59,7 +59,7 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path, torn: str) -> None:
 
 
 @pytest.mark.parametrize("damaged", ['{"step": 3, "to', "", "3", '{"epoch": 0}'])
-def test_a_line_that_nobody_cut_off_is_said(tmp_path: Path, damaged: str) -> None:
+def test_a_malformed_line_is_reported(tmp_path: Path, damaged: str) -> None:
     path = tmp_path / "m.jsonl"
     for after in ("", '{"step": 4}\n', '{"ste'):
         path.write_text(f'{{"step": 1}}\n{damaged}\n{after}')
@@ -67,7 +67,7 @@ def test_a_line_that_nobody_cut_off_is_said(tmp_path: Path, damaged: str) -> Non
             read_metrics(path)
 
 
-def test_a_reading_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+def test_a_reading_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     reporter = Reporter(tmp_path, speaks=True)
     (tmp_path / METRICS).symlink_to("/dev/full")
     with reporter, pytest.raises(UsageError, match=r"metrics\.jsonl: No space left"):

@@ -113,7 +113,7 @@ def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: p
     assert [entry.name for entry in tmp_path.iterdir()] == ["last.pt"]
 
 
-def test_what_the_disk_says_is_what_is_raised(tmp_path: Path) -> None:
+def test_disk_errors_are_raised_unchanged(tmp_path: Path) -> None:
     """Not what PyTorch's writer makes of it."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     large = dataclasses.replace(Run().checkpoint(), ema={"weight": torch.zeros(60_000)})
@@ -144,14 +144,14 @@ def test_the_data_are_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch
     assert calls == ["file", "replace", "folder"]
 
 
-def test_what_needs_code_to_be_read_is_refused_before_writing(tmp_path: Path) -> None:
+def test_objects_that_need_code_to_load_are_refused_before_writing(tmp_path: Path) -> None:
     checkpoint = dataclasses.replace(Run().checkpoint(), config={"sizes": [1, {"seed": np.int64(3)}]})
     with pytest.raises(UsageError, match=r"config\['sizes'\]\[1\]\['seed'\] is a int64"):
         save_checkpoint(tmp_path / "a.pt", checkpoint)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
+def test_other_files_are_refused_as_checkpoints(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     with pytest.raises(UsageError, match="no file"):
         load_checkpoint(path)

@@ -17,7 +17,7 @@ def test_it_is_the_mean_absolute_difference() -> None:
     assert float(flow_loss(uniform(0, 0), uniform(1, 3), None, 0.8)) == pytest.approx(2)
 
 
-def test_pixels_that_do_not_count_do_not() -> None:
+def test_invalid_pixels_do_not_count() -> None:
     truth, valid = uniform(1, 3).clone(), torch.ones(2, 3, 1, 4, 5)
     truth[:, :, :, :2] = 1000.0
     valid[:, :, :, :2] = 0

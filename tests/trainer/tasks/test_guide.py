@@ -25,7 +25,7 @@ def batch() -> Iterator[Batch]:
 
 
 @pytest.mark.parametrize(("epoch", "share"), [(0, 1.0), (4, 0.75), (15, 1 / 16), (16, None), (80, None), (None, None)])
-def test_the_share_falls_from_all_to_nothing_in_training_only(
+def test_the_guides_share_falls_from_1_to_0_in_training_only(
     batch: Batch, epoch: int | None, share: float | None
 ) -> None:
     task = Reconstruction(ReconstructionSettings(guide_epochs=16), None, CPU, bfloat16=False)

@@ -31,7 +31,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
 }  # fmt: skip
-QUICK = ("e2vid", "firenet-cpu", "tiny-cpu")
+QUICK = ("e2vid", "finetune-cpu", "firenet-cpu", "tiny-cpu")
 """RAFT and E-RAFT have no reduced size, and most kinds of E2VID differ in a number."""
 SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in shipped()]
 SIDES_PX = {"alex": 33}
@@ -74,7 +74,7 @@ def reduced(name: str, weights: Path) -> TrainConfig:
     settings = {
         "stream.recipe": {"preset": preset, **recipe}, "stream.batch_size": 2, "stream.loader_workers": 0,
         "stream.spec": {},
-        "network.options": NETWORKS[config.network.name], "compute.device": "cpu",
+        "network.options": NETWORKS[config.network.name], "network.weights": "", "compute.device": "cpu",
     }  # fmt: skip
     loss = config.loss
     if getattr(loss, "lpips_weight", 0):
@@ -126,7 +126,7 @@ def flow_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_configuration_builds_trains_and_minimises_what_it_says(
+def test_a_shipped_configuration_builds_trains_and_minimises_its_loss(
     server: FakeServer, weights: Path, name: str
 ) -> None:
     config = reduced(name, weights)
@@ -175,7 +175,7 @@ class Waits(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_step_neither_waits_for_the_device_nor_copies_to_it(
+def test_a_step_neither_synchronises_with_the_device_nor_copies_to_it(
     server: FakeServer, weights: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the batch on the device to the reading of the meter."""

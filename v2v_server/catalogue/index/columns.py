@@ -214,6 +214,11 @@ class Records(Sequence[IndexRow]):
         return np.frombuffer(self._height, np.int32)
 
     @property
+    def frames_per_second(self) -> npt.NDArray[np.float64]:
+        """[N] of each, NaN where unknown."""
+        return np.frombuffer(self._rate, np.float64)
+
+    @property
     def codec(self) -> npt.NDArray[np.int32]:
         """[N], number of each one's name."""
         return np.frombuffer(self._codec, np.int32)

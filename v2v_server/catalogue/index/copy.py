@@ -19,6 +19,8 @@ from typing import Any, BinaryIO
 import msgpack
 import xxhash
 
+from v2v_server.system.private import open_private
+
 Part = Mapping[str, Any]
 """Some of the records in columns, see :meth:`v2v_server.catalogue.index.columns.Records.packed`."""
 
@@ -79,7 +81,7 @@ def copied(index: Path | None, mark: str, parts: Iterable[Part], kind: str = "co
     path = copy_path(index, kind)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        file = partial.open("wb", buffering=0)
+        file = open(open_private(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "wb", buffering=0)  # noqa: SIM115
     except OSError:
         yield from parts
         return

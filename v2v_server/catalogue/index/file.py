@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SCHEMA_VERSION = 4
+from v2v_server.system.private import make_private
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+
+SCHEMA_VERSION = 5
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
-_REFUSED_MORE = 3
-"""The version with the same table that refused videos which are read now: those are probed again, the others kept."""
 
 MARKED_FROM = 10_000
 """Records from which on it is worth knowing that nothing has changed."""
@@ -43,6 +44,20 @@ CREATE TABLE video (
     frame_index BLOB
 )"""
 
+_SOUND = f"""
+    typeof(id) = 'text' AND typeof(fingerprint) = 'text' AND typeof(codec) = 'text'
+    AND typeof(size_bytes) = 'integer' AND typeof(mtime_ns) = 'integer' AND typeof(ctime_ns) = 'integer'
+    AND typeof(interlaced) = 'integer' AND interlaced IN (0, 1)
+    AND typeof(frames) = 'integer' AND typeof(width_px) = 'integer' AND typeof(height_px) = 'integer'
+    AND (frames_per_second IS NULL OR typeof(frames_per_second) = 'real' AND frames_per_second BETWEEN 0 AND 1e9)
+    AND CASE WHEN problem IS NULL THEN
+        frames BETWEEN 1 AND {LARGEST_FRAMES} AND width_px BETWEEN 1 AND {LARGEST_SIDE_PX}
+        AND height_px BETWEEN 1 AND {LARGEST_SIDE_PX} AND typeof(frame_index) IN ('blob', 'null')
+    ELSE
+        typeof(problem) = 'text' AND frames BETWEEN 0 AND {LARGEST_FRAMES}
+        AND width_px BETWEEN 0 AND {LARGEST_SIDE_PX} AND height_px BETWEEN 0 AND {LARGEST_SIDE_PX}
+    END"""
+"""Records that :meth:`Store.put` can have written: SQLite takes any type in any column."""
 
 _SCENES = """
 CREATE TABLE IF NOT EXISTS scene (
@@ -95,15 +110,20 @@ class Store:
 
     Attributes:
         path: that.
+        replaced_version: version of the index that lay there and could not be used; None if there was none.
 
     Raises:
         sqlite3.Error, OSError: the file cannot be made, opened or read.
+
+    Every method may also raise UnicodeDecodeError for a damaged file: SQLite's message then quotes what is not UTF-8.
     """
 
     def __init__(self, path: Path | None) -> None:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            make_private(path)  # SQLite gives its other files the mode of this one
         self.path = path
+        self.replaced_version: int | None = None
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
@@ -121,23 +141,24 @@ class Store:
             version = self._version()
             if version == SCHEMA_VERSION:  # another process was faster
                 return
-            if version == _REFUSED_MORE:
-                self._database.execute("DELETE FROM video WHERE problem IS NOT NULL")
-            else:
-                self._database.execute("DROP TABLE IF EXISTS video")
-                self._database.execute(_TABLE)
+            self.replaced_version = version or None
+            self._database.execute("DROP TABLE IF EXISTS video")
+            self._database.execute(_TABLE)
             self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
     def rows(self) -> Generator[tuple[Any, ...], None, None]:
-        """All records by id, as the attributes of :class:`IndexRow` without their frame indices.
+        """Yield all sound records by id, as the attributes of :class:`IndexRow` without their frame indices.
+
+        Damaged ones are left out, so that their files are probed again.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        with closing(self._database.execute(f"SELECT {_COLUMNS} FROM video ORDER BY id")) as rows:
+        query = f"SELECT {_COLUMNS} FROM video WHERE {_SOUND} ORDER BY id"
+        with closing(self._database.execute(query)) as rows:
             yield from rows
 
     @contextmanager
@@ -173,8 +194,7 @@ class Store:
             sqlite3.Error: the file is damaged.
         """
         query = "SELECT frame_index FROM video WHERE id = ? AND fingerprint = ?"
-        row = self._database.execute(query, (id, fingerprint)).fetchone()
-        return None if row is None else row[0]
+        return _blob(self._database.execute(query, (id, fingerprint)).fetchone())
 
     def state(self, id: str) -> tuple[int, int] | None:
         """Size and time of the last modification of a file when it was probed; None if it is not known.
@@ -209,8 +229,7 @@ class Store:
             sqlite3.Error: the file is damaged.
         """
         query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
-        row = self._database.execute(query, (id, fingerprint, look)).fetchone()
-        return None if row is None else row[0]
+        return _blob(self._database.execute(query, (id, fingerprint, look)).fetchone())
 
     def put_scenes(self, scenes: Iterable[tuple[str, str, str, bytes]]) -> None:
         """Add or replace (id, fingerprint, look, encoded scene), in one transaction.
@@ -286,3 +305,8 @@ class Store:
     def close(self) -> None:
         """Close the file."""
         self._database.close()
+
+
+def _blob(row: tuple[Any] | None) -> bytes | None:
+    """Return what a query for one blob found; None if that is no blob, since another program changed it."""
+    return row[0] if row is not None and isinstance(row[0], bytes) else None

@@ -128,7 +128,7 @@ def take_in_parts(index: Path, parts: list[Path]) -> int:
     """
     try:
         store = Store(index)
-    except (sqlite3.Error, OSError) as error:
+    except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         raise CorpusError(f"the catalogue's index {index} cannot be opened: {error}") from error
     records = 0
     with closing(store):

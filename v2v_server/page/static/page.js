@@ -1,11 +1,11 @@
-// Shows the newest state of the service. Names of files and peers come from strangers: text only, never markup.
+// Show the newest state of the service. Names of files and peers are untrusted: insert text only, never markup.
 "use strict";
 
 const MOST_POINTS = 1200; // ten minutes
 const MOST_ROWS = 200;
-const SILENT_MS = 3000; // no word for so long: what is shown is old
+const SILENT_MS = 3000; // silence of the server after which the state is marked as old
 const AGAIN_MS = 2000;
-const MOST_WAITING = 0.98; // who waits all the time says nothing of what it would take
+const MOST_WAITING = 0.98; // a consumer that always waits gives no estimate of the rate it could use
 
 const at = (id) => document.getElementById(id);
 const hexOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -21,7 +21,7 @@ function say(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-// --- how numbers are written ---
+// --- formatting of numbers ---
 
 const share = (value) => `${Math.round(100 * value)} %`;
 
@@ -178,18 +178,19 @@ function show(state) {
     ["workers decode", shares.decode],
     ["workers simulate", shares.simulate],
     ["workers hand over", shares.handover],
+    ["workers wait for a core", shares.queued],
     ["server's loop busy", shares.broker],
   ], true);
   list("tiles", tiles(state), false);
-  fill("consumers", state.consumers.map(consumer), "nobody is connected");
-  fill("workers", state.workers.map(worker), "none has said hello");
+  fill("consumers", state.consumers.map(consumer), "no consumers are connected");
+  fill("workers", state.workers.map(worker), "no workers are connected");
   fill("refusals", state.refusals.map(refusal), "no video was passed over");
   fill("verdicts", state.verdicts.map(refusal), "nothing");
   fill("recipe", settings(state.spec), "");
   say(at("consumers-count"), `${state.consumer_count} connected`);
   say(at("workers-count"), workersCount(state));
   say(at("refusals-count"), `${state.totals.refused_candidates} times, the last few`);
-  say(at("verdicts-count"), `${state.quarantined} verdicts`);
+  say(at("verdicts-count"), `${state.quarantined} entries`);
   charts.speed.setData(past.speed);
   charts.waits.setData(past.waits);
 }
@@ -207,8 +208,8 @@ function tiles(state) {
     ["samples a second", number(state.samples_per_second), `${totals.samples.toLocaleString("en")} in all`],
     ["bytes a second", bytes(state.bytes_per_second), `${bytes(totals.bytes)} in all`],
     ["decodes a second", number(state.decodes_per_second), `${totals.decodes.toLocaleString("en")} in all`],
-    ["asked, not begun", String(state.queue), "samples"],
-    ["went wrong", String(totals.faults), "and was survived"],
+    ["queued", String(state.queue), "samples without a worker"],
+    ["faults", String(totals.faults), "handled"],
     ["videos", state.video_count.toLocaleString("en"), `${state.unusable_count} cannot be used`],
   ];
   if (state.cache) {
@@ -281,7 +282,7 @@ function listen() {
   });
   events.addEventListener("trouble", (event) => {
     heard = Date.now();
-    trouble(`${JSON.parse(event.data).trouble}. What is shown is old; this page tries again.`);
+    trouble(`${JSON.parse(event.data).trouble}. The state shown is old; this page retries.`);
   });
   events.addEventListener("error", () => {
     if (events.readyState !== EventSource.CLOSED) return; // the browser tries again by itself
@@ -293,7 +294,7 @@ function listen() {
 drawCharts();
 listen();
 setInterval(() => {
-  if (Date.now() - heard > SILENT_MS) trouble("The server does not answer. What is shown is old; this page tries again.");
+  if (Date.now() - heard > SILENT_MS) trouble("The server does not answer. The state shown is old; this page retries.");
 }, 1000);
 new ResizeObserver(() => {
   for (const name of Object.keys(charts)) charts[name].setSize({ width: at(name).clientWidth, height: 190 });

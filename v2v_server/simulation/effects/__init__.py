@@ -1,22 +1,22 @@
-"""What a camera does beyond the paper's pixel model: one file an effect, off at zero.
+"""Effects beyond the paper's pixel model: one file per effect, off at zero.
 
-    mismatch.py       every pixel has thresholds of its own
-    photoreceptor.py  a low-pass, slower in the dark
-    leak.py           positive events without any cause
-    refractory.py     a pixel is blind after an event
+    mismatch.py       every pixel has its own thresholds
+    photoreceptor.py  a low-pass filter, slower in the dark
+    leak.py           positive events without a change of brightness
+    refractory.py     a pixel fires no events for a time after an event
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
-    state.py          what an effect is given
-    kernel.py         the pixel kernel with all of them
+    state.py          inputs of an effect
+    kernel.py         the pixel kernel with all effects
 
 An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws) and one file
 here, named in :data:`EFFECTS`. The file states the equation, its source, and
 
     FIELD                     the recipe's field
-    ROWS                      how many rows of a block's state it keeps for itself
+    ROWS                      the number of rows of a block's state that it needs
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
 
-and, compiled, as many of these as it needs. Each does nothing where the tables say off:
+and, compiled, any of these functions. Each does nothing if the tables say off:
 
     start(tables, own, block, at)     before the first step of a block of pixels; may change the block's thresholds
     see(tables, own, block, at)       may replace ``block.change``, the change of log intensity in this step
@@ -25,9 +25,9 @@ and, compiled, as many of these as it needs. Each does nothing where the tables 
     after(tables, own, block, at)     may change ``block.signed``, the events of this step, and ``block.residual``
     close(tables, own, block, at)     may change ``block.count``, the sum of a bin, before it is stored
 
-Within a step: see, noise, change, hot drift, cross, after. Effects take their turns in the order of :data:`EFFECTS`.
-The names of ``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`. ``docs/effects.md`` tells sources,
-departures from them, and values; ``docs/extending.md`` shows a new effect.
+Within a step: see, noise, change, hot drift, cross, after. Effects run in the order of :data:`EFFECTS`. The names of
+``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`. ``docs/effects.md`` gives sources, differences
+from them, and values; ``docs/extending.md`` shows how to add an effect.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ EFFECTS: tuple[Any, ...] = tuple(
         "dead_pixels",
     )
 )
-"""All effects, in the order in which they take their turns."""
+"""All effects, in the order in which they run."""
 
 
 def prepare(
@@ -67,16 +67,16 @@ def prepare(
     real: Real,
     words_of: noise.WordsOf = noise.words,
 ) -> tuple[Any, ...]:
-    """The tables of every effect for one clip, in the order of :data:`EFFECTS`.
+    """Return the tables of every effect for one clip, in the order of :data:`EFFECTS`.
 
     Args:
-        values: the draw, by field; what is missing is off.
-        key: of the sample's noise.
+        values: the draw, by field; missing fields are off.
+        key: key of the sample's noise.
         intensity: gamma and log_eps.
         step_seconds: [steps] duration of each step.
-        pixels: of the picture.
+        pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
-        words_of: a faster ``noise.words`` where the caller has one.
+        words_of: a faster ``noise.words``, if the caller has one.
 
     Raises:
         UsageError: more shot events in a step than can be drawn.

@@ -1,4 +1,4 @@
-"""Dead pixels never fire. They are chosen like the hot ones; no published rate was found."""
+"""Dead pixels never fire. They are chosen like the hot ones. No published rate was found."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
@@ -19,27 +19,27 @@ PLACE = 15
 
 
 class Tables(NamedTuple):
-    """[count] int64, the dead pixels, ascending; [2] int64, those of the block: from, up to."""
+    """[count] int64, the dead pixels, ascending; [2] int64, range of those in the block: start, end."""
 
     position: Any
     of_block: Any
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     return Tables(positions(clip.key, value, clip.pixels, clip.words_of), np.zeros(2, np.int64))
 
 
 def positions(
     key: noise.NoiseKey, share: float, pixels: int, words_of: noise.WordsOf = noise.words
 ) -> npt.NDArray[np.int64]:
-    """The dead pixels, as many as the share says, rounded half up: [count] int64, ascending, in row order."""
+    """Choose the dead pixels, as many as the share states, rounded half up: [count] int64, ascending, in row order."""
     return noise.smallest_words(key, PLACE, math.floor(share * pixels + 0.5), pixels, words_of)
 
 
 @hook
 def start(tables, own, block, at):
-    """Find those of the block."""
+    """Find the dead pixels of the block."""
     if len(tables.position) > 0:
         end = 0 if at.first == 0 else tables.of_block[1]
         tables.of_block[0] = end
@@ -50,7 +50,7 @@ def start(tables, own, block, at):
 
 @hook
 def close(tables, own, block, at):
-    """No events."""
+    """Set their counts to 0."""
     if len(tables.position) > 0:
         for each in range(tables.of_block[0], tables.of_block[1]):
             block.count[tables.position[each] - at.first] = block.tolerance - block.tolerance

@@ -1,8 +1,8 @@
-"""The pixel kernel with effects: that of ``pixel.py``, and in its places what each effect adds.
+"""The pixel kernel with effects: ``pixel.py`` with the additions of each effect.
 
-A kernel of its own, so that a camera without effects runs the code it always ran. Loops, order of operations and
-promises are those of ``pixel.py``, whose inner functions it calls. The effects' parts become one compiled function with
-it: one that is off costs a comparison for each block and step.
+It is a separate kernel, so that a camera without effects runs the simpler code. Loops, order of operations and promises
+are those of ``pixel.py``, whose inner functions it calls. The effects' functions are compiled into it: an effect that
+is off costs one comparison per block and step.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -36,7 +36,9 @@ _UNIT = np.float32(2.0**-24)
 
 
 def _linked(name: str, link: Any) -> Any:
-    """One compiled function of (tables, rows, block, at): the hook of every effect that has it, in their order."""
+    """Build one compiled function of (tables, rows, block, at) from the hooks of all effects that have it, in their
+    order.
+    """
 
     @hook
     def chain(tables, rows, block, at):
@@ -76,7 +78,9 @@ def _simulate(
     frames, table, source_index, key, noise_scale, hot_position, hot_drift, hot_scale, threshold_pos, threshold_neg,
     tolerance, drawn_start, start_residual, steps_per_bin, limit, voxels, tables, state, words, floats,
 ):  # fmt: skip
-    """Without counting of references, which every view of an array costs: all memory is the caller's."""
+    """Run the kernel without reference counting, which every view of an array would cost; the caller provides all
+    memory.
+    """
     use_widest_vectors()  # type: ignore[call-arg]
     steps, pixels = len(source_index) - 1, frames.shape[1]
     noisy = len(noise_scale) > 0

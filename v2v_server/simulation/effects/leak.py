@@ -23,7 +23,7 @@ class Tables(NamedTuple):
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     return Tables((value * clip.step_seconds).astype(clip.real) if value > 0.0 else np.empty(0, clip.real))
 
 

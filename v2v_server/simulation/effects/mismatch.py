@@ -30,19 +30,21 @@ class Tables(NamedTuple):
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     return Tables(clip.real(value), clip.real(SMALLEST_THRESHOLD_SHARE))
 
 
 def normals(key: noise.NoiseKey, pixels: int) -> tuple[noise.Reals, noise.Reals]:
-    """By how many deviations each pixel's positive and negative threshold lies off: two of [pixels] float32."""
+    """Return each pixel's deviation of its positive and negative threshold, in standard deviations: two of [pixels]
+    float32.
+    """
     place = np.arange(pixels)
     return noise.box_muller(*noise.mix(noise.words(key, RADIUS, place), noise.words(key, ANGLE, place)))
 
 
 @hook
 def start(tables, own, block, at):
-    """Spreads the thresholds."""
+    """Set each pixel's thresholds."""
     if tables.sigma > 0:
         words, normal = block.words, block.floats
         radius, angle = folds_of(block.key, np.uint32(RADIUS)), folds_of(block.key, np.uint32(ANGLE))

@@ -32,13 +32,13 @@ class Tables(NamedTuple):
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     tables = [low_pass_table(value, clip.light, each) for each in clip.durations] if value > 0.0 else []
     return Tables(np.array(tables, clip.real).reshape(-1, 2, 256), clip.table_of_step)
 
 
 def low_pass_table(photoreceptor_hz: float, light: Doubles, seconds: float) -> Doubles:
-    """a and b of a step of that duration, [2, 256] float64."""
+    """Return a and b of a step of that duration, [2, 256] float64."""
     turns = 2.0 * np.pi * photoreceptor_hz * seconds * ((light + DARKEST) / (1.0 + DARKEST))
     a = 1.0 - exponential(-turns)
     return np.stack([a, 1.0 - a / turns])
@@ -46,7 +46,7 @@ def low_pass_table(photoreceptor_hz: float, light: Doubles, seconds: float) -> D
 
 @hook
 def start(tables, own, block, at):
-    """P = L."""
+    """Set P = L."""
     if len(tables.low_pass) > 0:
         for i in range(BLOCK_PX):
             own[0, i] = block.levels[at.now, i]
@@ -54,7 +54,7 @@ def start(tables, own, block, at):
 
 @hook
 def see(tables, own, block, at):
-    """The change of P."""
+    """Replace the change by that of P."""
     if len(tables.low_pass) > 0:
         seen, slow, fast, levels = own[0], own[1], own[2], block.levels
         of_step = tables.table_of_step[at.step]

@@ -1,7 +1,7 @@
-"""Refractory period t: after an event the pixel is blind for t seconds; what changes meanwhile is lost.
+"""Refractory period t: for t seconds after an event a pixel fires none, and changes in that time are lost.
 
 v2e drops the events of that time. With a change that is linear within the step, k events take the time to the first
-threshold plus (k - 1) (c / slope + t), and the blind time left over goes on into the next step.
+threshold plus (k - 1) (c / slope + t), and the remaining blind time continues in the next step.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -26,15 +26,15 @@ class Tables(NamedTuple):
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     return Tables(clip.real(value), clip.step_seconds.astype(clip.real))
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def crossed(residual, blind, change, seconds, refractory, threshold_pos, threshold_neg, tolerance):
-    """Signed events, residual and blind seconds after a step whose change is linear in time.
+    """Return signed events, residual and blind seconds after a step whose change is linear in time.
 
-    In log units, a period between events is the threshold plus what the change would have done while blind.
+    In log units, a period between events is the threshold plus the change during the blind time.
     """
     zero = tolerance - tolerance
     seen = max(seconds - blind, zero) / seconds
@@ -62,14 +62,14 @@ def crossed(residual, blind, change, seconds, refractory, threshold_pos, thresho
 
 @hook
 def start(tables, own, block, at):
-    """Nothing is blind."""
+    """Reset the blind time."""
     for i in range(BLOCK_PX):
         own[0, i] = block.tolerance - block.tolerance
 
 
 @hook
 def cross(tables, own, block, at):
-    """Events beside each other in time."""
+    """Fire events one after another in time."""
     if tables.refractory > 0:
         duration, blind = tables.seconds[at.step], own[0]
         for i in range(BLOCK_PX):

@@ -1,7 +1,7 @@
-"""Shot noise of R events a second: two Poisson processes, one a polarity, of rate R/2 (1 - 3/4 i(F)).
+"""Shot noise of R events a second: two Poisson processes, one per polarity, of rate R/2 (1 - 3/4 i(F)).
 
-F is the new frame (v2e). They come on top of the step's events, and the pixel starts afresh from what it sees: its
-residual becomes 0 (v2e).
+F is the new frame (v2e). Shot events are added to the step's events, and the pixel restarts from the current
+brightness: its residual becomes 0 (v2e).
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -25,7 +25,7 @@ PIXEL_POS, PIXEL_NEG, STEP_POS, STEP_NEG = range(11, 15)
 WHITE_SHOT_NOISE = 0.25
 """Shot noise of a white pixel as a share of a black one's (v2e)."""
 LARGEST_SHOT_MEAN = 64.0
-"""Most shot events of one polarity that a step may hold on average."""
+"""Largest mean number of shot events of one polarity in a step."""
 _M0, _M1, _M2 = noise.MIX_FACTORS
 
 
@@ -48,7 +48,7 @@ class Tables(NamedTuple):
 
 
 def prepare(value: float, clip: Clip) -> Tables:
-    """See ``effects/__init__.py``."""
+    """Return the tables, see ``effects/__init__.py``."""
     shot = np.empty((0, 0, 256), np.uint32)
     if value > 0.0:
         shot = shot_table(shot_means(value, clip.light, clip.durations))
@@ -57,7 +57,7 @@ def prepare(value: float, clip: Clip) -> Tables:
 
 
 def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doubles:
-    """Mean events of one polarity: [durations, 256].
+    """Return the mean number of events of one polarity: [durations, 256].
 
     Raises:
         UsageError: more than LARGEST_SHOT_MEAN.
@@ -66,15 +66,16 @@ def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doub
     if means.max() > LARGEST_SHOT_MEAN:
         raise UsageError(
             f"shot noise of {shot_noise_hz:.6g} events a second makes {means.max():.4g} events of a polarity in a step "
-            f"of {durations[-1]:.6g} s; the limit is {LARGEST_SHOT_MEAN:.0f}: lower shot_noise_hz, or take a video of "
-            "more frames a second"
+            f"of {durations[-1]:.6g} s; the limit is {LARGEST_SHOT_MEAN:.0f}: lower shot_noise_hz, or use a video with "
+            "more frames per second"
         )
     return means
 
 
 def shot_table(means: Doubles) -> npt.NDArray[np.uint32]:
-    """The chance of more than k Poisson events in units of 2**-32: [tables, most, 256], k = 0, 1 ... as far as it is
-    not 0 in those units."""
+    """Return the probability of more than k Poisson events in units of 2**-32: [tables, most, 256], for k = 0, 1 ...
+    while it is not 0 in those units.
+    """
     term = exponential(-means)
     below, layers = term, []
     for k in range(1, 1024):
@@ -88,7 +89,7 @@ def shot_table(means: Doubles) -> npt.NDArray[np.uint32]:
 
 
 def shot_words(key: noise.NoiseKey, steps: int, pixels: int) -> tuple[noise.Words, noise.Words]:
-    """Independent uniform words that decide the shot events: those of positive and of negative events.
+    """Return independent uniform words that decide the shot events: those of positive and of negative events.
 
     ``mix`` of the words of pixel and step, as for the normals: with PIXEL_POS and STEP_POS in the place of the two
     radius words, PIXEL_NEG and STEP_NEG in that of the two angle words.
@@ -103,7 +104,7 @@ def shot_words(key: noise.NoiseKey, steps: int, pixels: int) -> tuple[noise.Word
 
 @hook
 def start(tables, own, block, at):
-    """The words of the pixels and of the steps."""
+    """Compute the words of the pixels and of the steps."""
     if len(tables.shot) > 0:
         pixel_pos, pixel_neg = folds_of(block.key, np.uint32(PIXEL_POS)), folds_of(block.key, np.uint32(PIXEL_NEG))
         step_pos, step_neg = folds_of(block.key, np.uint32(STEP_POS)), folds_of(block.key, np.uint32(STEP_NEG))
@@ -129,7 +130,7 @@ def after(tables, own, block, at):
 
 @hook
 def _draw(drawn, step_pos, step_neg):
-    """``shot_words`` of a block and one step, into the last two rows of ``drawn``."""
+    """Write the ``shot_words`` of a block and one step into the last two rows of ``drawn``."""
     for i in range(BLOCK_PX):
         x = np.uint32(drawn[0, i] ^ step_pos)
         x = np.uint32(x ^ (x >> np.uint32(16)))
@@ -143,9 +144,9 @@ def _draw(drawn, step_pos, step_neg):
 
 @compiled
 def _fire(chances, largest, shown, drawn, chance, signed, residual):
-    """Add shot events to ``signed`` and clears the residual of the pixels that had any.
+    """Add shot events to ``signed`` and clear the residual of the pixels that had any.
 
-    A function that is compiled by itself: as a part of the kernel its loops would not become vector instructions.
+    The function is compiled separately: inside the kernel its loops would not become vector instructions.
 
     Args:
         chances, largest: [most, 256] and [most], one duration's part of the tables.

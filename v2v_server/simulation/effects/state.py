@@ -1,4 +1,4 @@
-"""What an effect is given: the clip when its tables are made, the block of pixels and the step when it runs."""
+"""Inputs of an effect: the clip when its tables are built, the block of pixels and the step when it runs."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from v2v_server.simulation.precision import Real
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 compiled: Any = numba.njit(**_OPTIONS)
-"""Decorator of a compiled function without the counting of references, which every view of an array would cost. It can
-make no array: all memory is its caller's."""
+"""Decorator of a compiled function without reference counting, which every view of an array would cost. The function
+cannot create arrays; the caller provides all memory."""
 hook: Any = numba.njit(forceinline=True, **_OPTIONS)
-"""The same for an effect's part of the kernel, which becomes a piece of the kernel itself."""
+"""The same for an effect's functions, which are inlined into the kernel."""
 
 
 class Clip(NamedTuple):
-    """What the tables of an effect are made for.
+    """Inputs of an effect's tables.
 
     Attributes:
         light: [256] float64, i(F) of every grey level, 0 (black) to 1 (white).
         step_seconds: [steps] float64, duration of each step.
-        durations: [different] float64, the different ones, ascending.
-        table_of_step: [steps] int64, which of them each step has.
-        pixels: of the picture.
+        durations: [different] float64, the distinct durations, ascending.
+        table_of_step: [steps] int64, index into ``durations`` of each step.
+        pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
-        key: of the sample's noise.
+        key: key of the sample's noise.
         words_of: ``noise.words``, or a faster one.
     """
 
@@ -44,12 +44,12 @@ class Clip(NamedTuple):
 
 
 class Block(NamedTuple):
-    """State of BLOCK_PX neighbouring pixels; [BLOCK_PX + padding] real each where nothing else is said.
+    """State of BLOCK_PX neighbouring pixels; arrays are [BLOCK_PX + padding] real unless stated otherwise.
 
     Attributes:
-        residual: what is left of the change since the last event, log units.
+        residual: remaining change since the last event, log units.
         count: signed events of the bin so far.
-        change: what this step adds to the residual, log units.
+        change: change that this step adds to the residual, log units.
         signed: signed events of this step.
         positive, negative: the thresholds of each pixel, log units.
         levels: two rows of log intensity, see :class:`At`.
@@ -72,7 +72,7 @@ class Block(NamedTuple):
 
 
 class At(NamedTuple):
-    """Where the kernel is.
+    """Position of the kernel.
 
     Attributes:
         first: the block's first pixel.
