@@ -21,10 +21,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 
-Record = Mapping[str, Any]
-"""Flat: keys with SI units -> text, number, bool or None."""
-Column = tuple[str, str, str, float]
-"""Key of a record, title, format, and the factor from SI units to what is shown."""
+Record = Mapping[str, Any]  # Flat: keys with SI units -> text, number, bool or None
+Column = tuple[str, str, str, float]  # Key of a record, title, format, and the factor from SI units to what is shown
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,10 +36,8 @@ _PORTS = range(20_000, 30_000)
 """Below the ports of outgoing connections. Otherwise a consumer that reconnects to a dead server's port may get that
 port for its own end, connect to itself and occupy the address (TCP simultaneous open)."""
 _MOST_AUTOCORRELATION = 0.99
-Series = Sequence[tuple[float, float]]
-"""(seconds, MiB) of one process."""
-Roles = Mapping[str, Sequence[int]]
-"""Process ids by role."""
+Series = Sequence[tuple[float, float]]  # (seconds, MiB) of one process
+Roles = Mapping[str, Sequence[int]]  # Process ids by role
 
 
 def cpu_seconds(pid: int) -> float:

@@ -49,8 +49,7 @@ THRESHOLDS = (0.1, 0.2, 0.5, 1.0)
 PHOTOGRAPHS = ("camera", "coffee", "astronaut", "rocket")
 RENDERED_HZ, BIN_FRAMES, BINS = 1200, 48, 8
 EVERY = (1, 2, 4, 8, 16, 48)
-SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)
-"""px per rendered frame: 6 to 600 px/s."""
+SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)  # px per rendered frame: 6 to 600 px/s
 VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
 LARGEST_DIFFERENCE_PPM = 60.0
 _RECORDED: tuple[Column, ...] = (

@@ -31,8 +31,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate
 
-BLUR_SIGMA_PX = 2.0
-"""Blur of both counts before they are correlated: single events of two cameras never coincide."""
+BLUR_SIGMA_PX = 2.0  # Blur of both counts before they are correlated: single events of two cameras never coincide
 LAMP_LEVEL, LAMP_MARGIN_PX = 250, 12
 Image = npt.NDArray[np.float64]
 LOG_OFFSETS = (0.001, 0.003, 0.01, 0.03, 0.05, 0.1, 0.15, 0.2, 0.5)
@@ -58,8 +57,7 @@ _COLUMNS: tuple[Column, ...] = (
     ("ceiling_pixels", "ceiling", "{:.3f}", 1),
     ("effect", "effect", "{}", 1),
 )
-Counts = npt.NDArray[np.float64]
-"""[bins, h, w] signed events."""
+Counts = npt.NDArray[np.float64]  # [bins, h, w] signed events
 
 
 @dataclass(frozen=True)

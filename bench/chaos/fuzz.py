@@ -34,8 +34,7 @@ from tests.oracles.hostile_peers import Attack
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 
-_UNDER_ATTACK_SECONDS = 60.0
-"""Longest extension of the attack until the healthy consumer has a batch."""
+_UNDER_ATTACK_SECONDS = 60.0  # Longest extension of the attack until the healthy consumer has a batch
 _LAST_BATCHES_SECONDS = 120.0
 _TRIM_SECONDS = 0.5
 _SETTLE_SECONDS = 30.0

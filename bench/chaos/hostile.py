@@ -48,8 +48,7 @@ from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
 
 PEERS = 8
-IDLE_EACH = 125
-"""Connections of each idle peer: a thousand of all eight."""
+IDLE_EACH = 125  # Connections of each idle peer: a thousand of all eight
 _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
 _READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)

@@ -49,8 +49,7 @@ from v2v_server.system.process import resident_bytes, usable_cores
 from v2v_server.video.rows import Rows
 
 _PER_FOLDER = 1000
-_LINKS = 50_000
-"""Hard links to one file; ext4 allows at most 65,000."""
+_LINKS = 50_000  # Hard links to one file; ext4 allows at most 65,000
 _COLUMNS: tuple[Column, ...] = (
     ("videos", "videos", "{}", 1),
     ("open_seconds", "open s", "{:.2f}", 1.0),

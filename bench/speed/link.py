@@ -49,8 +49,7 @@ from v2v_server.system.process import usable_cores
 
 BAR = 5.0
 IN_OWN_NETWORK = True
-_MTU_BYTES = 9000
-"""As in clusters; it also saves work of the cable's process."""
+_MTU_BYTES = 9000  # As in clusters; it also saves work of the cable's process
 _COLUMNS: tuple[Column, ...] = (
     ("samples", "", "{}", 1.0),
     ("batches_per_second", "batches/s", "{:.2f}", 1.0),

@@ -51,11 +51,9 @@ from v2v_server.system.process import die_with_parent, keep_freed_memory
 from v2v_server.worker.output_buffer import open_output_buffer, pack, sample_message
 from v2v_server.worker.produce import sample_layout
 
-Ready = Mapping[str, npt.NDArray[Any]]
-"""Samples made ahead: [samples, ...] of each array."""
+Ready = Mapping[str, npt.NDArray[Any]]  # Samples made ahead: [samples, ...] of each array
 
-CREDIT = 2
-"""Leases that each holds at a time, as a real worker does."""
+CREDIT = 2  # Leases that each holds at a time, as a real worker does
 _PING_SECONDS = 5.0
 _FRAMES_PER_SECOND = 30
 _SEQUENCES_PER_VIDEO = 2

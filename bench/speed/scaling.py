@@ -41,8 +41,7 @@ from v2v_server.system.process import usable_cores
 
 LEAST_GAIN_OF_TWO = 1.75
 LEAST_BYTES_PER_SECOND = 1e9
-MOST_BROKER_BYTES = 150e6
-"""Beside the credit window."""
+MOST_BROKER_BYTES = 150e6  # Beside the credit window
 _FEW_CORES = 4
 _COLUMNS: tuple[Column, ...] = (
     ("measure", "", "{}", 1),

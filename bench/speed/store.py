@@ -34,8 +34,7 @@ from v2v_server.video.decode import decode_luma, stream_luma
 from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]
-CROP = (149, 128, 128)
-"""Frames, rows and columns."""
+CROP = (149, 128, 128)  # Frames, rows and columns
 FORMS = {"store dense": DENSE, "store fast": FAST, "cache": QUICK}
 _MOST_FRAMES = 450
 _COLUMNS: tuple[Column, ...] = (

@@ -52,8 +52,7 @@ BARS = {
 }
 """Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; of
 `dense-12`, every 12. A label without a bar of its own has that of its part before the dash."""
-LIMIT_BARS = {"exact, source": 0.9}
-"""Least share of the decode limit of the same corpus, by the clock."""
+LIMIT_BARS = {"exact, source": 0.9}  # Least share of the decode limit of the same corpus, by the clock
 
 _COLUMNS: tuple[Column, ...] = (
     ("label", "", "{}", 1.0),

@@ -57,8 +57,7 @@ _COLUMNS: tuple[Column, ...] = (
     ("broker_cpu_cores", "broker CPU", "{:.2%}", 1),
 )
 
-Stretch = tuple[float, float, float]
-"""Batches/s, and cores that the page's process and the server's main process used."""
+Stretch = tuple[float, float, float]  # Batches/s, and cores that the page's process and the server's main process used
 
 
 @contextlib.contextmanager

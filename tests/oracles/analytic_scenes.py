@@ -20,7 +20,7 @@ from tests.oracles.known_motion import photograph
 
 Reals = npt.NDArray[np.float64]
 SECONDS = 1.0
-"""How long every analytic scene lasts."""
+"""Duration of every analytic scene."""
 PIXELS = 256
 START_SHARE = 1 / math.pi
 """Every residual starts at this share of the threshold: from 0, symmetric scenes would meet thresholds exactly at the
@@ -45,7 +45,7 @@ class Scene:
     turns: Reals
 
     def events(self, edges: Reals, threshold: float) -> tuple[npt.NDArray[np.int64], int]:
-        """True signed counts [bins, pixels] in the bins between the edges (seconds), and the number of events.
+        """Return the true signed counts [bins, pixels] between the edges (seconds), and the number of events.
 
         The residual starts at START_SHARE of the threshold.
         """
@@ -57,7 +57,7 @@ class Scene:
 
 
 def analytic_scenes() -> list[Scene]:
-    """Ramps, jumps, sinusoids, moving edges and gratings, lamps."""
+    """Return ramps, jumps, sinusoids, moving edges and gratings, lamps."""
     each = np.linspace(0.0, 1.0, PIXELS)
     still = np.empty((0, PIXELS))
     jump = np.full((1, PIXELS), _JUMP_SECONDS)
@@ -76,14 +76,14 @@ def analytic_scenes() -> list[Scene]:
 
 
 def _sinusoid(name: str, hertz: float, phase: Reals, form: Callable[[Reals], Reals]) -> Scene:
-    """``form`` of sin(2 pi (hertz t + phase)), which it must increase with; it turns where the sine is +-1."""
+    """Return a scene of ``form`` of sin(2 pi (hertz t + phase)), increasing in the sine; it turns where that is +-1."""
     half = np.arange(math.ceil(2 * hertz * SECONDS) + 5)[:, None]
     turns = (half / 2 - 0.75 - phase) / hertz
     return Scene(name, False, lambda t: form(np.sin(2 * np.pi * (hertz * t + phase))), turns)
 
 
 def _edge(speed: float, width: float) -> Scene:
-    """A soft edge from dark (0.05) to bright (0.9) that passes over a row of pixels; profile a logistic function."""
+    """Return a soft edge from dark (0.05) to bright (0.9) that passes over a row of pixels; its profile is logistic."""
     place = np.linspace(0.25, 0.75, PIXELS) * speed * SECONDS
 
     def level(t: Reals) -> Reals:
@@ -94,7 +94,7 @@ def _edge(speed: float, width: float) -> Scene:
 
 
 def moved_photograph(name: str, frames: int, height: int, width: int, px_per_frame: float) -> Reals:
-    """A photograph of scikit-image seen by a camera that moves at constant speed along a winding path.
+    """Return a photograph of scikit-image seen by a camera that moves at constant speed along a winding path.
 
     Args:
         name: of ``known_motion.PHOTOGRAPHS``.

@@ -1,4 +1,4 @@
-"""Do the events account for all that happened? The balance of every pixel of a simulated clip.
+"""The balance of every pixel of a simulated clip: its events against the changes that caused them.
 
     threshold_pos sum N+  -  threshold_neg sum N-   =   change of log intensity + noise + drift - change of residual
 
@@ -43,7 +43,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Balance:
-    """What is left when everything is accounted for.
+    """The imbalance of a clip, and its bounds.
 
     Attributes:
         real: the arithmetic.
@@ -65,12 +65,12 @@ class Balance:
 
     @property
     def holds(self) -> bool:
-        """True where no event came from nothing, none was lost, and every residual is below its threshold."""
+        """Return whether no event is invented or lost, and every residual is below its threshold."""
         return self.differing == 0 and self.error <= self.bound and self.beyond <= self.bound
 
 
 def balance(camera: Camera, frames: npt.NDArray[Any]) -> Balance:
-    """Simulates a clip and accounts for it.
+    """Simulate a clip and compute its balance.
 
     Args:
         camera: the virtual camera.
@@ -102,7 +102,7 @@ def balance(camera: Camera, frames: npt.NDArray[Any]) -> Balance:
 
 
 def arithmetic(camera: Camera, frames: npt.NDArray[Any]) -> tuple[Real, float]:
-    """The arithmetic a clip is simulated in, and ``most_events`` of it."""
+    """Return the arithmetic in which a clip is simulated, and ``most_events`` of it."""
     if frames.dtype == np.uint8:
         table = log_table_float64(camera.gamma, camera.log_eps)
         ends = float(table[0]), float(table[-1])
@@ -115,7 +115,7 @@ def arithmetic(camera: Camera, frames: npt.NDArray[Any]) -> tuple[Real, float]:
 
 
 def trace_of(camera: Camera, frames: npt.NDArray[Any], real: Real) -> Trace:
-    """The clip followed pixel by pixel, in the arithmetic given."""
+    """Follow the clip pixel by pixel in the given arithmetic."""
     steps, pixels, key = len(frames) - 1, frames[0].size, noise_key_of_seed(camera.seed)
     flat = frames.reshape(len(frames), pixels)
     if frames.dtype == np.uint8:
@@ -136,7 +136,7 @@ def trace_of(camera: Camera, frames: npt.NDArray[Any], real: Real) -> Trace:
 
 
 def imbalance(camera: Camera, frames: npt.NDArray[Any], seen: Trace) -> float:
-    """Largest difference of the two sides of the balance, log units."""
+    """Return the largest difference of the two sides of the balance, log units."""
     steps, pixels, key = len(frames) - 1, frames[0].size, noise_key_of_seed(camera.seed)
     ends = frames[[0, -1]].reshape(2, pixels)
     level = log_table_float64(camera.gamma, camera.log_eps)[ends] if frames.dtype == np.uint8 else ends

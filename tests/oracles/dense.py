@@ -1,4 +1,4 @@
-"""Event cameras simulated one event at a time, one pixel at a time: what the voxel simulation is measured against.
+"""Event cameras simulated one event and one pixel at a time: the reference of the voxel simulation.
 
 Nothing here is shared with the kernel but the equations of the pixel model (``v2v_protocol.recipe``) and the rule of
 ``v2v_server/simulation/voxel.py`` about when a change counts.
@@ -37,7 +37,7 @@ class Events(NamedTuple):
 def dense_events(
     levels: Levels, seconds: Levels, start: Levels, threshold_pos: float, threshold_neg: float, tolerance: float = 0.0
 ) -> Events:
-    """Every event of a clip, float64, without noise.
+    """Return every event of a clip, float64, without noise.
 
     Args:
         levels: [n, pixels] log intensity.
@@ -55,8 +55,10 @@ def dense_events(
 
 
 def bin_events(events: Events, edges: Levels, pixels: int) -> npt.NDArray[np.int64]:
-    """Signed counts: [bins, pixels]. Bin b holds edges[b] < seconds <= edges[b + 1]: an event that is due at a frame
-    belongs to the step that ends there."""
+    """Return signed counts [bins, pixels].
+
+    Bin b holds edges[b] < seconds <= edges[b + 1]: an event at the time of a frame belongs to the step that ends there.
+    """
     bins = len(edges) - 1
     place = np.searchsorted(edges, events.seconds, side="left") - 1
     inside = (place >= 0) & (place < bins)
@@ -67,7 +69,7 @@ def bin_events(events: Events, edges: Levels, pixels: int) -> npt.NDArray[np.int
 
 @numba.njit(cache=True)
 def _walk(levels, clock, start, threshold_pos, threshold_neg, tolerance, pixel, seconds, polarity, write):
-    """Counts the events; writes them as well where ``write`` is set."""
+    """Count the events; with ``write`` also write them."""
     made = 0
     for p in range(levels.shape[1]):
         residual = start[p]
@@ -93,7 +95,7 @@ def _walk(levels, clock, start, threshold_pos, threshold_neg, tolerance, pixel, 
 
 
 class Trace(NamedTuple):
-    """What :func:`trace` saw.
+    """The result of :func:`trace`.
 
     Attributes:
         counts: [steps, pixels] signed events, in the arithmetic of the trace.
@@ -117,7 +119,7 @@ def trace(
     threshold_neg: float | np.floating[Any],
     tolerance: float,
 ) -> Trace:
-    """The pixel model, step by step, in the arithmetic (float32 or float64) of ``levels``.
+    """Run the pixel model, step by step, in the arithmetic (float32 or float64) of ``levels``.
 
     Args:
         levels: [steps + 1, pixels] log intensity.

@@ -37,7 +37,7 @@ LARGEST_Z = 5.0
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found. It passes where ``measured <= bound``.
+    """The result of a check. It passes where ``measured <= bound``.
 
     Attributes:
         measured, bound: in the row's own quantity.
@@ -81,26 +81,26 @@ def record_of(row: Row) -> dict[str, Any]:
 
 
 def texture(steps: int = STEPS, height: int = HEIGHT_PX, width: int = WIDTH_PX) -> Frames:
-    """Uncorrelated grey levels: every pixel jumps at every step."""
+    """Return uncorrelated grey levels: every pixel jumps at every step."""
     shape = (steps + 1, height, width)
     return np.random.default_rng(1).integers(0, 256, shape, np.uint8)
 
 
 def flicker(steps: int = STEPS) -> Frames:
-    """Black and white in turns."""
+    """Return frames that are black and white in turns."""
     frames = np.zeros((steps + 1, HEIGHT_PX, WIDTH_PX), np.uint8)
     frames[1::2] = 255
     return frames
 
 
 def staircase() -> Frames:
-    """All grey levels, one by one, up and down again."""
+    """Return all grey levels, one by one, up and down again."""
     levels = np.concatenate([np.arange(256), np.arange(254, -1, -1)]).astype(np.uint8)
     return np.broadcast_to(levels[:, None, None], (len(levels), HEIGHT_PX, WIDTH_PX))
 
 
 def balanced(camera: Camera, frames: npt.NDArray[Any]) -> Finding:
-    """The balance of a clip; infinite where the kernel's counts are not those of the trace.
+    """Return the balance of a clip; infinite where the kernel's counts are not those of the trace.
 
     The bound is never above half the smaller threshold: where the arithmetic allows more, it was the wrong one.
     """
@@ -112,7 +112,7 @@ def balanced(camera: Camera, frames: npt.NDArray[Any]) -> Finding:
 
 
 def refused(error: type[UsageError], *calls: tuple[Callable[[], object], Sequence[str]]) -> Finding:
-    """How many calls do not raise exactly that error with all the words in its message. Other errors pass through."""
+    """Count the calls that do not raise exactly that error with all words in its message; other errors pass through."""
     wrong = []
     for number, (call, words) in enumerate(calls):
         try:
@@ -127,7 +127,7 @@ def refused(error: type[UsageError], *calls: tuple[Callable[[], object], Sequenc
 
 
 def still(level: int) -> Finding:
-    """Events of a still scene after its first step."""
+    """Count the events of a still scene after its first step."""
     frames = np.full((STEPS + 1, HEIGHT_PX, WIDTH_PX), level, np.uint8)
     voxels = simulate(frames, threshold_pos=0.05, threshold_neg=0.06, bins=STEPS).voxels[0]
     accounted = balanced(Camera(0.05, 0.06), frames)
@@ -135,7 +135,7 @@ def still(level: int) -> Finding:
 
 
 def exact_multiples() -> Finding:
-    """Ramps of k thresholds, from everywhere between black and white, that do not give k events."""
+    """Count the ramps of k thresholds, from everywhere between black and white, that do not give k events."""
     wrong = tried = 0
     cases = [(0.1, 20, 10)]  # 2.0 log units at 0.1
     cases += [(c, k, steps) for c in (0.05, 0.1, 1 / 3, 0.7, 2.0) for k in (1, 3, 100) for steps in (5, 40, 200)]
@@ -152,7 +152,7 @@ def exact_multiples() -> Finding:
 
 
 def one_grey_level() -> Finding:
-    """The staircase: balance, and as many events up as the whole height holds."""
+    """Check the staircase: balance, and as many events up as the whole height holds."""
     camera = Camera(0.05, 0.05)
     accounted = balanced(camera, staircase())
     up = simulate(staircase()[:256], threshold_pos=0.05, start_residual=0.0, bins=255, dtype="int16").voxels.sum((0, 1))
@@ -164,7 +164,7 @@ def one_grey_level() -> Finding:
 
 
 def large_frames() -> Finding:
-    """One noisy step of 8192 x 4320 pixels: how many of every 101st and of the last 4096 pixels have a wrong count."""
+    """Count wrong pixels of a noisy step of 8192 x 4320, among every 101st and the last 4096."""
     height, width, camera = 4320, 8192, Camera(0.2, 0.25, 0.1)
     pixels, key = height * width, noise_key_of_seed(camera.seed)
     first = (np.arange(pixels, dtype=np.uint32) * np.uint32(2654435761) >> np.uint32(24)).astype(np.uint8)
@@ -189,7 +189,7 @@ def large_frames() -> Finding:
 
 
 def million_frames(real_name: str) -> Finding:
-    """The drift of a residual over 10^6 frames of a scene that repeats every three: rounding that does not cancel."""
+    """Measure the drift of a residual over 10^6 frames of a scene with period three: rounding does not cancel."""
     levels = np.array([[10, 0, 255, 30], [90, 255, 3, 31], [200, 128, 77, 33]], np.uint8)
     frames = levels[np.arange(LONG_STEPS + 1) % 3][:, None]
     camera = Camera(0.05, 0.06)
@@ -210,7 +210,7 @@ def million_frames(real_name: str) -> Finding:
 
 
 def not_numbers() -> Finding:
-    """Every numeric argument, NaN or infinite."""
+    """Check every numeric argument, NaN or infinite."""
     frames = texture(5)
     names = ("threshold_pos", "threshold_neg", "noise_sigma", "hot_pixel_sigma", "gamma", "log_eps", "start_residual")
     calls: list[tuple[Callable[[], object], Sequence[str]]] = []
@@ -225,7 +225,7 @@ def not_numbers() -> Finding:
 
 
 def not_numbers_in_a_recipe() -> Finding:
-    """Every real field of a recipe, NaN or infinite."""
+    """Check every real field of a recipe, NaN or infinite."""
     fields = [name for name, value in Recipe().to_dict().items() if isinstance(value, float | list)]
     calls: list[tuple[Callable[[], object], Sequence[str]]] = []
     for name, value in itertools.product(fields, (math.nan, math.inf, -math.inf)):
@@ -235,13 +235,13 @@ def not_numbers_in_a_recipe() -> Finding:
 
 
 def denormals() -> Finding:
-    """Log intensities that differ by denormal numbers, under noise of denormal strength."""
+    """Check log intensities that differ by denormal numbers, under noise of denormal strength."""
     tiny = np.arange(STEPS + 1)[:, None, None] * np.array([[5e-324, 1e-45, 1e-39, 2e-38]])
     return balanced(Camera(0.05, 0.06, noise_sigma=1e-310, hot_pixel_count=2, hot_pixel_sigma=1e-40), tiny)
 
 
 def dtype_limits() -> Finding:
-    """Bins that are neither exact nor clipped to the limit of their type and counted."""
+    """Count bins that are neither exact nor clipped to the limit of their type and counted."""
     wrong = 0
     for dtype, limit in (("int8", 127), ("int16", 32767), ("float32", math.inf)):
         for height in (0.5, 126.5, 127.5, 128.5, 255.5, 256.5, 32766.5, 32767.5, 32768.5, 65536.5, 1e6 + 0.5):
@@ -255,7 +255,7 @@ def dtype_limits() -> Finding:
 
 
 def seeds() -> Finding:
-    """The ends of the seed's range: both work, differ, and repeat; beyond them is refused."""
+    """Check the ends of the seed's range: both work, differ, and repeat; beyond them is refused."""
     frames = texture(5)
     make = [simulate(frames, threshold_pos=0.2, noise_sigma=0.5, seed=s).voxels for s in (0, 2**64 - 1, 0, 2**64 - 1)]
     wrong = int((make[0] == make[1]).all()) + int((make[0] != make[2]).any()) + int((make[1] != make[3]).any())
@@ -265,7 +265,7 @@ def seeds() -> Finding:
 
 
 def noise_correlation() -> Finding:
-    """The largest correlation of the noise with itself: next pixels, frames, samples, epochs and seeds."""
+    """Measure the largest correlation of the noise with itself: next pixels, frames, samples, epochs and seeds."""
     steps, pixels = 40, 25_000
     recipe = preset("paper")
 
@@ -291,7 +291,7 @@ def noise_correlation() -> Finding:
 
 
 def beyond_float64() -> Finding:
-    """Cameras that not even float64 can count."""
+    """Check cameras that not even float64 can count."""
     frames = texture(5)
     limit = f"{LIMITS['float64'][1]:.4g}"
     return refused(
@@ -307,7 +307,7 @@ def beyond_float64() -> Finding:
 
 
 def recipe_beyond_float64() -> Finding:
-    """Recipes whose worst draw not even float64 can count."""
+    """Check recipes whose worst draw not even float64 can count."""
     limit = f"{LIMITS['float64'][1]:.4g}"
     return refused(
         RecipeError,
@@ -321,7 +321,7 @@ def recipe_beyond_float64() -> Finding:
 
 
 def rows() -> list[Row]:
-    """All of them."""
+    """Return all rows."""
     error = "imbalance, log units"
     made = [
         Row("black", "counted", "events after the first step", lambda: still(0)),
@@ -369,7 +369,7 @@ def rows() -> list[Row]:
 
 
 def table_never_falls() -> Finding:
-    """A flat table may repeat a value in float32; it must never fall."""
+    """Count falls of a flat table: it may repeat a value in float32, but must not fall."""
     step = np.diff(log_table(4.0, 0.1))
     note = f"{int((step == 0).sum())} levels share a value"
     return Finding(int((step < 0).sum()), 0.0, "float32", note)

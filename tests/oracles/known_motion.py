@@ -58,13 +58,13 @@ class Scene:
 
 
 def photograph(name: str) -> Grey:
-    """One of the photographs that come with scikit-image, grey."""
+    """Return one of the photographs that come with scikit-image, grey."""
     picture = getattr(data, name)()
     return np.array(picture if picture.ndim == 2 else color.rgb2gray(picture) * 255.0 + 0.5, np.uint8)
 
 
 def scenes(textures: Mapping[str, Grey], height: int, width: int, seed: int = 0, every: int = 1) -> list[Scene]:
-    """One scene of every texture, kind and degradation, or every so many of them.
+    """Return one scene of every texture, kind and degradation, or every ``every``-th of them.
 
     The largest displacement of each is drawn log-uniformly from 0.25 to 16 px.
     """
@@ -119,7 +119,7 @@ def _render(
     *,
     later: bool,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """One picture, the flow from it to the other one, and which layer each pixel shows."""
+    """Return one picture, the flow from it to the other one, and the layer of each pixel."""
     picture = np.zeros(grid.shape[1:])
     flow = np.zeros((*grid.shape[1:], 2), np.float32)
     owner = np.zeros(grid.shape[1:], np.int64)
@@ -148,7 +148,7 @@ def _sample(texture: Grey, x: npt.NDArray[np.float64], y: npt.NDArray[np.float64
 
 
 def _cover(outline: _Affine, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """How much of each pixel an ellipse covers; ``outline`` takes it to the unit circle."""
+    """Return the share of each pixel that an ellipse covers; ``outline`` takes it to the unit circle."""
     x, y, _ = _apply(outline, points)
     radius = np.hypot(x, y)
     pixel = math.sqrt(abs(np.linalg.det(outline[:2, :2])))
@@ -157,7 +157,7 @@ def _cover(outline: _Affine, points: npt.NDArray[np.float64]) -> npt.NDArray[np.
 
 
 def _motion(kind: str, most_px: float, height: int, width: int, rng: np.random.Generator) -> _Affine:
-    """A motion whose largest displacement is about ``most_px``."""
+    """Return a motion whose largest displacement is about ``most_px``."""
     centre = _shift((width - 1) / 2, (height - 1) / 2)
     reach = math.hypot(width, height) / 2
     sign = rng.choice((-1.0, 1.0))
@@ -172,7 +172,7 @@ def _motion(kind: str, most_px: float, height: int, width: int, rng: np.random.G
 
 
 def _look(texture: Grey, height: int, width: int, rng: np.random.Generator) -> _Affine:
-    """Where in the texture the picture lies: its middle part, slightly turned, at a fraction of a pixel."""
+    """Return the place of the picture in the texture: its middle part, slightly turned, at a fraction of a pixel."""
     rows, columns = texture.shape
     shift = _shift(columns / 2 + rng.uniform(-20, 20), rows / 2 + rng.uniform(-20, 20))
     return shift @ _turn(rng.uniform(0.02, 0.05)) @ _shift(-width / 2, -height / 2)

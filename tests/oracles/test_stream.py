@@ -1,4 +1,4 @@
-"""The checker over a real corpus: samples made in this process, logged as consumers do, with and without faults."""
+"""The oracle of a stream on a real corpus: samples made here and logged as consumers do, with and without faults."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Flip = Callable[[int, np.ndarray], None]
 
 
 def lines(catalogue: Catalogue, asked: Profile, flip: Flip = lambda index, voxels: None) -> list[Line]:
-    """A faultless consumer's log; ``flip`` may change the bytes of a sample before they are logged."""
+    """Return a log without faults; ``flip`` may change the bytes of a sample before they are logged."""
     found: list[Line] = [LifeLine(0, 0, 0.0)]
     for number in range(BATCHES):
         epoch, place = divmod(number, 11 // asked.batch_size)
@@ -70,7 +70,7 @@ def faults(found: Verdict) -> tuple[int, int, int]:
 
 
 def changed(log: list[Line], place: int, **changes: object) -> list[Line]:
-    """The log with one field of the first sample of line ``place`` changed."""
+    """Return the log with one field of the first sample of line ``place`` changed."""
     line = log[place]
     assert isinstance(line, BatchLine)
     first = dataclasses.replace(line.samples[0], **changes)  # type: ignore[arg-type]

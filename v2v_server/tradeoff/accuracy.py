@@ -1,7 +1,7 @@
 """Errors of each form of the corpus against exactly decoded frames, by contrast threshold.
 
 Both sides are the same camera: the sample's own draw and noise key, with both thresholds set to the value in question.
-Hot pixels are left out: their many events are the same on both sides and would make every relative error look small.
+Hot pixels are left out: they fire alike on both sides and would make every relative error look small.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def test_every_kind_is_survived_and_the_memory_comes_back(tmp_path: Path, corpus
 
 @pytest.mark.slow
 def test_an_attack_arrives(tmp_path: Path, corpus: Path) -> None:
-    """Idle peers hold the server's files while they are there: the siege is no siege if nobody comes."""
+    """Idle peers hold the server's files while they are connected: the attackers do arrive."""
     fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0)
     del fleet.crowd[0]
     try:

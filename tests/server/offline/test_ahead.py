@@ -232,8 +232,13 @@ def test_what_is_no_shard(text: str) -> None:
 
 def test_an_index_that_knows_something_already_keeps_it(tmp_path: Path) -> None:
     with closing(Store(tmp_path / "one")) as one, closing(Store(tmp_path / "other")) as other:
-        one.put([IndexRow("a", 1, fingerprint="old"), IndexRow("b", 1, fingerprint="kept")])
-        other.put([IndexRow("a", 2, fingerprint="new"), IndexRow("c", 3)])
+        one.put(
+            [
+                IndexRow(name, 1, fingerprint=fingerprint, problem="cut off")
+                for name, fingerprint in (("a", "old"), ("b", "kept"))
+            ]
+        )
+        other.put([IndexRow("a", 2, fingerprint="new", problem="cut off"), IndexRow("c", 3, problem="cut off")])
         other.not_looked_at("look")  # makes the table
         other.put_scenes([("a", "new", "look", b"scene")])
         assert one.take_in(tmp_path / "other") == 2
