@@ -70,7 +70,7 @@ def draw_overview(
 
 
 def _panel(whole: Camera, tile_px: int) -> tuple[int, int]:
-    """Width and height of a panel, px."""
+    """Return width and height of a panel, px."""
     height, width = whole.frames.shape[1:]
     scale = min((2 * tile_px + GAP_PX) / width, _HIGHEST_TILES * tile_px / height)
     return max(1, round(width * scale)), max(1, round(height * scale))
@@ -101,7 +101,7 @@ def _box(page: Canvas, camera: Camera, x: int, y: int, width_px: int, height_px:
 
 
 def _place(camera: Camera, width_px: int, height_px: int) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of the camera's crop where its whole picture has this size, px."""
+    """Return left, top, right and bottom of the camera's crop in a whole picture of this size, px."""
     assert camera.whole is not None
     height, width = camera.whole.shape
     across, down = width_px / width, height_px / height

@@ -39,11 +39,6 @@ class Liveness:
         self._wait = self._ping_seconds
         self._ask_at = now + self._wait
 
-    def leave_out(self, seconds: float) -> None:
-        """Exclude time during which this process was not polling."""
-        self._heard += seconds
-        self._ask_at += seconds
-
     def silence(self, now: float) -> float:
         """Return the seconds since the peer was heard."""
         return now - self._heard

@@ -129,16 +129,6 @@ class Proxy:
         with self._change:
             self._healthy()
 
-    def wait_until(self, condition: Callable[[Proxy], bool], seconds: float = 30.0) -> None:
-        """Returns as soon as ``condition`` holds.
-
-        Raises:
-            TimeoutError: it does not.
-        """
-        with self._change:
-            if not self._change.wait_for(lambda: condition(self), seconds):
-                raise TimeoutError(f"the proxy did not come to it within {seconds} s")
-
     # --- threads ------------------------------------------------------------------------------------------------------
 
     def _spawn(self, work: Callable[..., None], *arguments: object) -> None:

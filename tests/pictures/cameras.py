@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
+from v2v_pictures.canvas import Canvas
 
 
 def camera(
@@ -32,3 +34,16 @@ def has(image: npt.NDArray[np.uint8], colour: tuple[int, ...]) -> int:
 
 def without_noise(shown: Camera, quiet: npt.NDArray[Any]) -> Camera:
     return dataclasses.replace(shown, quiet=dataclasses.replace(shown, voxels=quiet).rates)
+
+
+def record_texts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return a list that collects every text drawn from now on."""
+    written: list[str] = []
+    write = Canvas.text
+
+    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
+        written.append(text)
+        return write(page, x, y, text, **style)
+
+    monkeypatch.setattr(Canvas, "text", listen)
+    return written

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pictures
 
-from tests.pictures.cameras import camera, has, without_noise
+from tests.pictures.cameras import camera, has, record_texts, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import INK, MARK, PAUSED, Canvas, shortened, text_width
@@ -107,14 +107,7 @@ def test_a_full_bar_of_the_strip_is_the_rate_that_is_written_above_it(monkeypatc
     voxels[10, 0] = 1  # twice as many
     voxels[20, 0, :5] = 0
     voxels[20, 0, :, :2] = 1  # 0.2 instead of 0.5: a bar of the square root of 0.4
-    written: list[str] = []
-    write = Canvas.text
-
-    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
-        written.append(text)
-        return write(page, x, y, text, **style)
-
-    monkeypatch.setattr(Canvas, "text", listen)
+    written = record_texts(monkeypatch)
     page = Canvas(1100, 160)
     draw_strip(page, camera(voxels), 50, 40, 1000, 80, 0.5)
     assert "full bar: 0.5 or more a pixel and bin" in written
@@ -128,14 +121,7 @@ def test_all_strips_of_a_page_have_one_scale(draw: Any, monkeypatch: pytest.Monk
     """A camera with hardly any events must not look as active as one with motion."""
     busy, quiet = np.ones((4, 2, 16, 16), np.int8), np.zeros((4, 2, 16, 16), np.int8)
     quiet[:, :, 0, 0] = 1
-    written: list[str] = []
-    write = Canvas.text
-
-    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
-        written.append(text)
-        return write(page, x, y, text, **style)
-
-    monkeypatch.setattr(Canvas, "text", listen)
+    written = record_texts(monkeypatch)
     draw([camera(quiet), camera(busy)], "one scale")
     assert {text for text in written if text.startswith("full bar")} == {"full bar: 1 or more a pixel and bin"}
 
@@ -226,14 +212,7 @@ def test_a_film_has_a_picture_for_each_bin() -> None:
 def test_a_camera_of_mostly_noise_says_so_in_a_film_too(monkeypatch: pytest.MonkeyPatch) -> None:
     loud, quiet = np.ones((3, 2, 16, 16), np.int8), np.zeros((3, 2, 16, 16), np.int8)
     quiet[:, :, :4] = 1
-    written: list[str] = []
-    write = Canvas.text
-
-    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
-        written.append(text)
-        return write(page, x, y, text, **style)
-
-    monkeypatch.setattr(Canvas, "text", listen)
+    written = record_texts(monkeypatch)
     next(draw_film([without_noise(camera(loud), quiet)], "t"))
     assert "mostly noise: 75% of the events" in written
 

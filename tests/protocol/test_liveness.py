@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 
-from hypothesis import given
-from hypothesis import strategies as st
-
 from v2v_protocol.liveness import Liveness
 
 
@@ -33,12 +30,3 @@ def test_a_peer_without_pings_is_never_due() -> None:
     peer = Liveness(0.0)
     assert not peer.ping_due(1e9)
     assert peer.next_due(1e9) == math.inf
-
-
-@given(away=st.floats(0.0, 1e6), silent=st.floats(0.0, 30.0))
-def test_time_without_polling_does_not_count_as_silence(away: float, silent: float) -> None:
-    peer = Liveness(0.0, gone_seconds=20.0, ping_seconds=5.0)
-    peer.leave_out(away)
-    now = away + silent
-    assert abs(peer.silence(now) - silent) < 1e-6
-    assert peer.next_due(now) <= max(0.0, 5.0 - silent) + 1e-6

@@ -1,4 +1,4 @@
-"""Scalars and pictures of a run for TensorBoard, written by the calling thread.
+"""Write scalars and pictures of a run for TensorBoard in the calling thread.
 
 PyTorch's ``SummaryWriter`` writes in a thread of its own. That thread prints a trace when the disk is full, and the
 caller learns of the error at a later call.
@@ -20,10 +20,10 @@ from trainer.pictures import Image
 
 
 class Board:
-    """An event file in ``folder``, which is made if it is missing.
+    """Write an event file in ``folder``, which is created if it is missing.
 
     Args:
-        first_step: TensorBoard drops what earlier files say of this step and later ones.
+        first_step: TensorBoard drops what earlier files hold for this step and later ones.
 
     Raises:
         OSError: the file cannot be written; every method raises it too.

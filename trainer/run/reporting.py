@@ -134,7 +134,7 @@ class Reporter:
 
     @contextlib.contextmanager
     def _writing(self, name: str) -> Iterator[None]:
-        """A block that writes ``name`` in the folder of the run."""
+        """Turn an error of writing ``name`` in the folder of the run into one line with the remedy."""
         try:
             yield
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Validation during training: the network is scored on recordings, which the ranks share."""
+"""Score the network on recordings during training; the ranks share the recordings."""
 
 from __future__ import annotations
 

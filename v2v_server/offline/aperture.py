@@ -1,4 +1,4 @@
-"""The clean aperture of MP4 and QuickTime files: a part of the picture that their ``clap`` box says is to be shown.
+"""Read the clean aperture of MP4 and QuickTime files: the part of the picture that their ``clap`` box asks to show.
 
 ISO/IEC 14496-12, 4.2 (boxes) and 12.1.4 (clean aperture).
 """
@@ -20,10 +20,10 @@ _MOST_BOXES = 10_000
 
 
 def clean_aperture(path: Path) -> tuple[Fraction, Fraction] | None:
-    """Return width and height in pixels that a file wants shown, where that is less than its picture.
+    """Return width and height in pixels of a file's clean aperture, if it is smaller than the picture.
 
     Returns:
-        None where it wants all of it, is of another format or is damaged.
+        None if it is the whole picture, or if the file has another format or is damaged.
 
     Raises:
         OSError: the file cannot be read.

@@ -148,28 +148,28 @@ class Stack:
         raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
 
     def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """The collected frames of each cut, [count, h, w] uint8: upright, in full range."""
+        """Yield the collected frames of each cut, [count, h, w] uint8: upright, in full range."""
         for _, raw in self._parts:
             stretch(raw, self._luma)
             yield self._orientation.upright(raw)
 
 
 class LastFrame(Stack):
-    """Keeps only the last of the asked frames, of one cut."""
+    """Keep only the last of the asked frames, of one cut."""
 
     def __init__(self, wanted: FrameRange, cut: Cut) -> None:
         super().__init__(wanted, [cut])
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         ((stored, last),) = self._parts
-        self._parts = [(stored, np.empty_like(last))]  # whoever has the last one may keep it
+        self._parts = [(stored, np.empty_like(last))]  # a caller may keep the last one
         copy_luma(samples, self._luma, stored, self._parts[0][1][0])
 
     def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
         return super()._part(replace(cut, count=1))
 
     def picture(self) -> npt.NDArray[np.uint8]:
-        """The last frame that was taken, [h, w] uint8: upright, in full range."""
+        """Return the last frame that was taken, [h, w] uint8: upright, in full range."""
         (grey,) = self.grey()
         picture: npt.NDArray[np.uint8] = grey[0]
         return picture

@@ -122,7 +122,7 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
 
 
 def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """The cuts, [count, h, w] uint8 each, and the codec's name."""
+    """Return the cuts, [count, h, w] uint8 each, and the codec's name."""
     stack = _filled(wanted, cuts)
     return list(stack.grey()), stack.codec
 
@@ -145,7 +145,7 @@ def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:
 def stream_luma(
     path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """The frames of :func:`decode_luma` one by one, in the memory of one.
+    """Yield the frames of :func:`decode_luma` one by one, in the memory of one.
 
     Yields:
         [h, w] uint8, C-contiguous, full-range luma.
@@ -193,7 +193,7 @@ def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> b
 
 
 def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
-    """The frames from the last keyframe at or before the range, without those that nothing refers to.
+    """Yield the frames from the last keyframe at or before the range, without unreferenced ones.
 
     Raises:
         _SeekFailed, VideoError: it did not work out, or there is nothing to be saved; decoding from the beginning has
@@ -241,7 +241,7 @@ def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
 
 
 def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:
-    """Shows frame after frame to a stack, until it has what it wants; a step after each."""
+    """Pass frame after frame to a stack until it is complete, and yield after each."""
     with closing(frames):  # type: ignore[type-var]  # a generator
         for frame in frames:
             complete = stack.take(frame)
@@ -265,7 +265,7 @@ def _needed(source: Iterator[Packet[VideoStream]], begin: int, prefix: int) -> I
 
 
 def _from_keyframe(frames: Iterator[VideoFrame], pts: int) -> Iterator[VideoFrame]:
-    """The same frames, once it is certain that the first is the keyframe of that pts.
+    """Yield the same frames after checking that the first is the keyframe of that pts.
 
     Raises:
         _SeekFailed: it is not.
@@ -292,7 +292,7 @@ def _show_first_packet(container: InputContainer, stream: VideoStream) -> None:
 
 
 def _packets_from(container: InputContainer, stream: VideoStream, pts: int, dts: int) -> Iterator[Packet[VideoStream]]:
-    """The packets from the keyframe of that pts on.
+    """Yield the packets from the keyframe of that pts on.
 
     Demuxers differ in whether they seek by pts or by dts, and where they land: everything in front of the keyframe is
     passed over, and a landing behind it is tried again with the other time stamp.

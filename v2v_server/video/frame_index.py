@@ -80,7 +80,7 @@ class FrameIndex:
         return start - self.first
 
     def slice(self, start: int, count: int) -> FrameIndex:
-        """The part needed to decode frames start .. start + count - 1: from the keyframe at or before ``start``.
+        """Return the part needed to decode frames start .. start + count - 1: from the keyframe at or before ``start``.
 
         Raises:
             UsageError: the range does not lie in this index.
@@ -128,7 +128,7 @@ class FrameIndex:
         return self.pts[at : at + count].astype(np.float64) * numerator / denominator
 
     def to_bytes(self) -> bytes:
-        """A compact encoding: a few bytes a frame at a varying rate, next to nothing at a constant one."""
+        """Encode the index: a few bytes a frame at a varying rate, next to nothing at a constant one."""
         lies = self.orientation
         flags = _SEEKABLE * self.seekable | _TRANSPOSE * lies.transpose | _FLIP_Y * lies.flip_y | _FLIP_X * lies.flip_x
         head = _HEADER.pack(
@@ -142,7 +142,7 @@ class FrameIndex:
 
     @classmethod
     def from_bytes(cls, data: bytes, most_frames: int = LARGEST_FRAMES) -> FrameIndex:
-        """The index back from :meth:`to_bytes`. Allocates at most 24 bytes for each frame it accepts.
+        """Decode what :meth:`to_bytes` returned. Allocates at most 24 bytes for each frame it accepts.
 
         Raises:
             ProtocolError: ``data`` is no such encoding, or states more than ``most_frames`` frames.
@@ -179,7 +179,7 @@ class FrameIndex:
 def unseekable(
     frames: int, time_base: tuple[int, int], height_px: int, width_px: int, orientation: Orientation = _UPRIGHT
 ) -> FrameIndex:
-    """The index of a file whose frames can only be counted from its beginning."""
+    """Return the index of a file whose frames can only be counted from its beginning."""
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
     return FrameIndex(0, pts, none, none, time_base, height_px, width_px, False, orientation)

@@ -18,7 +18,7 @@ _SLOPE, _INTERCEPT, _FRACTION_BITS = np.int32(76309), np.int32(16 * 76309 - 2**1
 # The signature holds for every layout, so that there is one variant; it is compiled, or loaded, as this is imported.
 @numba.njit(numba.void(numba.uint8[:, :, :]), nogil=True, cache=True)
 def to_full_range(frames):
-    """Turns limited-range luma Y into ``range_table(8, False)[Y]``, in place.
+    """Turn limited-range luma Y into ``range_table(8, False)[Y]``, in place.
 
     Args:
         frames: [n, h, w] uint8, neighbours of a row side by side.

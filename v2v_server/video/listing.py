@@ -1,8 +1,7 @@
-"""Making sure that the frames of a file are those that its packets list.
+"""Confirm that the frames of a file are those that its packets list.
 
-Decoding confirms the first frames, those around the longest gaps in the time stamps, and the last group of frames where
-that is short. A sign that any of the list could be wrong (:mod:`v2v_server.video.signs`) has the whole file decoded
-once.
+Decoding confirms the first frames, those around the longest gaps in the time stamps, and the last group of frames if
+it is short. If :mod:`v2v_server.video.signs` finds a reason for doubt, the whole file is decoded once.
 """
 
 from __future__ import annotations
@@ -95,8 +94,8 @@ class Delivered:
     def confirmed(self, listed: FrameIndex, empty_pts: array[int]) -> FrameIndex | None:
         """Return the part of a list that the decoder delivers; None where it delivers other frames, or another order.
 
-        Frames behind the last one that comes are left out, and empty packets. Others that do not come are lost: they
-        stay in the list, and are refused. Where many are, it is no list of frames.
+        Frames after the last delivered one are left out, and so are empty packets. Other frames that are not delivered
+        are lost: they stay in the list and are refused. If many are lost, the packets do not list frames.
 
         Args:
             listed: all frames of the file, seekable.

@@ -51,7 +51,7 @@ class LumaFormat:
 
     @classmethod
     def of(cls, frame: VideoFrame) -> LumaFormat:
-        """The luma format of a decoded frame."""
+        """Return the luma format of a decoded frame."""
         name = frame.format.name
         if not _LUMA_PLANE.fullmatch(name) or frame.planes[0].line_size <= 0:  # negative: stored bottom-up
             return cls(name, int(frame.color_range), 8, full_range=True, has_plane=False)
@@ -97,7 +97,7 @@ def range_table(bits: int, full_range: bool) -> npt.NDArray[np.uint8]:
 
 
 def luma_plane(frame: VideoFrame, luma: LumaFormat) -> npt.NDArray[np.unsignedinteger]:
-    """The samples of a frame's luma, [H, W] uint8 or uint16 as stored: the decoder's own memory, only to be read."""
+    """Return the samples of a frame's luma, [H, W] uint8 or uint16 as stored: the decoder's memory, read-only."""
     if not luma.has_plane:
         frame = frame.reformat(format="gray")
     plane = frame.planes[0]
@@ -129,7 +129,7 @@ def stretch(frames: npt.NDArray[np.uint8], luma: LumaFormat) -> None:
         luma: the format that they were copied from.
     """
     if luma.bits == 8 and not luma.full_range:
-        # Whoever only lists or opens videos does without the compiler.
+        # Imported lazily: listing or opening videos must not load numba.
         from v2v_server.video.full_range import to_full_range
 
         to_full_range(frames)

@@ -30,7 +30,7 @@ class Orientation:
 
     @classmethod
     def of(cls, frame: VideoFrame) -> Orientation:
-        """The orientation in the frame's display matrix; upright without one.
+        """Return the orientation in the frame's display matrix; upright without one.
 
         A matrix that turns by another angle than a multiple of 90 degrees counts as the nearest one.
         """
@@ -57,7 +57,7 @@ class Orientation:
         return (left, top, columns, rows) if self.transpose else (top, left, rows, columns)
 
     def upright(self, frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Stored pictures [n, h, w] turned upright: [n, h, w] or [n, w, h], C-contiguous."""
+        """Turn stored pictures [n, h, w] upright: [n, h, w] or [n, w, h], C-contiguous."""
         if self.transpose:
             frames = frames.transpose(0, 2, 1)
         if self.flip_y:

@@ -131,7 +131,7 @@ class Fields:
         return frame_num, structure
 
     def _read_configuration(self, data: memoryview) -> None:
-        """The AVCDecoderConfigurationRecord: so many SPS behind their lengths of two bytes, then PPS alike."""
+        """Read an AVCDecoderConfigurationRecord: a count of SPS, each behind its two-byte length, then PPS alike."""
         at = 5
         for mask in (0x1F, 0xFF):
             if at >= len(data):
@@ -211,14 +211,14 @@ class _Bits:
         self._value, self._left = int.from_bytes(content, "big"), 8 * len(content)
 
     def u(self, bits: int) -> int:
-        """The next bits as a whole number."""
+        """Return the next bits as a whole number."""
         self._left -= bits
         if self._left < 0:
             raise IndexError
         return self._value >> self._left & ((1 << bits) - 1)
 
     def ue(self) -> int:
-        """The next Exp-Golomb code, 9.1."""
+        """Return the next Exp-Golomb code, 9.1."""
         zeros = 0
         while not self.u(1):
             zeros += 1

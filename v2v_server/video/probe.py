@@ -131,7 +131,7 @@ class _Shown:
 
 
 def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[VideoFrame, _Shown]:
-    """The first frame that decodes without error, and every packet that begins a frame."""
+    """Return the first frame that decodes without error, and every packet that begins a frame."""
     codec = stream.codec_context.codec.canonical_name
     fields = Fields(stream.codec_context.extradata) if codec == "h264" else None
     head: VideoFrame | None = None
@@ -156,13 +156,13 @@ def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[Vi
 
 
 class _Effort:
-    """Gives up on a file that would never end, or whose list of frames would fill the memory."""
+    """Limit of the work on one file, which may never end or list frames without end."""
 
     def __init__(self, name: str) -> None:
         self._name, self._until = name, time.process_time() + LONGEST_CPU_SECONDS
 
     def check(self, frames: int) -> None:
-        """Raises VideoError where there is more than may be, after so many frames."""
+        """Check the number of frames so far against the limits; raise VideoError beyond them."""
         if frames > LARGEST_FRAMES:
             why = f"holds more than {LARGEST_FRAMES} frames, the most that this program serves"
             raise VideoError(self._name, None, why)
@@ -196,7 +196,7 @@ def _is_doubtful(shown: _Shown, reorders: bool) -> bool:
 
 
 def _index(shown: _Shown, head: VideoFrame, uncounted: FrameIndex) -> FrameIndex | None:
-    """The index by presentation time; None when the time stamps do not name the frames."""
+    """Return the index by presentation time; None if the time stamps do not name the frames."""
     pts = np.array(shown.pts, np.int64)
     if head.pts is None or np.any(pts == NO_TIMESTAMP):
         return None

@@ -20,7 +20,7 @@ class Rows:
 
     Attributes:
         top, bottom: shares of the height, 0 <= top < bottom <= 1.
-        top_px: where not None, the first so many rows, whatever the height.
+        top_px: number of rows from the top, whatever the height; None: use ``top`` and ``bottom``.
 
     Raises:
         UsageError: a band without rows, or outside the picture.
@@ -73,7 +73,7 @@ class Rows:
         return top, bottom
 
     def __str__(self) -> str:
-        """The canonical text, which :meth:`parse` reads back."""
+        """Return the canonical text, which :meth:`parse` reads back."""
         if self.top_px is not None:
             return f"top:{self.top_px}px"
         if (self.top, self.bottom) == (0.0, 1.0):
@@ -82,7 +82,7 @@ class Rows:
 
 
 def _plain(share: float) -> str:
-    """The shortest decimal that reads back as the same float, never in scientific notation."""
+    """Return the shortest decimal that reads back as the same float, never in scientific notation."""
     text = repr(share)
     if "e" in text:
         mantissa, exponent = text.split("e")

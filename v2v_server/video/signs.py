@@ -1,4 +1,4 @@
-"""Signs that a list of packets may not be the list of frames. They cost no decoding; a false alarm costs one pass.
+"""Find signs that a list of packets is not the list of frames, without decoding. A false alarm costs one decoding pass.
 
 Sources: ITU-T H.264 and H.265, 7.3; RFC 6386, 9.1; VP9 bitstream specification, 6.2; AV1 bitstream specification, 5.3;
 ISO/IEC 13818-2, 6.2.2.1; ISO/IEC 14496-2, 6.2; ITU-T T.81, B.2.2.
@@ -35,14 +35,14 @@ _SIZES = {
     "vp9": re.compile(rb"\A.\x49\x83\x42(.{5})", re.DOTALL),
     "av1": re.compile(rb"\A(?:\x12\0)?\x0a(.{10})", re.DOTALL),
 }
-"""Where the size of the picture stands, by codec: in its headers, or with them."""
+"""Patterns of the headers that hold the size of the picture, by codec."""
 _SPS = {"h264": (0, 0x1F, 7), "hevc": (1, 0x3F, 33)}
-"""(shift, mask, type) that tell a sequence parameter set by the first byte of its NAL unit."""
+"""(shift, mask, type) that identify a sequence parameter set by the first byte of its NAL unit."""
 _VOP = b"\0\0\1\xb6"
 
 
 class PacketSigns:
-    """Reads the packets of a track.
+    """Read the packets of a track.
 
     Attributes:
         picture_changes: whether a packet states another picture than an earlier one.
@@ -80,7 +80,7 @@ class PacketSigns:
         return bool(stated) and stated != self._stated and stated not in self._extradata
 
     def _size(self, content: memoryview) -> bytes:
-        """Return what a packet says of the size of its picture; nothing where it says nothing."""
+        """Return the bytes that state the size of a packet's picture; empty if it has none."""
         head = content[:_HEAD_BYTES]
         if self._codec in _SPS:
             shift, mask, kind = _SPS[self._codec]

@@ -54,7 +54,7 @@ _PACKETS_LOOKED_AT = 256
 
 @contextmanager
 def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The container and its video track, closed at the end whatever happens.
+    """Open a container and its video track; both are closed at the end.
 
     Of several tracks it is one with a decoder and more than one frame, the default one before others, the first before
     later ones. Stills such as cover art do not count. The decoder runs in the calling thread only. A file is opened by
@@ -144,8 +144,7 @@ def _raw_format(name: str) -> str | None:
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """The track's packets in stored order. Empty ones (AVI's dropped frames) are left out: a decoder would take them
-    for the end of the stream."""
+    """Yield the track's packets in stored order, without empty ones, which would end the decoder (AVI's drops)."""
     for packet in container.demux(stream):
         if packet.size:
             yield packet

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.pictures.cameras import record_texts
 from trainer.evaluation.pictures import choose_steps, draw_recording
-from v2v_pictures.canvas import Canvas
 
 
 @given(st.integers(1, 500), st.integers(1, 20))
@@ -34,14 +32,7 @@ def test_chosen_steps_of_known_cases(count: int, rows: int, steps: set[int]) -> 
 def test_a_picture_says_what_its_greys_are_and_how_long_its_windows_last(
     seconds: list[float], lasts: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written: list[str] = []
-    write = Canvas.text
-
-    def listen(page: Canvas, x: float, y: float, text: str, **style: Any) -> float:
-        written.append(text)
-        return write(page, x, y, text, **style)
-
-    monkeypatch.setattr(Canvas, "text", listen)
+    written = record_texts(monkeypatch)
     rows = [np.full((50, 3 * 44, 3), 7, np.uint8)] * 2
     picture = draw_recording(rows, "desk", seconds, with_camera=True)
     assert (picture == 7).all(axis=-1).sum() == 2 * 50 * 3 * 44  # the panels as they were
