@@ -52,9 +52,12 @@ def draw_overview(
     for _, camera in boxes:
         for x in left:
             _box(page, camera, x, top, width, height)
-    for number, camera in boxes:  # above all boxes
+    numbers: dict[tuple[int, int], list[str]] = {}  # cameras of one box share its label
+    for number, camera in boxes:
         across, down, *_ = _place(camera, width, height)
-        canvas.label(page, round(left[0] + across) + 2, round(top + down) + 2, str(number), canvas.MARK)
+        numbers.setdefault((round(left[0] + across) + 2, round(top + down) + 2), []).append(str(number))
+    for (label_x, label_y), names in numbers.items():  # above all boxes
+        canvas.label(page, label_x, label_y, ", ".join(names), canvas.MARK)
     x = left[1] + width + 3 * GAP_PX
     strip_width = page.width_px - MARGIN_PX - x
     lines = [whole.title, f"shown: bin {liveliest + 1} of voxel grid {grid + 1}"]

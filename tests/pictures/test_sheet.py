@@ -174,6 +174,15 @@ def test_the_overview_marks_the_cameras_of_its_clip_only() -> None:
     assert sheet.shape[0] - draw_sheet([looks, other], "t").shape[0] == overview_height(whole, 192)
 
 
+def test_cameras_with_one_box_share_its_label(monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels = np.zeros((2, 2, 30, 40), np.int8)
+    seen = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, scale=1.0, crop_left_px=10))
+    looks = dataclasses.replace(camera(voxels[..., :16, :16]), provenance=seen, whole=np.zeros((30, 40), np.uint8))
+    written = record_texts(monkeypatch)
+    draw_overview(Canvas(overview_width(80), 300), camera(voxels), [looks, looks], 10, 80, 1.0, 1.0)
+    assert "1, 2" in written
+
+
 def test_arrows_of_flow_point_where_pixels_move() -> None:
     """Flow is to the right in the upper half and zero below: only above are dark tips, right of the light rims."""
     flow = np.zeros((2, 32, 32), np.float32)

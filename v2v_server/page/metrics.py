@@ -22,7 +22,7 @@ _COUNTERS = {
     "v2v_shared_memory_samples": ("in_slots", "Samples written to memory shared with their consumer."),
     "v2v_worker_cpu_seconds": ("cpu_seconds", "Processor time that samples took in workers."),
     "v2v_consumer_waiting_seconds": ("waited_seconds", "Time that consumers waited for samples, as they report."),
-    "v2v_refused_candidates": ("refused_candidates", "Videos passed over."),
+    "v2v_refused_candidates": ("refused_candidates", "Candidates skipped because their video could not be used."),
     "v2v_unavailable_samples": ("unavailable", "Samples without a usable candidate."),
     "v2v_returned_leases": ("returned_leases", "Leases taken back from workers that died, hung or left."),
     "v2v_second_leases": ("second_leases", "Samples given to a second worker because the first was slow."),

@@ -184,7 +184,7 @@ function show(state) {
   list("tiles", tiles(state), false);
   fill("consumers", state.consumers.map(consumer), "no consumers are connected");
   fill("workers", state.workers.map(worker), "no workers are connected");
-  fill("refusals", state.refusals.map(refusal), "no video was passed over");
+  fill("refusals", state.refusals.map(refusal), "no sequence was skipped");
   fill("verdicts", state.verdicts.map(refusal), "nothing");
   fill("recipe", settings(state.spec), "");
   say(at("consumers-count"), `${state.consumer_count} connected`);
