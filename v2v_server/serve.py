@@ -38,7 +38,6 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
 from v2v_server.console.progress import catalogue_progress
@@ -46,6 +45,7 @@ from v2v_server.console.shutdown_summary import format_shutdown_summary
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess

@@ -31,7 +31,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.flow import FlowSettings, flow_for, view_part
 from v2v_server.flow.methods import one_thread
 from v2v_server.schedule.sequences import SequenceTable

@@ -38,12 +38,12 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.refresh import index_path
-from v2v_server.catalogue.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
-from v2v_server.catalogue.scenes import Looking
-from v2v_server.catalogue.survey import examine
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
+from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.survey import examine
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
 from v2v_server.video.rows import Rows

@@ -23,9 +23,9 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import StateMismatch
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue import refresh
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index.file import SCHEMA_VERSION
+from v2v_server.corpus import refresh
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.video.rows import Rows
 
 FIXTURES = sorted(Path(__file__).parent.glob("numerics-*"))

@@ -14,7 +14,7 @@ from v2v_protocol.wire import LARGEST_ARRAY_BYTES
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import clean_name
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import Columns, SequenceTable
 

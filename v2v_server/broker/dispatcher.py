@@ -64,7 +64,7 @@ from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.terms import check_result, lease_for, work_seconds
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
 
 MOST_SESSIONS = 4096
 _LONGEST_SECRET_BYTES = 64

@@ -18,8 +18,8 @@ from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.leases import Request
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.sequences import VideoSequence
 
 

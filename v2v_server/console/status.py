@@ -8,8 +8,8 @@ from typing import TextIO
 
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.console.state import CacheState, ServiceState
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.log import write
 

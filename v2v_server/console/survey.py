@@ -18,7 +18,6 @@ from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import Member, clean_name
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.history import History, Moment
 from v2v_server.console.state import (
@@ -32,6 +31,7 @@ from v2v_server.console.state import (
     WorkerState,
 )
 from v2v_server.console.waiting import Shares, Waiting, who_waits
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.store.cache import GIB
 from v2v_server.store.used import used_bytes
 from v2v_server.supervise.protocol import Supervisor

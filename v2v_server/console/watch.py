@@ -14,11 +14,11 @@ from v2v_server.broker.actions import Show, ToConsumer, ToWorker, denial
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.transport import ServerTransport
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
 from v2v_server.console.history import History
 from v2v_server.console.state import ServiceState
 from v2v_server.console.survey import Service, service_state
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.supervise.protocol import Supervisor
 
 ANSWER_SECONDS = 0.4

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.corpus import find_corpus
-from v2v_server.catalogue.files import Notice, corpus_root
-from v2v_server.catalogue.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
-from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
-from v2v_server.catalogue.scenes import Looking
 from v2v_server.cloud.copies import COPIES_GIB, copies_of
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.corpus import find_corpus
+from v2v_server.corpus.files import Notice, corpus_root
+from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
+from v2v_server.corpus.refresh import Progress, index_path, up_to_date
+from v2v_server.corpus.scenes import Looking
 from v2v_server.video.rows import Rows
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """What to catalogue, and how; see :func:`v2v_server.catalogue.catalogue.open_catalogue`."""
+    """What to catalogue, and how; see :func:`v2v_server.corpus.catalogue.open_catalogue`."""
 
     videos: str
     list_file: str | None = None
@@ -55,7 +55,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     Args:
         asked: the corpus.
         parts: folder of the parts that other hosts made; files that match are not probed again.
-        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: as there; or parts are missing or cannot be read.
@@ -86,7 +86,7 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     Args:
         asked: the corpus.
         out: folder of the parts, which all hosts see.
-        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: there is no such corpus, or a folder cannot be written to.

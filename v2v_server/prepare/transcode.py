@@ -21,8 +21,8 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import VideoError
-from v2v_server.catalogue.look import Look
-from v2v_server.catalogue.scene import MOST_FRAMES, Scene
+from v2v_server.corpus.look import Look
+from v2v_server.corpus.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
 from v2v_server.store.clips import stored_pictures
 from v2v_server.store.encoding import Encoding

@@ -19,9 +19,9 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.index.runs import CutVideos
-from v2v_server.catalogue.videos import VideoEntry
-from v2v_server.catalogue.videos import Videos as CatalogueVideos
+from v2v_server.corpus.index.runs import CutVideos
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 

@@ -8,7 +8,7 @@ import pytest
 from bench.processes import consume, peak_rss_bytes
 from bench.speed.null_workers import answer, null_service
 from tests.bench.small import FLAGS, RECIPE
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode_map, decode_sample

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from tests.server.console.watched import WALL, seen, service
-from tests.server.corpus import SMALL_SPEC
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Result, See, Want, WorkerHello

@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 from v2v_protocol.errors import UsageError
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.index.parts import Shard
-from v2v_server.catalogue.refresh import index_path
 from v2v_server.commands.catalogue import main
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.refresh import index_path
 
 _SLOWLY = """
 import sys, time
-from v2v_server.catalogue import refresh, survey
+from v2v_server.corpus import refresh, survey
 from v2v_server.commands.catalogue import main
 refresh._WRITE_EVERY = 2
 look = survey._facts

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.server.corpus import SMALL, SMALL_SPEC, video
+from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
 from v2v_server.video.rows import Rows

@@ -7,8 +7,8 @@ import signal
 import stat
 from pathlib import Path
 
-from v2v_server.catalogue.index.file import IndexRow
-from v2v_server.catalogue.survey import examine
+from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.survey import examine
 
 
 def lethal(root: str, id: str) -> IndexRow:

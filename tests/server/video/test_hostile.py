@@ -13,7 +13,7 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import VideoError
-from v2v_server.catalogue.survey import survey
+from v2v_server.corpus.survey import survey
 from v2v_server.video import probe as probing
 from v2v_server.video import source
 from v2v_server.video.probe import probe

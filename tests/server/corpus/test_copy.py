@@ -18,16 +18,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from v2v_server.catalogue import refresh
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.index import copy as copy_module
-from v2v_server.catalogue.index import file as file_module
-from v2v_server.catalogue.index.columns import Records
-from v2v_server.catalogue.index.copy import NoCopy, copied, copy_path, read_copy
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.refresh import index_path
-from v2v_server.catalogue.scene import COLUMNS, Scene
-from v2v_server.catalogue.scenes import Looking
+from v2v_server.corpus import refresh
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.index import copy as copy_module
+from v2v_server.corpus.index import file as file_module
+from v2v_server.corpus.index.columns import Records
+from v2v_server.corpus.index.copy import NoCopy, copied, copy_path, read_copy
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.scene import COLUMNS, Scene
+from v2v_server.corpus.scenes import Looking
 from v2v_server.video.rows import Rows
 
 PARTS = [{"ids": [b"a", b"1"], "n": [1, 2]}, {"ids": [b"b", b"2"], "n": []}]

@@ -1,4 +1,4 @@
-"""Writing the manifest of a prepared folder; :mod:`v2v_server.catalogue.manifest` says what is in it."""
+"""Writing the manifest of a prepared folder; :mod:`v2v_server.corpus.manifest` says what is in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
-from v2v_server.catalogue.manifest import MANIFEST_NAME, Header, PreparedVideo
+from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo
 
 
 class ManifestWriter:

@@ -12,8 +12,8 @@ from v2v_protocol.errors import IndexUnreadable, ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 

@@ -209,7 +209,7 @@ class Store:
         """The sound files whose scene is not known as they are.
 
         Args:
-            look: how and at which rows, see :class:`v2v_server.catalogue.scenes.Looking`.
+            look: how and at which rows, see :class:`v2v_server.corpus.scenes.Looking`.
 
         Raises:
             sqlite3.Error: the file is damaged or cannot be written.

@@ -1,4 +1,4 @@
-"""The look that fills a :class:`v2v_server.catalogue.scene.Scene`: every frame in blocks, every fourth one for motion.
+"""The look that fills a :class:`v2v_server.corpus.scene.Scene`: every frame in blocks, every fourth one for motion.
 
 Cuts. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure do not
 count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.catalogue.scene import (
+from v2v_server.corpus.scene import (
     CHANGE,
     CLIPPED,
     COLUMNS,

@@ -22,7 +22,7 @@ import xxhash
 from v2v_server.system.private import open_private
 
 Part = Mapping[str, Any]
-"""Some of the records in columns, see :meth:`v2v_server.catalogue.index.columns.Records.packed`."""
+"""Some of the records in columns, see :meth:`v2v_server.corpus.index.columns.Records.packed`."""
 
 _HEAD = struct.Struct("<QQ")  # length and checksum of what follows
 _MAGIC = b"v2v index copy 2\n"

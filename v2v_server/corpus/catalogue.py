@@ -13,17 +13,17 @@ import numpy as np
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_server.catalogue.corpus import Corpus, find_corpus, told
-from v2v_server.catalogue.files import Notice
-from v2v_server.catalogue.index.columns import Records
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.listfile import ListEntry
-from v2v_server.catalogue.manifest import Header, PreparedVideo
-from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
-from v2v_server.catalogue.scene import Scene
-from v2v_server.catalogue.scenes import Looking
-from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
+from v2v_server.corpus.corpus import Corpus, find_corpus, told
+from v2v_server.corpus.files import Notice
+from v2v_server.corpus.index.columns import Records
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.listfile import ListEntry
+from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.refresh import Progress, index_path, up_to_date
+from v2v_server.corpus.scene import Scene
+from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT, check_file
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
@@ -254,7 +254,7 @@ def open_catalogue(
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
-            :mod:`v2v_server.catalogue.scene`.
+            :mod:`v2v_server.corpus.scene`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
         notice: told what is looked at before that, file by file, and how far it is.

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.catalogue.index.file import IndexRow
 from v2v_server.cloud.copies import Copies, open_local
+from v2v_server.corpus.index.file import IndexRow
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint

@@ -17,14 +17,14 @@ from itertools import islice
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
-from v2v_server.catalogue.index.columns import Records
-from v2v_server.catalogue.index.copy import NoCopy, copied, read_copy
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.index.runs import CutVideos, Runs
-from v2v_server.catalogue.manifest import Manifest
-from v2v_server.catalogue.scene import LOOK_VERSION, MOST_FRAMES, Scene
-from v2v_server.catalogue.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.cloud.copies import Copies, open_local
+from v2v_server.corpus.index.columns import Records
+from v2v_server.corpus.index.copy import NoCopy, copied, read_copy
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.index.runs import CutVideos, Runs
+from v2v_server.corpus.manifest import Manifest
+from v2v_server.corpus.scene import LOOK_VERSION, MOST_FRAMES, Scene
+from v2v_server.corpus.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -180,7 +180,7 @@ def _look_at(root: Path | Copies, job: _ToLookAt) -> bytes:
     """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
     decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.
-    from v2v_server.catalogue.look import Look
+    from v2v_server.corpus.look import Look
 
     seen = Look()
     if job.index and job.window is not None:

@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
-from tests.server.catalogue.failing_storage import failing_opens
+from tests.server.corpus.failing_storage import failing_opens
 from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
-from v2v_server.catalogue import catalogue as catalogue_module
-from v2v_server.catalogue import survey as survey_module
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.index.file import SCHEMA_VERSION
-from v2v_server.catalogue.manifest import MANIFEST_NAME
-from v2v_server.catalogue.refresh import index_path
-from v2v_server.catalogue.survey import Examine, survey
+from v2v_server.corpus import catalogue as catalogue_module
+from v2v_server.corpus import survey as survey_module
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.index.file import SCHEMA_VERSION
+from v2v_server.corpus.manifest import MANIFEST_NAME
+from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.survey import Examine, survey
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -478,7 +478,7 @@ def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ende
 def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener, tmp_path: Path) -> None:
     script = tmp_path / "unguarded.py"
     script.write_text(
-        "from v2v_server.catalogue.catalogue import open_catalogue\n"
+        "from v2v_server.corpus.catalogue import open_catalogue\n"
         f"open_catalogue({str(corpus)!r}, cache_dir={str(opener.cache)!r}, processes=2)\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)

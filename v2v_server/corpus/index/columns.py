@@ -17,7 +17,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.catalogue.index.file import IndexRow
+from v2v_server.corpus.index.file import IndexRow
 
 CHUNK = 4096
 """Records that are worked on at a time."""

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from skimage import data
 
 from tests.clips import damaged, panned_luma, write_clip
-from tests.server.catalogue.failing_storage import failing_opens
+from tests.server.corpus.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
-from v2v_server.catalogue import scenes as looking
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.look import look
-from v2v_server.catalogue.scene import (
+from v2v_server.corpus import scenes as looking
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.look import look
+from v2v_server.corpus.scene import (
     CHANGE,
     CLIPPED,
     COLUMNS,

@@ -13,7 +13,7 @@ from pathlib import Path
 import xxhash
 
 from v2v_protocol.errors import CorpusError, UsageError
-from v2v_server.catalogue.index.file import Store
+from v2v_server.corpus.index.file import Store
 
 _NAME = re.compile(r"part-(\d+)-of-(\d+)\.sqlite3")
 

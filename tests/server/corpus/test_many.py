@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from v2v_server.catalogue import refresh
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.refresh import index_path
+from v2v_server.corpus import refresh
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.refresh import index_path
 
 VIDEOS = 2000
 MOST_BYTES = 820

@@ -1,6 +1,6 @@
 """What a video shows, in a few numbers for every sixteen frames: enough to know what of it is worth decoding.
 
-The numbers are taken once (:mod:`v2v_server.catalogue.look`) and kept whole, so that they have one encoding, which the
+The numbers are taken once (:mod:`v2v_server.corpus.look`) and kept whole, so that they have one encoding, which the
 digest of a catalogue can cover.
 """
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_server.catalogue.index import columns
-from v2v_server.catalogue.index.columns import Records, Texts, joined, merged
-from v2v_server.catalogue.index.file import IndexRow
-from v2v_server.catalogue.index.runs import CutVideos
-from v2v_server.catalogue.videos import NO_THRESHOLDS, Thresholds, Videos
+from v2v_server.corpus.index import columns
+from v2v_server.corpus.index.columns import Records, Texts, joined, merged
+from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.index.runs import CutVideos
+from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 
 NAMES = sorted(f"{name}-{number}.mp4" for name in ("plain", "Größe", "日本", "𝄞", "a b") for number in range(40))
@@ -109,7 +109,7 @@ def test_what_the_index_has_is_joined_with_what_was_asked() -> None:
 def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_samples(
     records: Records, monkeypatch: pytest.MonkeyPatch, all_usable: bool
 ) -> None:
-    monkeypatch.setattr("v2v_server.catalogue.videos.CHUNK", 16)
+    monkeypatch.setattr("v2v_server.corpus.videos.CHUNK", 16)
     if all_usable:
         records.problems.clear()
     used = [place for place in range(len(ROWS)) if place not in records.problems]

@@ -4,7 +4,7 @@ Of a million files that takes seconds, so other processes help. They are started
 that opens a catalogue needs no guard for them, and a loader's worker, which may have no children of multiprocessing,
 has them too.
 
-    python -m v2v_server.catalogue.changed      jobs come in on stdin, the answer goes out on stdout, in msgpack
+    python -m v2v_server.corpus.changed      jobs come in on stdin, the answer goes out on stdout, in msgpack
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from types import TracebackType
 import msgpack
 
 from v2v_protocol.programs import environment
-from v2v_server.catalogue.files import Notice, by_parts
 from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.files import Notice, by_parts
 from v2v_server.system.process import die_with_parent
 
 _State = tuple[int, int, int]

@@ -13,8 +13,8 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.files import (
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.files import (
     MOST_PATHS,
     PSEUDO,
     answers,
@@ -25,7 +25,7 @@ from v2v_server.catalogue.files import (
     regular_files,
     video_files,
 )
-from v2v_server.catalogue.listfile import read_list
+from v2v_server.corpus.listfile import read_list
 
 STEERING = {
     "red\x1b[31m.mp4": r"red\x1b[31m.mp4",

@@ -10,8 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from v2v_server.catalogue import changed as module
-from v2v_server.catalogue.changed import changed
+from v2v_server.corpus import changed as module
+from v2v_server.corpus.changed import changed
 
 COUNT = 700
 
@@ -68,7 +68,7 @@ def test_a_script_needs_no_guard_and_a_daemon_may_ask(corpus: Corpus, tmp_path: 
     script = tmp_path / "script.py"
     script.write_text(
         "from array import array\nfrom pathlib import Path\nimport multiprocessing\n"
-        "from v2v_server.catalogue import changed as module\n"
+        "from v2v_server.corpus import changed as module\n"
         f"module._FILES_A_PROCESS = 100\nprint('once')\nmultiprocessing.current_process()._config['daemon'] = True\n"
         f"print(module.changed(Path({str(folder)!r}), {ids!r}, array('q', {states.tolist()!r}), 3, None))\n"
     )

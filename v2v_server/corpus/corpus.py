@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.files import (
+from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.files import (
     UNPRINTABLE,
     VIDEO_SUFFIXES,
     Notice,
@@ -21,9 +22,8 @@ from v2v_server.catalogue.files import (
     regular_files,
     video_files,
 )
-from v2v_server.catalogue.listfile import LIST_SUFFIXES, ListEntry, read_list
-from v2v_server.catalogue.manifest import Manifest, find_manifest, refuse_prepared_below
-from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.corpus.manifest import Manifest, find_manifest, refuse_prepared_below
 from v2v_server.video.rows import Rows
 
 
@@ -60,7 +60,7 @@ def find_corpus(
     """Looks for the files of a corpus.
 
     Args:
-        source, list_file, rows, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        source, list_file, rows, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
         bucket: what lies in object storage, where that is the source.
 
     Raises:

@@ -14,15 +14,15 @@ from contextlib import closing, suppress
 from itertools import islice, pairwise
 from pathlib import Path
 
-from v2v_server.catalogue.changed import changed
-from v2v_server.catalogue.files import Notice, by_parts
-from v2v_server.catalogue.index.columns import CHUNK, Records, merged
-from v2v_server.catalogue.index.copy import NoCopy, Part, copied, read_copy
-from v2v_server.catalogue.index.file import SCHEMA_VERSION, IndexRow, Store
-from v2v_server.catalogue.index.parts import Shard
-from v2v_server.catalogue.scenes import Looking
-from v2v_server.catalogue.survey import survey
 from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.changed import changed
+from v2v_server.corpus.files import Notice, by_parts
+from v2v_server.corpus.index.columns import CHUNK, Records, merged
+from v2v_server.corpus.index.copy import NoCopy, Part, copied, read_copy
+from v2v_server.corpus.index.file import SCHEMA_VERSION, IndexRow, Store
+from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.survey import survey
 from v2v_server.system.process import cache_folder, without_collections
 
 _WRITE_EVERY = 256
@@ -36,7 +36,7 @@ def index_path(
     root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None, shard: Shard | None = None
 ) -> Path:
     """The index file of a corpus, or of a shard of it; ``cache_dir`` as in
-    :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+    :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: none was chosen, and this user has no home folder.
@@ -64,7 +64,7 @@ def up_to_date(
         ids: of the videos to know.
         path: of the index.
         looking: how to look at what the videos show; None does not.
-        processes, progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
     """
     try:
         store, records = _refreshed(path, root, ids, looking, processes, progress, notice)

@@ -11,8 +11,8 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.catalogue.index.columns import CHUNK, Records
-from v2v_server.catalogue.index.runs import CutVideos, Runs
+from v2v_server.corpus.index.columns import CHUNK, Records
+from v2v_server.corpus.index.runs import CutVideos, Runs
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
