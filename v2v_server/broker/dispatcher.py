@@ -110,7 +110,7 @@ class Dispatcher:
     ) -> None:
         self.counters = Counters()
         self.leases = LeaseBook(lease_deadline_seconds)
-        self.sessions = Sessions(self.leases.abandoned)
+        self.sessions = Sessions(self.leases)
         self._expected_workers = expected_workers
         self._catalogue = catalogue
         self._quarantine = quarantine
