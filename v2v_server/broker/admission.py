@@ -22,7 +22,7 @@ MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
 """Less than ``transport.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
-"""Sequence tables cached for later consumers; a session keeps its own."""
+"""Sequence tables cached for later consumers. A session keeps its own, which is small."""
 
 
 def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
