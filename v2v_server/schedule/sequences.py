@@ -19,7 +19,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.index.runs import CutVideos
+from v2v_server.corpus.scenes.runs import SplitVideos
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
@@ -51,14 +51,14 @@ class Columns:
         frames: int64 [N], frames of each video.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        cut: the videos whose usable runs are not just the whole video; None if runs are unknown.
+        split: the videos whose usable frames are not one run of all; None if runs are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
         if isinstance(videos, CatalogueVideos):
-            self.frames, sizes, self.cut = videos.frames, _sizes(videos.height_px, videos.width_px), videos.cut
+            self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
         else:
-            self.frames, sizes, self.cut = _columns(videos)
+            self.frames, sizes, self.split = _columns(videos)
         _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
         self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
@@ -69,15 +69,14 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
     return height_px.astype(np.int64) << 32 | width_px
 
 
-def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], CutVideos | None]:
+def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
     """Return frames, sizes, and the videos with shot boundaries."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [(place, video.runs) for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
-    known = [(place, those) for place, those in runs if those is not None]
-    return frames, sizes, CutVideos.of(known) if len(known) == len(runs) else None
+    runs = [video.runs for video in videos if video.runs is not None]
+    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
 
 
 class SequenceTable:
@@ -110,14 +109,14 @@ class SequenceTable:
         suits = [_unsuited_size(videos[first], rows, spec) is None for first in columns.first_of_size]
         counts *= np.array(suits, bool)[columns.size]
         if spec.scene != "off":
-            if columns.cut is None:
+            if columns.split is None:
                 raise UsageError(
                     f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                     "start the server with --scene auto"
                 )
-            self._cut = _CutSequences(columns.cut, counts[columns.cut.numbers], spec)
+            self._cut = _CutSequences(columns.split, counts[columns.split.numbers], spec)
             self.spoilt = self._cut.spoilt
-            counts[columns.cut.numbers] = self._cut.counts
+            counts[columns.split.numbers] = self._cut.counts
         self._ends = np.cumsum(counts)
         self.count = int(self._ends[-1]) if len(videos) else 0
         self.videos = int(np.count_nonzero(counts))
@@ -159,7 +158,7 @@ class _CutSequences:
         too_short: frames of the longest run of each video that has no sequence because of its shot boundaries.
     """
 
-    def __init__(self, cut: CutVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
+    def __init__(self, cut: SplitVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
         needed, self._stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
         self._cut, owners = cut, cut.owners()
         each = np.clip((cut.end - cut.first - needed) // self._stride + 1, 0, None)
