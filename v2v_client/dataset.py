@@ -235,8 +235,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rows = {"batch_size": ours.batch_size, "arrays": ", ".join(ours.arrays), "seed": ours.seed, "epoch": self.epoch}
         return html_table(f"V2VStreamDataset of {self._address}", rows | {"rank": f"{self.rank} of {self.world_size}"})
 
-    # --- properties ---------------------------------------------------------------------------------------------------
-
     @property
     def rank(self) -> int:
         """Return this process's rank, 0 .. world_size - 1."""
@@ -307,8 +305,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
         loader = get_worker_info()
         return ConsumerId(self.rank, self.world_size, None if loader is None else loader.id, workers)
 
-    # --- position -----------------------------------------------------------------------------------------------------
-
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next iteration. It starts at the beginning, unless a state of that epoch was loaded.
 
@@ -351,8 +347,6 @@ class V2VStreamDataset(IterableDataset[Batch]):
         if loaded.stream is not None:
             self._connector.options.spec(loaded.stream, "the state")
         self._position.load(loaded, self._consumer)
-
-    # --- iteration ----------------------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[Batch]:
         self._require_open()
