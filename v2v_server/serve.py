@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError
+from v2v_protocol.wire import encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -27,6 +28,7 @@ from v2v_server.broker.actions import (
     CutOff,
     GiveUp,
     ReportRefusal,
+    SendLease,
     Show,
     ToConsumer,
     ToWorker,
@@ -45,7 +47,7 @@ from v2v_server.console.shutdown_summary import format_shutdown_summary
 from v2v_server.console.status import summary
 from v2v_server.console.terminal import make_status
 from v2v_server.console.watch import make_watch
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
@@ -132,7 +134,7 @@ def serve(config: ServeConfig) -> None:
     for entry in quarantine.entries(quarantine.latest):
         log.say(f"in quarantine: {entry}")
     dispatcher = Dispatcher(
-        catalogue,
+        catalogue.facts,
         config.spec,
         quarantine=quarantine,
         wall_clock=_utc_now,
@@ -303,6 +305,8 @@ class Server:
                 case ToWorker() as message:
                     if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
+                case SendLease() as grant:
+                    todo.extendleft(reversed(self._complete(grant, todo)))
                 case CutOff(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
@@ -316,6 +320,25 @@ class Server:
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case Show() as show:
                     todo.extend(self._watch.ask(show))
+
+    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
+        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
+
+        Args:
+            grant: the lease.
+            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
+        """
+        try:
+            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
+        except IndexUnreadable as error:
+            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
+            later = [each for each in todo if not isinstance(each, SendLease)]
+            todo.clear()
+            todo.extend(later)
+            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
+            return []
+        except V2VError as error:
+            return self._dispatcher.lease_refused(grant, str(error), self._clock())
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

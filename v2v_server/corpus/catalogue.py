@@ -6,13 +6,15 @@ import os
 import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
+from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
+from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_protocol.spec import StreamSpec
 from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
 from v2v_server.corpus.corpus import Corpus, find_corpus, told
 from v2v_server.corpus.files import Notice
@@ -24,7 +26,7 @@ from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT, check_file
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
@@ -189,23 +191,14 @@ class Catalogue:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return Scene.from_bytes(data)
 
+    @property
+    def facts(self) -> CorpusFacts:
+        """What is known in memory: all that a server's dispatcher needs."""
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest)
+
     def digest_under(self, scene: str) -> str:
-        """The digest that names this snapshot in samples of a spec.
-
-        Args:
-            scene: of the spec; with "off" the statistics do not count.
-
-        Raises:
-            UsageError: "auto", and the catalogue was opened without ``scene``.
-        """
-        if scene == "off":
-            return self.digest
-        if self.scene_digest is None:
-            raise UsageError(
-                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
-                "server with --scene auto"
-            )
-        return self.scene_digest
+        """See :meth:`CorpusFacts.digest_under`."""
+        return self.facts.digest_under(scene)
 
     def fail_fast(self) -> None:
         """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
@@ -228,6 +221,23 @@ class Catalogue:
         if number is None:
             raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
         return self.videos.fingerprints[number]
+
+
+def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
+    """Return a lease with what the index on disk holds of its clip.
+
+    Args:
+        lease: without ``frame_index`` and ``scene``.
+        catalogue: where its video is catalogued.
+        spec: the spec that the lease names.
+
+    Raises:
+        IndexUnreadable: the index cannot be read at the moment.
+        V2VError: the index of this video is damaged, or belongs to another file.
+    """
+    video, start, count = lease.video, lease.start_frame, spec.recipe.frames_needed
+    scene = catalogue.scene(video).slice(start, count).to_bytes() if spec.scene != "off" else b""
+    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=scene)
 
 
 def open_catalogue(
@@ -255,7 +265,7 @@ def open_catalogue(
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
-            :mod:`v2v_server.corpus.scene`.
+            :mod:`v2v_server.corpus.scenes`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
         notice: told what is looked at before that, file by file, and how far it is.

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import overload
 
+from v2v_protocol.errors import UsageError
 from v2v_server.corpus.index.columns import CHUNK, VideoTable
 from v2v_server.corpus.scenes.runs import Runs, SplitVideos
 from v2v_server.video.rows import Rows
@@ -124,3 +125,38 @@ class Videos(Sequence[VideoEntry]):
             threshold_neg=neg,
             runs=runs,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class CorpusFacts:
+    """What is known of a corpus in memory: no part of it reads the index on disk.
+
+    Attributes:
+        videos: the videos that can be used, by id.
+        rows: the usable rows of each picture.
+        digest: names this snapshot.
+        scene_digest: names this snapshot together with the statistics of its videos; None without them.
+    """
+
+    videos: Sequence[VideoEntry]
+    rows: Rows
+    digest: str
+    scene_digest: str | None
+
+    def digest_under(self, scene: str) -> str:
+        """Return the digest that names this snapshot in samples of a spec.
+
+        Args:
+            scene: of the spec; with "off" the statistics do not count.
+
+        Raises:
+            UsageError: "auto", and the catalogue was opened without ``scene``.
+        """
+        if scene == "off":
+            return self.digest
+        if self.scene_digest is None:
+            raise UsageError(
+                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
+                "server with --scene auto"
+            )
+        return self.scene_digest
