@@ -265,7 +265,7 @@ def open_catalogue(
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
-            :mod:`v2v_server.corpus.scene`.
+            :mod:`v2v_server.corpus.scenes`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
         notice: told what is looked at before that, file by file, and how far it is.
