@@ -10,9 +10,11 @@ import stat
 from array import array
 from collections.abc import Sequence
 from contextlib import closing, suppress
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_server.cloud.copies import Copies
 from v2v_server.corpus.files import Notice, by_parts
@@ -60,7 +62,7 @@ def refresh_index(
         scenes: how to analyse what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
     """
-    ids = sorted(set(ids))  # a list may name a video twice
+    ids = [id for id, _ in groupby(sorted(ids))]  # a list may name a video twice
     try:
         store, table = _refreshed(path, root, ids, scenes, processes, progress, notice)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
@@ -92,15 +94,16 @@ def _refreshed(
     try:
         with without_collections():
             unasked = list[str]()
-            table = VideoTable.of(joined(ids, store.rows(), unasked))
-            stale = _changed(root, ids, table, notice)
+            table, states = VideoTable.read(joined(ids, store.rows(), unasked), len(ids))
+            stale = _changed(root, ids, states, notice)
+        del states
         store.forget(_gone(root, unasked, notice))
         with closing(probe_files(root, [ids[at] for at in stale], processes)) as found:
             for batch in batches(found, len(stale), progress):
                 store.put(batch)
         if stale:
             with without_collections():
-                table = VideoTable.of(joined(ids, store.rows(), []))
+                table, _ = VideoTable.read(joined(ids, store.rows(), []), len(ids))
         if scenes is not None:
             scenes.collect(store, root, table, processes, progress)
         _remove_earlier_caches(path)
@@ -110,12 +113,12 @@ def _refreshed(
         raise
 
 
-def _changed(root: Path | Copies, ids: list[str], table: VideoTable, notice: Notice | None) -> list[int]:
-    """Ask for size and times of every file; return the places of those that the table does not know as they are."""
+def _changed(root: Path | Copies, ids: list[str], states: npt.NDArray[np.int64], notice: Notice | None) -> list[int]:
+    """Ask for size and times of every file; return the places of those that differ from the known [N, 3] states."""
     folder = os.path.join(root, "")
     listed = root.listed if isinstance(root, Copies) else None
 
-    def states(ids: Sequence[str]) -> array[int]:
+    def ask(ids: Sequence[str]) -> array[int]:
         found = array("q")
         for id in ids:
             if listed is not None:
@@ -131,8 +134,8 @@ def _changed(root: Path | Copies, ids: list[str], table: VideoTable, notice: Not
         return found
 
     changed, done = list[int](), 0
-    for part, answer in by_parts(states, ids):
-        found, known = np.asarray(answer).reshape(-1, 3), table.states[done : done + len(part)]
+    for part, answer in by_parts(ask, ids):
+        found, known = np.asarray(answer).reshape(-1, 3), states[done : done + len(part)]
         changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
         done += len(part)
         if notice is not None:
