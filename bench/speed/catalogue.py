@@ -43,6 +43,7 @@ from v2v_server.corpus.index.file import IndexRow, Store
 from v2v_server.corpus.refresh import index_path
 from v2v_server.corpus.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
 from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.survey import examine
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
@@ -84,7 +85,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = examine(folder, ids[0])
+    known = examine(Folder(folder), ids[0])
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))

@@ -13,7 +13,7 @@ from v2v_server.console.state import ServiceState
 from v2v_server.console.status import StatusLine, figures
 from v2v_server.console.status_log import StatusLog
 from v2v_server.console.top import consumers_table
-from v2v_server.corpus.files import printable
+from v2v_server.corpus.sources.names import printable
 from v2v_server.system.log import Log, write
 
 _SECONDS = 0.5

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from v2v_server.console.shutdown_summary import format_duration
-from v2v_server.corpus.files import printable
+from v2v_server.corpus.sources.names import printable
 
 _MOST_ROWS = 30
 _COLOURS = {

@@ -2,9 +2,7 @@
 
 catalogue        the snapshot that everything else works from
 videos           its videos, in columns
-corpus           where a corpus lies, and which files it has
-files            looking for them, and asking about many at a time
-listfile         list files like the paper's
+corpus           the files of a corpus, before one of them is opened
 survey           probing many files in processes of their own
 index            what probing found, on disk and in memory
 refresh          bringing that up to date
@@ -14,4 +12,5 @@ look             the look that finds these numbers
 scenes           the numbers of a whole corpus
 manifest         what a prepared folder says of itself
 manifest_writer  writing that
+sources          where the videos come from
 """

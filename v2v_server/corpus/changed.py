@@ -17,18 +17,15 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 
 import msgpack
 
 from v2v_protocol.programs import environment
-from v2v_server.cloud.copies import Copies
-from v2v_server.corpus.files import Notice, by_parts
+from v2v_server.corpus.sources.asking import Notice, by_parts
+from v2v_server.corpus.sources.source import VideoSource, open_source
 from v2v_server.system.process import die_with_parent
 
-_State = tuple[int, int, int]
-_NO_STATE: _State = (-1, 0, 0)  # no file has that size
 _FILES_A_PROCESS = 50_000
 """For fewer another process costs more than it saves."""
 _TOGETHER = 10_000
@@ -39,37 +36,37 @@ class _Some:
     """Some of the files.
 
     Attributes:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        source: where the videos come from.
         first: number of the first of them.
         ids: relative paths.
         states: that the index knows, size, mtime and ctime of each, one after the other.
     """
 
-    root: Path | Copies
+    source: VideoSource
     first: int
     ids: Sequence[str]
     states: array[int]
 
 
 def changed(
-    root: Path | Copies, ids: Sequence[str], states: array[int], processes: int, notice: Notice | None
+    source: VideoSource, ids: Sequence[str], states: array[int], processes: int, notice: Notice | None
 ) -> list[int]:
     """The numbers of the files that are not as the index knows them, rising.
 
     Args:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        source: where the videos come from.
         ids: relative paths.
         states: that the index knows, size, mtime and ctime of each, one after the other.
         processes: how many may ask, this one among them.
         notice: told how far it is.
     """
-    shares = 1 if isinstance(root, Copies) else max(1, min(processes, len(ids) // _FILES_A_PROCESS))
+    shares = max(1, min(processes if source.is_local else 1, len(ids) // _FILES_A_PROCESS))
     ends = [len(ids) * share // shares for share in range(shares + 1)]
 
     def some(share: int) -> Iterator[_Some]:
         for start in range(ends[share], ends[share + 1], _TOGETHER):
             end = min(start + _TOGETHER, ends[share + 1])
-            yield _Some(root, start, ids[start:end], states[3 * start : 3 * end])
+            yield _Some(source, start, ids[start:end], states[3 * start : 3 * end])
 
     done, found = 0, list[int]()
 
@@ -102,7 +99,7 @@ class _Helper:
             assert self._process.stdin is not None
             self._process.stdin.write(msgpack.packb(os.getpid()))
             for job in jobs:
-                given = str(job.root), job.first, job.ids, job.states.tobytes()
+                given = job.source.name, job.first, job.ids, job.states.tobytes()
                 self._process.stdin.write(msgpack.packb(given, unicode_errors="surrogateescape"))
             self._process.stdin.close()
 
@@ -132,26 +129,8 @@ class _Helper:
 
 
 def _changed(some: _Some) -> list[int]:
-    folder = os.path.join(some.root, "")
-    listed = some.root.listed if isinstance(some.root, Copies) else None
-
-    def states(ids: Sequence[str]) -> array[int]:
-        found = array("q")
-        for id in ids:
-            if listed is not None:
-                state = listed.get(id)
-                found.extend(_NO_STATE if state is None else (state.size_bytes, state.mark, 0))
-                continue
-            try:
-                status = os.stat(folder + id)
-            except OSError:
-                found.extend(_NO_STATE)
-            else:
-                found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns))
-        return found
-
     found = array("q")
-    for _, those in by_parts(states, some.ids):
+    for _, those in by_parts(some.source.states, some.ids):
         found += those
     if found == some.states and -1 not in found[::3]:
         return []
@@ -167,7 +146,7 @@ def _help() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; who asked decides what follows
     given = msgpack.Unpacker(sys.stdin.buffer, unicode_errors="surrogateescape")
     die_with_parent(next(given))
-    jobs = [_Some(Path(root), first, ids, array("q", states)) for root, first, ids, states in given]
+    jobs = [_Some(open_source(name), first, ids, array("q", states)) for name, first, ids, states in given]
     sys.stdout.buffer.write(msgpack.packb([number for job in jobs for number in _changed(job)]))
 
 

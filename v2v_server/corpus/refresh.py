@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import sqlite3
-import stat
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,14 +12,14 @@ from contextlib import closing, suppress
 from itertools import islice, pairwise
 from pathlib import Path
 
-from v2v_server.cloud.copies import Copies
 from v2v_server.corpus.changed import changed
-from v2v_server.corpus.files import Notice, by_parts
 from v2v_server.corpus.index.columns import CHUNK, Records, merged
 from v2v_server.corpus.index.copy import NoCopy, Part, copied, read_copy
 from v2v_server.corpus.index.file import SCHEMA_VERSION, IndexRow, Store
 from v2v_server.corpus.index.parts import Shard
 from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.sources.asking import Notice, by_parts
+from v2v_server.corpus.sources.source import GONE, VideoSource
 from v2v_server.corpus.survey import survey
 from v2v_server.system.process import cache_folder, without_collections
 
@@ -33,21 +31,21 @@ Progress = Callable[[int, int], None]
 
 
 def index_path(
-    root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None, shard: Shard | None = None
+    name: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None, shard: Shard | None = None
 ) -> Path:
-    """The index file of a corpus, or of a shard of it; ``cache_dir`` as in
+    """Return the index file of a source of this name, or of a shard of it; ``cache_dir`` as in
     :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: none was chosen, and this user has no home folder.
     """
-    name = hashlib.sha256(os.fsencode(root)).hexdigest()[:16]
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     of = "" if shard is None else f"-{shard.number}-of-{shard.count}"
-    return cache_folder(cache_dir) / f"catalogue-{name}{of}.sqlite3"
+    return cache_folder(cache_dir) / f"catalogue-{digest}{of}.sqlite3"
 
 
 def up_to_date(
-    root: Path | Copies,
+    source: VideoSource,
     ids: Sequence[str],
     path: Path,
     looking: Looking | None,
@@ -60,21 +58,21 @@ def up_to_date(
     The index is in memory, with a note, where the file cannot serve.
 
     Args:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        source: where the videos come from.
         ids: of the videos to know.
         path: of the index.
         looking: how to look at what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
     """
     try:
-        store, records = _refreshed(path, root, ids, looking, processes, progress, notice)
+        store, records = _refreshed(path, source, ids, looking, processes, progress, notice)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        return *_refreshed(None, root, ids, looking, processes, progress, notice), [note]
+        return *_refreshed(None, source, ids, looking, processes, progress, notice), [note]
     if store.replaced_version is None:
         return store, records, []
     note = (
@@ -86,7 +84,7 @@ def up_to_date(
 
 def _refreshed(
     path: Path | None,
-    root: Path | Copies,
+    source: VideoSource,
     ids: Sequence[str],
     looking: Looking | None,
     processes: int,
@@ -97,10 +95,10 @@ def _refreshed(
     try:
         with without_collections():
             records, unasked, mark = _known(store, ids)
-        stale = [records.ids[at] for at in changed(root, records.ids, records.states, processes, notice)]
+        stale = [records.ids[at] for at in changed(source, records.ids, records.states, processes, notice)]
         del records.states[:]
-        store.forget(_gone(root, unasked, notice))
-        with closing(survey(root, stale, processes)) as found:
+        store.forget(_gone(source, unasked, notice))
+        with closing(survey(source, stale, processes)) as found:
             for batch in _batches(found, len(stale), progress):
                 store.put(batch)
                 for record in batch:
@@ -109,7 +107,7 @@ def _refreshed(
                     records.change(place, record)
         records.fingerprints.settle()
         if looking is not None:
-            looking.take_in(store, root, records, processes, progress)
+            looking.take_in(store, source, records, processes, progress)
         _copy(store, mark)
         return store, records
     except BaseException:
@@ -150,23 +148,15 @@ def _copy(store: Store, mark: str) -> None:
             deque(_parts(store, now), maxlen=0)
 
 
-def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> list[str]:
-    """Those of the ids of which there is no file any more. One that cannot be looked at today is not gone."""
-    if isinstance(root, Copies):
-        return [id for id in ids if id not in root.listed]
-
-    def is_gone(id: str) -> bool:
-        try:
-            return not stat.S_ISREG(os.stat(os.path.join(root, id)).st_mode)
-        except OSError as error:
-            return error.errno in (errno.ENOENT, errno.ENOTDIR)
-
+def _gone(source: VideoSource, ids: Iterable[str], notice: Notice | None) -> list[str]:
+    """Return those of the ids of which there is no file any more. One whose state cannot be told today is not gone."""
     unlisted, gone, done = sorted(ids), list[str](), 0
-    for part, those in by_parts(lambda part: list(filter(is_gone, part)), unlisted):
-        done += len(part)
-        gone += those
-        if notice is not None:
-            notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
+    with closing(by_parts(source.states, unlisted)) as answered:
+        for part, states in answered:
+            done += len(part)
+            gone += [id for id, size in zip(part, states[::3], strict=True) if size == GONE[0]]
+            if notice is not None:
+                notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
     return gone
 
 

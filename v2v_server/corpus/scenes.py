@@ -14,16 +14,15 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from pathlib import Path
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.index.columns import Records
 from v2v_server.corpus.index.copy import NoCopy, copied, read_copy
 from v2v_server.corpus.index.file import IndexRow, Store
 from v2v_server.corpus.index.runs import CutVideos, Runs
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.scene import LOOK_VERSION, MOST_FRAMES, Scene
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.survey import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
@@ -57,7 +56,7 @@ class Looking:
     def take_in(
         self,
         store: Store,
-        root: Path | Copies,
+        source: VideoSource,
         records: Records,
         processes: int,
         progress: Callable[[int, int], None] | None,
@@ -71,7 +70,7 @@ class Looking:
         missing = [records[place] for place in places if place is not None]
         total = len(missing)
         batch: list[tuple[str, str, str, bytes]] = []
-        with closing(self._found(store, root, missing, processes)) as found:
+        with closing(self._found(store, source, missing, processes)) as found:
             for done, (record, scene) in enumerate(found, 1):
                 batch.append((record.id, record.fingerprint, self.key, scene.to_bytes()))
                 if progress is not None:
@@ -117,7 +116,7 @@ class Looking:
                 yield number, runs
 
     def _found(
-        self, store: Store, root: Path | Copies, missing: list[IndexRow], processes: int
+        self, store: Store, source: VideoSource, missing: list[IndexRow], processes: int
     ) -> Generator[tuple[IndexRow, Scene], None, None]:
         by_id = {record.id: record for record in missing}
         left = []
@@ -135,10 +134,10 @@ class Looking:
 
         isolated = partial(
             run_isolated,
-            partial(_look_at, root),
+            partial(_look_at, source),
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
-            writable=None if isinstance(root, Copies) else compile_cache(),
+            writable=compile_cache() if source.is_local else None,
         )
         suspects = []
         for job, scene in isolated(jobs(), processes):
@@ -176,7 +175,7 @@ class _ToLookAt:
     window: Window | None
 
 
-def _look_at(root: Path | Copies, job: _ToLookAt) -> bytes:
+def _look_at(source: VideoSource, job: _ToLookAt) -> bytes:
     """The encoded scene of one video: of what decodes before the first error. Empty where the system, rather than the
     decoder, reports an error."""
     # The catalogue is opened by processes that need none of what a look does.
@@ -185,7 +184,7 @@ def _look_at(root: Path | Copies, job: _ToLookAt) -> bytes:
     seen = Look()
     if job.index and job.window is not None:
         try:
-            with open_local(root, job.id, job.fingerprint) as path:
+            with source.open_local(job.id, job.fingerprint) as path:
                 pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
                 for picture in islice(pictures, MOST_FRAMES):
                     seen.add(picture)

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
@@ -22,21 +22,21 @@ LARGEST_MEMORY_BYTES = 2 << 30
 """What a process may allocate to examine a file: enough for 16 pictures of the largest size, or a list of 2**24 frames.
 A file of some kB can claim a thousand million frames, for which a demuxer would make room."""
 
-Examine = Callable[[Path | Copies, str], IndexRow]
-"""(root, id) -> what is known of that file; see :func:`examine`."""
+Examine = Callable[[VideoSource, str], IndexRow]
+"""(source, id) -> what is known of that file; see :func:`examine`."""
 
 
-def examine(root: Path | Copies, id: str) -> IndexRow:
+def examine(source: VideoSource, id: str) -> IndexRow:
     """What is known of one file. Never raises: what goes wrong is the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is looked at again next time.
     """
     try:
-        before = _state(root, id)
-        with open_local(root, id, "") as path:
+        before = source.state(id)
+        with source.open_local(id, "") as path:
             mark = fingerprint(path)
             facts = _facts(path)
-        if _state(root, id) != before:
+        if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
@@ -61,14 +61,6 @@ def examine(root: Path | Copies, id: str) -> IndexRow:
     )
 
 
-def _state(root: Path | Copies, id: str) -> tuple[int, int, int]:
-    """Size in bytes, and the times of the last modification and change of status, or what stands for them."""
-    if isinstance(root, Copies):
-        return root.state(id)
-    status = (root / id).stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
-
-
 def _facts(path: Path) -> VideoFacts:
     """What is known of the video; an error of the system, rather than of the decoder, has to come twice.
 
@@ -90,7 +82,7 @@ def _facts(path: Path) -> VideoFacts:
 
 
 def survey(
-    root: Path | Copies,
+    source: VideoSource,
     ids: Iterable[str],
     processes: int,
     examine: Examine = examine,
@@ -102,7 +94,7 @@ def survey(
     killed from outside, or the memory may not have sufficed for it and its neighbours.
 
     Args:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        source: where the videos come from.
         ids: relative paths.
         processes: processes to probe in, spawned and ended here; 0 probes in this one, where a file that crashes the
             decoder takes the caller along.
@@ -111,10 +103,10 @@ def survey(
     """
     isolated = partial(
         run_isolated,
-        partial(examine, root),
+        partial(examine, source),
         deadline_seconds=lambda id: longest_seconds,
         memory_bytes=LARGEST_MEMORY_BYTES,
-        writable=None if isinstance(root, Copies) else (),  # copies are fetched: from a network, into a folder
+        writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
     suspects: list[str] = []
     for id, found in isolated(ids, processes):
@@ -125,15 +117,15 @@ def survey(
         else:
             yield found
     for id, found in isolated(suspects, 1):
-        yield _culprit(root, id, found) if isinstance(found, Died) else found
+        yield _culprit(source, id, found) if isinstance(found, Died) else found
 
 
-def _culprit(root: Path | Copies, id: str, death: Died) -> IndexRow:
+def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return IndexRow(id, *_state(root, id), problem=why)
-    except (OSError, VideoUnreadable):
+        return IndexRow(id, *source.state(id), problem=why)
+    except VideoUnreadable:
         return IndexRow(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again

@@ -12,6 +12,7 @@ import pytest
 
 from v2v_server.corpus import changed as module
 from v2v_server.corpus.changed import changed
+from v2v_server.corpus.sources.folder import Folder
 
 COUNT = 700
 
@@ -47,10 +48,10 @@ def change(corpus: Corpus) -> list[int]:
 @pytest.mark.parametrize("processes", [0, 1, 3])
 def test_a_changed_a_missing_and_an_unknown_file_are_told(corpus: Corpus, processes: int) -> None:
     notices: list[str] = []
-    assert changed(*corpus, processes, notices.append) == []
+    assert changed(Folder(corpus[0]), *corpus[1:], processes, notices.append) == []
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 0 of them new or changed"
     expected = change(corpus)
-    assert changed(*corpus, processes, notices.append) == expected
+    assert changed(Folder(corpus[0]), *corpus[1:], processes, notices.append) == expected
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 5 of them new or changed"
 
 
@@ -60,17 +61,18 @@ def test_a_helper_that_does_not_answer_costs_time_only(
 ) -> None:
     expected = change(corpus)
     monkeypatch.setattr(sys, "executable", program)
-    assert changed(*corpus, 3, None) == expected
+    assert changed(Folder(corpus[0]), *corpus[1:], 3, None) == expected
 
 
 def test_a_script_needs_no_guard_and_a_daemon_may_ask(corpus: Corpus, tmp_path: Path) -> None:
     folder, ids, states = corpus
     script = tmp_path / "script.py"
     script.write_text(
-        "from array import array\nfrom pathlib import Path\nimport multiprocessing\n"
+        "from array import array\nfrom pathlib import Path\n"
+        "from v2v_server.corpus.sources.folder import Folder\nimport multiprocessing\n"
         "from v2v_server.corpus import changed as module\n"
         f"module._FILES_A_PROCESS = 100\nprint('once')\nmultiprocessing.current_process()._config['daemon'] = True\n"
-        f"print(module.changed(Path({str(folder)!r}), {ids!r}, array('q', {states.tolist()!r}), 3, None))\n"
+        f"print(module.changed(Folder(Path({str(folder)!r})), {ids!r}, array('q', {states.tolist()!r}), 3, None))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("once\n[]\n", "")
@@ -85,5 +87,5 @@ def test_helpers_end_with_who_asks_them(corpus: Corpus, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(module, "_changed", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        changed(*corpus, 3, None)
+        changed(Folder(corpus[0]), *corpus[1:], 3, None)
     assert set(psutil.Process().children()) <= before
