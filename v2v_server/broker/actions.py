@@ -35,7 +35,7 @@ class ToWorker:
 
 
 @dataclass(frozen=True, slots=True)
-class CutOff:
+class Disconnect:
     """Disconnect a consumer that keeps sending malformed messages."""
 
     identity: bytes
@@ -95,7 +95,7 @@ class ReportRefusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Show:
+class SendStatus:
     """Send the next state of the service to this peer.
 
     Attributes:
@@ -107,7 +107,9 @@ class Show:
     is_worker_side: bool = False
 
 
-Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | Show
+Action: TypeAlias = (
+    ToConsumer | ToWorker | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
+)
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tests.server.console.watched import service
 from tests.server.peers import peers
-from v2v_server.console.shutdown_summary import format_shutdown_summary
+from tests.server.status.services import service
+from v2v_server.status.shutdown_summary import format_shutdown_summary
 
 
 def test_a_server_that_did_nothing_says_so() -> None:

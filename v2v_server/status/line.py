@@ -8,9 +8,9 @@ from typing import TextIO
 
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.console.state import CacheState, ServiceState
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.status.state import CacheState, ServiceState
 from v2v_server.system.log import write
 
 _SHOWN = 5

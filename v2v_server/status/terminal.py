@@ -9,11 +9,11 @@ from typing import TextIO
 from rich.console import Console, Group
 from rich.text import Text
 
-from v2v_server.console.state import ServiceState
-from v2v_server.console.status import StatusLine, figures
-from v2v_server.console.status_log import StatusLog
-from v2v_server.console.top import consumers_table
 from v2v_server.corpus.sources.names import printable
+from v2v_server.status.line import StatusLine, figures
+from v2v_server.status.log import StatusLog
+from v2v_server.status.state import ServiceState
+from v2v_server.status.top import consumers_table
 from v2v_server.system.log import Log, write
 
 _SECONDS = 0.5

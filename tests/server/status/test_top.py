@@ -16,12 +16,12 @@ import pytest
 from rich.console import Console
 
 from tests.clips import panned_luma, write_clip
-from tests.server.console.watched import service
 from tests.server.peers import peers
+from tests.server.status.services import service
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_server.commands.top import main
-from v2v_server.console.top import draw, line
+from v2v_server.status.top import draw, line
 
 HOSTILE = "[red]x[/red]\x1b[2J<b>.mp4"
 

@@ -19,8 +19,10 @@ from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
-from v2v_server.console.history import History, Moment
-from v2v_server.console.state import (
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.status.bottleneck import Shares, Waiting, find_bottleneck
+from v2v_server.status.history import History, Moment
+from v2v_server.status.state import (
     STATE_VERSION,
     CacheState,
     ConsumerState,
@@ -30,8 +32,6 @@ from v2v_server.console.state import (
     Totals,
     WorkerState,
 )
-from v2v_server.console.waiting import Shares, Waiting, who_waits
-from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.store.cache import GIB
 from v2v_server.store.used import used_bytes
 from v2v_server.supervise.protocol import Supervisor
@@ -135,7 +135,7 @@ def _first_of_each_spec(sessions: list[Session]) -> list[Session]:
 
 def _waiting(service: Service, now: float, before: Moment, last: Moment) -> Waiting:
     dispatcher = service.dispatcher
-    return who_waits(
+    return find_bottleneck(
         Shares.of(before, last),
         is_attended=service.history.is_attended(now) or dispatcher.consumers > 0,
         workers=dispatcher.workers,

@@ -14,8 +14,8 @@ from tests.clips import panned_luma, write_clip
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import V2VError
-from v2v_server.console.asking import Looker
-from v2v_server.console.history import WINDOW_SECONDS
+from v2v_server.status.client import StatusClient
+from v2v_server.status.history import WINDOW_SECONDS
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
@@ -75,13 +75,13 @@ def verdicts(
     consumer.start()
     said = []
     try:
-        with Looker(address) as looker:
-            while not trouble and not looker.look()["totals"]["samples"]:
+        with StatusClient(address) as client:
+            while not trouble and not client.get_status()["totals"]["samples"]:
                 stop.wait(0.2)
             stop.wait(WINDOW_SECONDS + 2.0)
             until = time.monotonic() + 3.0
             while time.monotonic() < until:
-                said.append(looker.look()["waiting"])
+                said.append(client.get_status()["waiting"])
     finally:
         stop.set()
         consumer.join(30)

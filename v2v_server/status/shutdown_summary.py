@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v2v_server.console.state import ServiceState, Totals
+from v2v_server.status.state import ServiceState, Totals
 from v2v_server.store.cache import GIB
 
 _FAULTS = {

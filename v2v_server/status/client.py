@@ -12,7 +12,7 @@ import zmq
 
 from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
-from v2v_protocol.messages import Denied, See, Seen
+from v2v_protocol.messages import Denied, GetStatus, Status
 from v2v_protocol.safe_json import parse_json
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
 
@@ -20,7 +20,7 @@ _AGAIN_SECONDS = 2.0
 """Without an answer the question is asked again: it may be lost with a connection."""
 
 
-class Looker:
+class StatusClient:
     """One connection to look through.
 
     Args:
@@ -55,7 +55,7 @@ class Looker:
         self._poller.register(self._socket, zmq.POLLIN)
         self._poller.register(self._monitor, zmq.POLLIN)
 
-    def __enter__(self) -> Looker:
+    def __enter__(self) -> StatusClient:
         return self
 
     def __exit__(
@@ -63,8 +63,8 @@ class Looker:
     ) -> None:
         self.close()
 
-    def look(self, timeout_seconds: float = 10.0) -> dict[str, Any]:
-        """The state of now: ``v2v_server.console.state.ServiceState.to_dict()``.
+    def get_status(self, timeout_seconds: float = 10.0) -> dict[str, Any]:
+        """The state of now: ``v2v_server.status.state.ServiceState.to_dict()``.
 
         Raises:
             ServerLost: no answer in that time.
@@ -78,7 +78,7 @@ class Looker:
             if now >= ask_at:
                 ask_at = now + _AGAIN_SECONDS
                 with suppress(zmq.Again):  # the handshake has failed, and is heard of below
-                    self._socket.send_multipart(encode(See()), flags=zmq.NOBLOCK)
+                    self._socket.send_multipart(encode(GetStatus()), flags=zmq.NOBLOCK)
             ready = dict(self._poller.poll(int(1000 * max(0.0, min(end, ask_at) - now)) + 1))
             if self._monitor in ready:
                 self._handshakes.take(
@@ -95,7 +95,7 @@ class Looker:
             message = decode(self._socket.recv_multipart()[0])
             if isinstance(message, Denied):
                 raise RemoteError(message.code, f"{self._address} refused: {message.text}")
-            if isinstance(message, Seen):
+            if isinstance(message, Status):
                 newest = message
         if newest is None:
             return None

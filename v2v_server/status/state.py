@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any
 
 from v2v_protocol.wire import LARGEST_HEADER_BYTES
-from v2v_server.console.waiting import Waiting
+from v2v_server.status.bottleneck import Waiting
 
 STATE_VERSION = 1
 

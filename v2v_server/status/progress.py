@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.status import Status
 from rich.text import Text
 
-from v2v_server.console.shutdown_summary import format_duration
+from v2v_server.status.shutdown_summary import format_duration
 from v2v_server.system.log import Log
 
 _LOG_SECONDS = 10.0

@@ -6,20 +6,20 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
-from tests.server.console.watched import service
 from tests.server.named_corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from tests.server.peers import peers
+from tests.server.status.services import service
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.counters import Counters
-from v2v_server.console.state import CacheState, ServiceState
-from v2v_server.console.status import StatusLine, summary
-from v2v_server.console.status_log import StatusLog
-from v2v_server.console.terminal import StatusBlock, make_status
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.status.line import StatusLine, summary
+from v2v_server.status.log import StatusLog
+from v2v_server.status.state import CacheState, ServiceState
+from v2v_server.status.terminal import StatusBlock, make_status
 from v2v_server.system.log import Log
 from v2v_server.video.rows import Rows
 

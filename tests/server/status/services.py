@@ -8,12 +8,12 @@ from typing import Any, cast
 from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
 from tests.server.queues import Queues, ToySupervisor
-from v2v_protocol.messages import Seen
+from v2v_protocol.messages import Status
 from v2v_protocol.wire import decode
-from v2v_server.broker.actions import Action, Show, ToConsumer, ToWorker
+from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
-from v2v_server.console.state import ServiceState
-from v2v_server.console.watch import Watch, make_watch
+from v2v_server.status.publisher import StatusPublisher, make_publisher
+from v2v_server.status.state import ServiceState
 
 WALL = "2024-02-29T12:00:00+00:00"
 
@@ -30,7 +30,7 @@ class Watched:
     """
 
     at: Peers
-    watch: Watch
+    watch: StatusPublisher
     transport: Queues
     supervisor: ToySupervisor
 
@@ -50,7 +50,7 @@ class Watched:
 
     def ask(self, actions: list[Action]) -> list[ToConsumer | ToWorker]:
         (show,) = actions
-        return self.watch.ask(cast(Show, show))
+        return self.watch.ask(cast(SendStatus, show))
 
 
 def service(at: Peers, **settings: Any) -> Watched:
@@ -58,7 +58,7 @@ def service(at: Peers, **settings: Any) -> Watched:
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
     transport, supervisor = Queues(), ToySupervisor(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    watch = make_watch(config, catalogue, at.dispatcher, supervisor, at.quarantine, transport, at.now, lambda: WALL)
+    watch = make_publisher(config, catalogue, at.dispatcher, supervisor, at.quarantine, transport, at.now, lambda: WALL)
     watch._processor_clock = lambda: 0.0  # a slow host makes states less often
     watch.tick(at.now)
     return Watched(at, watch, transport, supervisor)
@@ -67,6 +67,6 @@ def service(at: Peers, **settings: Any) -> Watched:
 def seen(action: ToConsumer | ToWorker) -> bytes:
     """The JSON of an answer."""
     message = decode(action.frames[0])
-    if not isinstance(message, Seen):
+    if not isinstance(message, Status):
         raise AssertionError(message)
     return message.json

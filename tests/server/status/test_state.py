@@ -8,19 +8,19 @@ import time
 
 import pytest
 
-from tests.server.console.watched import WALL, seen, service
 from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
+from tests.server.status.services import WALL, seen, service
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
-from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Result, See, Want, WorkerHello
+from v2v_protocol.messages import Denied, ErrorCode, GetStatus, Goodbye, Hello, Result, Want, WorkerHello
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
-from v2v_server.broker.actions import Show, ToConsumer, ToWorker
+from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
 from v2v_server.broker.quarantine import QuarantineEntry
-from v2v_server.console.state import STATE_VERSION
-from v2v_server.console.survey import MOST_SHOWN
-from v2v_server.console.watch import ANSWER_SECONDS, MOST_LOOKERS
+from v2v_server.status.publisher import ANSWER_SECONDS, MOST_LOOKERS
+from v2v_server.status.snapshot import MOST_SHOWN
+from v2v_server.status.state import STATE_VERSION
 
 
 def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:
@@ -260,7 +260,7 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
 def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
     at = peers()
     watched = service(at)
-    assert watched.ask(at.dispatcher.from_consumer(b"page", encode(See()), at.now)) == []
+    assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
     (answer,) = watched.answers()
     assert isinstance(answer, ToConsumer)
     assert answer.identity == b"page"
@@ -271,7 +271,7 @@ def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
 def test_the_workers_side_may_look_too_and_is_no_worker_for_it() -> None:
     at = peers()
     watched = service(at)
-    watched.ask(at.dispatcher.from_worker(b"page", encode(See()), at.now))
+    watched.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
     (answer,) = watched.answers()
     assert isinstance(answer, ToWorker)
     assert json.loads(seen(answer))["worker_count"] == 0
@@ -283,7 +283,7 @@ def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
     made = 0
     for _ in range(20):
         for _ in range(50):
-            assert watched.ask(at.dispatcher.from_consumer(b"page", encode(See()), at.now)) == []
+            assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
         answers = watched.answers()
         assert len(answers) <= 1
         made += len(answers)
@@ -298,7 +298,7 @@ def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
     watched.watch._processor_clock = lambda: float(next(worked)) / 10.0
     made = []
     for _ in range(200):
-        watched.ask(at.dispatcher.from_consumer(b"page", encode(See()), at.now))
+        watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now))
         made += [at.now] * len(watched.answers())
         at.now += 0.1
     # A tenth of a second of work each.
@@ -309,8 +309,8 @@ def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> N
     at = peers()
     watched = service(at)
     for number in range(MOST_LOOKERS):
-        assert watched.watch.ask(Show(b"%d" % number)) == []
-    (denied,) = watched.watch.ask(Show(b"one too many"))
+        assert watched.watch.ask(SendStatus(b"%d" % number)) == []
+    (denied,) = watched.watch.ask(SendStatus(b"one too many"))
     answer = decode(denied.frames[0])
     assert isinstance(answer, Denied)
     assert answer.code == ErrorCode.BUSY

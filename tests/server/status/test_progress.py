@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from v2v_server.console.progress import catalogue_progress
+from v2v_server.status.progress import catalogue_progress
 
 
 def test_a_log_says_every_ten_seconds_how_far_a_scan_is(capsys: pytest.CaptureFixture[str]) -> None:

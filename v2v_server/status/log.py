@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v2v_server.console.state import ServiceState
+from v2v_server.status.state import ServiceState
 from v2v_server.system.log import Log
 
 _LOG_SECONDS = 10.0
@@ -10,7 +10,7 @@ _LOG_SECONDS = 10.0
 
 class StatusLog:
     """A line every ten seconds, with its numbers beside the text. Has the methods of
-    :class:`v2v_server.console.status.StatusLine`.
+    :class:`v2v_server.status.line.StatusLine`.
 
     Args:
         log: where to.

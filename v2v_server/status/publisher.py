@@ -8,17 +8,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from v2v_protocol.messages import ErrorCode, Seen
+from v2v_protocol.messages import ErrorCode, Status
 from v2v_protocol.wire import Frames, encode
-from v2v_server.broker.actions import Show, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker, denial
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.config import ServeConfig
-from v2v_server.console.history import History
-from v2v_server.console.state import ServiceState
-from v2v_server.console.survey import Service, service_state
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.status.history import History
+from v2v_server.status.snapshot import Service, service_state
+from v2v_server.status.state import ServiceState
 from v2v_server.supervise.protocol import Supervisor
 
 ANSWER_SECONDS = 0.4
@@ -28,7 +28,7 @@ MOST_LOOKERS = 64
 """Peers that are answered with one state."""
 
 
-class Watch:
+class StatusPublisher:
     """One service, looked at.
 
     Args:
@@ -52,7 +52,7 @@ class Watch:
         self._waited_seconds = waited_seconds
         self._wall_clock = wall_clock
         self._processor_clock = processor_clock
-        self._lookers: dict[Show, None] = {}
+        self._lookers: dict[SendStatus, None] = {}
         self._answer_at = service.started
         self.is_ready = False
 
@@ -60,7 +60,7 @@ class Watch:
         """The state of now."""
         return service_state(self._service, now, self._wall_clock(), is_ready=self.is_ready)
 
-    def ask(self, show: Show) -> list[ToConsumer | ToWorker]:
+    def ask(self, show: SendStatus) -> list[ToConsumer | ToWorker]:
         """Somebody looks; returns what is to be sent at once, which is nothing as a rule."""
         if show in self._lookers or len(self._lookers) < MOST_LOOKERS:
             self._lookers[show] = None
@@ -74,7 +74,7 @@ class Watch:
             return []
         began = self._processor_clock()
         lookers, self._lookers = self._lookers, {}
-        frames = encode(Seen(self.state(now).to_json()))
+        frames = encode(Status(self.state(now).to_json()))
         self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
         return [_to(show, frames) for show in lookers]
 
@@ -82,7 +82,7 @@ class Watch:
         return max(0.0, now - self._service.started - self._waited_seconds())
 
 
-def make_watch(
+def make_publisher(
     config: ServeConfig,
     catalogue: Catalogue,
     dispatcher: Dispatcher,
@@ -91,13 +91,13 @@ def make_watch(
     transport: ServerTransport,
     now: float,
     wall_clock: Callable[[], str],
-) -> Watch:
+) -> StatusPublisher:
     """The watch over a server that starts at ``now``."""
     addresses = transport.address, transport.worker_address
     service = Service(config, catalogue, dispatcher, supervisor, quarantine, History(now), *addresses, started=now)
     before = transport.waited_seconds
-    return Watch(service, lambda: transport.waited_seconds - before, wall_clock)
+    return StatusPublisher(service, lambda: transport.waited_seconds - before, wall_clock)
 
 
-def _to(show: Show, frames: Frames) -> ToConsumer | ToWorker:
+def _to(show: SendStatus, frames: Frames) -> ToConsumer | ToWorker:
     return ToWorker(show.identity, frames) if show.is_worker_side else ToConsumer(show.identity, frames)

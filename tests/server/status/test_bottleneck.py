@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from tests.server.console.watched import service
 from tests.server.peers import answer_to, peers
+from tests.server.status.services import service
 from v2v_protocol.messages import Goodbye, Result, Want
 from v2v_server.broker.leases import Stall
-from v2v_server.console.waiting import Shares, who_waits
+from v2v_server.status.bottleneck import Shares, find_bottleneck
 
 FULL = {"seconds": 10.0, "consumers": 0.8, "idle": 0.02, "broker": 0.2}
 CASES: list[tuple[dict[str, Any], str, str, str]] = [
@@ -37,7 +37,7 @@ CASES: list[tuple[dict[str, Any], str, str, str]] = [
 def test_each_verdict_follows_from_the_shares(case: dict[str, Any], part: str, sentence: str, remedy: str) -> None:
     there = {"is_attended": True, "workers": 4} | case.get("there", {})
     shares = Shares(**{**FULL, **{name: value for name, value in case.items() if name != "there"}})
-    said = who_waits(shares, **there)
+    said = find_bottleneck(shares, **there)
     assert said.part == part
     assert sentence in said.sentence
     assert remedy in said.remedy
@@ -47,8 +47,8 @@ def test_each_verdict_follows_from_the_shares(case: dict[str, Any], part: str, s
 
 def test_a_cache_that_is_there_is_no_remedy() -> None:
     shares = Shares(**FULL, decode=0.9)
-    assert "--cache" in who_waits(shares, is_attended=True, workers=1).remedy
-    assert "--cache" not in who_waits(shares, is_attended=True, workers=1, has_cache=True).remedy
+    assert "--cache" in find_bottleneck(shares, is_attended=True, workers=1).remedy
+    assert "--cache" not in find_bottleneck(shares, is_attended=True, workers=1, has_cache=True).remedy
 
 
 def test_the_shares_are_of_the_time_that_was_noted() -> None:

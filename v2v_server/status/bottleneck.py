@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from v2v_server.console.history import Moment
+from v2v_server.status.history import Moment
 
 NOTICEABLE_SHARE = 0.1
 """Of its time that a consumer may wait without a word about it."""
@@ -93,7 +93,7 @@ class Waiting:
     shares: Shares
 
 
-def who_waits(
+def find_bottleneck(
     shares: Shares,
     *,
     is_attended: bool,
