@@ -8,14 +8,14 @@ from typing import cast
 
 import numpy as np
 
-from v2v_protocol.errors import IndexUnreadable, ProtocolError, UsageError
+from v2v_protocol.errors import IndexUnreadable, ProtocolError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.corpus.videos import VideoEntry
+from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
@@ -45,11 +45,13 @@ class NamedCorpus:
     def fail_fast(self) -> None:
         """There is no index to wait for."""
 
+    @property
+    def facts(self) -> CorpusFacts:
+        """What is known in memory; these videos have no statistics."""
+        return CorpusFacts(self.videos, self.rows, self.digest, None)
+
     def digest_under(self, scene: str) -> str:
-        """The digest; these videos have no statistics."""
-        if scene != "off":
-            raise UsageError(f'scene = "{scene}" needs statistics')
-        return self.digest
+        return self.facts.digest_under(scene)
 
     def frame_index_bytes(self, name: str, start: int, count: int) -> bytes:
         return self.frame_index(name).slice(start, count).to_bytes()

@@ -165,7 +165,7 @@ class World:
         file = self.folder / "quarantine.jsonl"
         quarantine = read_quarantine(file)
         self.dispatcher = Dispatcher(
-            videos,
+            videos.facts,
             SMALL_SPEC,
             lease_deadline_seconds=DEADLINE,
             session_idle_seconds=600.0,

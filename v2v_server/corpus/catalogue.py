@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
+from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
+from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.corpus import Corpus, format_problems, list_corpus
-from v2v_server.corpus.index.columns import Records
-from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.index.columns import VideoTable
+from v2v_server.corpus.index.file import Store
 from v2v_server.corpus.manifest import Header, PreparedVideo
-from v2v_server.corpus.refresh import Progress, index_path, up_to_date
-from v2v_server.corpus.scene import Scene
-from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
-from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
@@ -66,8 +69,8 @@ class Catalogue:
     _store: Store = field(repr=False, compare=False)
     _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
-    _looking: Looking | None = field(repr=False, compare=False)
-    _unseen: frozenset[str] = field(repr=False, compare=False)
+    _scenes: SceneCollection | None = field(repr=False, compare=False)
+    _unknown: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
     _long: dict[str, FrameIndex] = field(repr=False, compare=False, default_factory=dict)
 
@@ -165,35 +168,26 @@ class Catalogue:
             VideoChanged: another process has catalogued a changed file under this id since.
         """
         fingerprint = self._fingerprint(id)
-        if self._looking is None:
+        if self._scenes is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
-        if id in self._unseen:
+        if id in self._unknown:
             return Scene.unknown()
         try:
-            data = self._store.scene(id, self._files.get(id, fingerprint), self._looking.key)
+            data = self._store.figures(id, self._files.get(id, fingerprint), self._scenes.kind)
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
             raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
         return Scene.from_bytes(data)
 
+    @property
+    def facts(self) -> CorpusFacts:
+        """What is known in memory: all that a server's dispatcher needs."""
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest)
+
     def digest_under(self, scene: str) -> str:
-        """The digest that names this snapshot in samples of a spec.
-
-        Args:
-            scene: of the spec; with "off" the statistics do not count.
-
-        Raises:
-            UsageError: "auto", and the catalogue was opened without ``scene``.
-        """
-        if scene == "off":
-            return self.digest
-        if self.scene_digest is None:
-            raise UsageError(
-                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
-                "server with --scene auto"
-            )
-        return self.scene_digest
+        """See :meth:`CorpusFacts.digest_under`."""
+        return self.facts.digest_under(scene)
 
     def fail_fast(self) -> None:
         """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
@@ -214,7 +208,24 @@ class Catalogue:
         number = self.videos.find(id)
         if number is None:
             raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.source})")
-        return self.videos.fingerprint(number)
+        return self.videos.fingerprints[number]
+
+
+def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
+    """Return a lease with what the index on disk holds of its clip.
+
+    Args:
+        lease: without ``frame_index`` and ``scene``.
+        catalogue: where its video is catalogued.
+        spec: the spec that the lease names.
+
+    Raises:
+        IndexUnreadable: the index cannot be read at the moment.
+        V2VError: the index of this video is damaged, or belongs to another file.
+    """
+    video, start, count = lease.video, lease.start_frame, spec.recipe.frames_needed
+    scene = catalogue.scene(video).slice(start, count).to_bytes() if spec.scene != "off" else b""
+    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=scene)
 
 
 def open_catalogue(
@@ -242,7 +253,7 @@ def open_catalogue(
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
-            :mod:`v2v_server.corpus.scene`.
+            :mod:`v2v_server.corpus.scenes`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
         notice: told what is looked at before that, file by file, and how far it is.
@@ -253,40 +264,35 @@ def open_catalogue(
     """
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
     corpus = list_corpus(opened, rows, notice)
-    looking = Looking(corpus.rows, opened.manifest) if scene else None
+    scenes = SceneCollection(corpus.rows, opened.manifest) if scene else None
     path = index_path(opened.name, cache_dir)
-    store, records, notes = up_to_date(opened, corpus.ids, path, looking, processes, progress, notice)
+    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
     try:
         with without_collections():
-            return _snapshot(corpus, records, notes, store, looking)
+            return _snapshot(corpus, table, notes, store, scenes)
     except BaseException:
         store.close()
         raise
 
 
-def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, looking: Looking | None) -> Catalogue:
-    source, manifest = corpus.source, corpus.source.manifest
+def _snapshot(
+    corpus: Corpus, on_disk: VideoTable, notes: list[str], store: Store, scenes: SceneCollection | None
+) -> Catalogue:
+    source, manifest, table = corpus.source, corpus.source.manifest, on_disk
     problems, files = dict(corpus.refused), dict[str, str]()
     absent: dict[str, PreparedVideo] = {}
-    on_disk = records
     if manifest is not None:
-        records = Records()
-        for record in on_disk:
-            files[record.id] = record.fingerprint
-            if not manifest.describes(record):
-                absent[record.id] = manifest.videos[record.id]
-            records.append(manifest.as_source(record))
-    elif STORE_FORMAT in records.codecs:
-        why = "is a file of a lossless corpus by itself: serve the whole folder"
-        lossless = np.flatnonzero(records.codec == records.codecs[STORE_FORMAT]).tolist()
-        records.problems.update(dict.fromkeys(lossless, why))
-    problems.update((records.ids[place], problem) for place, problem in records.problems.items())
-    usable = np.ones(len(records), bool)
-    usable[list(records.problems)] = False
-    places = np.flatnonzero(usable)
-    videos = Videos(records, places, {})
-    thresholds, shorter = _listed(source.listed or (), videos)
-    videos = Videos(records, places, thresholds)
+        records = [on_disk.row(at) for at in range(len(on_disk))]
+        files = {record.id: record.fingerprint for record in records}
+        absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
+        table = VideoTable.of(manifest.as_source(record).columns for record in records)
+    else:
+        table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
+    usable = table.problem == np.array(None)
+    problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
+    table = table.where(usable)
+    thresholds, shorter = _listed(source.listed or (), Videos(table, {}))
+    videos = Videos(table, thresholds)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
     if absent:
@@ -316,13 +322,12 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     digest = videos.digest(corpus.rows)
-    scene_digest, unseen = None, set(absent)
-    if looking is not None:
-        used = (_of_file(records[place], files) for place in places.tolist())
-        cut, scene_digest = looking.cuts(store, used, unseen, digest)
-        videos = Videos(records, places, thresholds, cut)
-        if died := sorted(unseen - absent.keys()):
-            notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
+    scene_digest, unknown = None, set(absent)
+    if scenes is not None:
+        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        videos = Videos(table, thresholds, split)
+        if died := sorted(unknown - absent.keys()):
+            notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
     return Catalogue(
         source=source,
         rows=corpus.rows,
@@ -335,14 +340,9 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
         _store=store,
         _files=files,
         _absent=absent,
-        _looking=looking,
-        _unseen=frozenset(unseen),
+        _scenes=scenes,
+        _unknown=frozenset(unknown),
     )
-
-
-def _of_file(record: IndexRow, files: Mapping[str, str]) -> IndexRow:
-    """The record under the fingerprint of the file that lies here."""
-    return replace(record, fingerprint=files.get(record.id, record.fingerprint))
 
 
 def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
-from v2v_server.corpus.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE, printable
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding

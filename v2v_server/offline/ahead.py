@@ -10,8 +10,9 @@ from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.corpus import list_corpus
 from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
-from v2v_server.corpus.refresh import Progress, index_path, up_to_date
-from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.video.rows import Rows
@@ -93,13 +94,18 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     source = _source(asked)
     corpus = list_corpus(source, asked.rows, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    looking = Looking(corpus.rows, source.manifest) if asked.scene else None
+    scenes = SceneCollection(corpus.rows, source.manifest) if asked.scene else None
     index = index_path(source.name, asked.cache_dir, shard)
-    store, records, notes = up_to_date(source, ids, index, looking, asked.processes, progress, notice)
+    store, table, notes = refresh_index(source, ids, index, scenes, asked.processes, progress, notice)
     store.close()
     if notes:
         raise CorpusError(notes[0])
-    return Part(write_part(index, out, shard), len(corpus.ids), len(ids), Counter(records.problems.values()))
+    return Part(
+        write_part(index, out, shard),
+        len(corpus.ids),
+        len(ids),
+        Counter(problem for problem in table.problem if problem is not None),
+    )
 
 
 def _source(asked: Ahead) -> VideoSource:

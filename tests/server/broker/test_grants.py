@@ -8,8 +8,8 @@ import pytest
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.sample import Form
 from v2v_protocol.wire import encode_sample
+from v2v_server.broker.grants import check_result
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import check_result
 
 SIZE = 1000
 FORM = Form.of({"voxels": ("int8", (SIZE,))})

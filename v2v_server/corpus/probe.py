@@ -1,11 +1,13 @@
-"""Probing many files in processes of their own, so that a file that kills its reader costs only itself."""
+"""Probe many files in processes of their own, so that a file that kills its reader costs only itself."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
@@ -16,20 +18,25 @@ from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
 
 LONGEST_SECONDS = 3600.0
-"""For reading a file from end to end, on slow storage: who needs longer waits for a file that never comes."""
+"""Limit for reading a file from end to end on slow storage; beyond it the file is taken for one that never ends."""
 
 LARGEST_MEMORY_BYTES = 2 << 30
-"""What a process may allocate to examine a file: enough for 16 pictures of the largest size, or a list of 2**24 frames.
-A file of some kB can claim a thousand million frames, for which a demuxer would make room."""
+"""Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
+frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
-Examine = Callable[[VideoSource, str], IndexRow]
-"""(source, id) -> what is known of that file; see :func:`examine`."""
+_MOST_TOGETHER = 1024
+_MOST_SECONDS = 10.0
+Progress = Callable[[int, int], None]
+"""(files done so far, files to do)."""
+ProbeFile = Callable[[VideoSource, str], IndexRow]
+"""(source, id) -> what is known of that file; see :func:`probe_file`."""
+T = TypeVar("T")
 
 
-def examine(source: VideoSource, id: str) -> IndexRow:
-    """What is known of one file. Never raises: what goes wrong is the record's ``problem``.
+def probe_file(source: VideoSource, id: str) -> IndexRow:
+    """Probe one file; an error becomes the record's ``problem``.
 
-    A file that cannot be read gets the size -1, which no file has: it is looked at again next time.
+    A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
     try:
         before = source.state(id)
@@ -45,7 +52,7 @@ def examine(source: VideoSource, id: str) -> IndexRow:
     except VideoError as error:
         where = "" if error.frame is None else f"frame {error.frame}: "
         return IndexRow(id, *before, problem=where + error.reason)
-    except Exception as error:  # noqa: BLE001 - one strange file must not end the survey of all others
+    except Exception as error:  # noqa: BLE001 - one strange file must not end the probing of all others
         return IndexRow(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
     return IndexRow(
         id,
@@ -62,10 +69,10 @@ def examine(source: VideoSource, id: str) -> IndexRow:
 
 
 def _facts(path: Path) -> VideoFacts:
-    """What is known of the video; an error of the system, rather than of the decoder, has to come twice.
+    """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
-        VideoUnreadable: it came twice.
+        VideoUnreadable: the system reported an error twice.
         VideoError: the file is no video that this program serves.
     """
     try:
@@ -81,29 +88,28 @@ def _facts(path: Path) -> VideoFacts:
         raise
 
 
-def survey(
+def probe_files(
     source: VideoSource,
     ids: Iterable[str],
     processes: int,
-    examine: Examine = examine,
+    probe: ProbeFile = probe_file,
     longest_seconds: float = LONGEST_SECONDS,
 ) -> Generator[IndexRow, None, None]:
-    """A record for each id, in any order.
+    """Yield a record of each id, in any order.
 
-    A file at which a process died is examined once more when all others are done, alone: the process may have been
-    killed from outside, or the memory may not have sufficed for it and its neighbours.
+    A file at which a process died is probed once more after all others, alone: the process may have been killed from
+    outside, or memory was too short for it and its neighbours.
 
     Args:
         source: where the videos come from.
         ids: relative paths.
-        processes: processes to probe in, spawned and ended here; 0 probes in this one, where a file that crashes the
-            decoder takes the caller along.
-        examine: what is done with each file; must be picklable.
-        longest_seconds: a process that is at a file for longer is ended; the next start tries that file again.
+        processes: number of processes to probe in; 0 probes in this one, which a file that crashes the decoder ends.
+        probe: probes one file; must be picklable.
+        longest_seconds: limit for one file; the next start tries it again.
     """
     isolated = partial(
         run_isolated,
-        partial(examine, source),
+        partial(probe, source),
         deadline_seconds=lambda id: longest_seconds,
         memory_bytes=LARGEST_MEMORY_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
@@ -128,4 +134,26 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
     try:
         return IndexRow(id, *source.state(id), problem=why)
     except VideoUnreadable:
-        return IndexRow(id, -1, problem=why)  # gone meanwhile; should it come back, it is looked at again
+        return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
+
+
+def batches(
+    items: Iterable[T], total: int, progress: Progress | None, clock: Callable[[], float] = time.monotonic
+) -> Iterator[list[T]]:
+    """Yield items in batches that are written to the index at once: a kill loses at most one.
+
+    Args:
+        total: number of items, for ``progress``.
+        progress: called after each item.
+    """
+    batch: list[T] = []
+    begun = clock()
+    for done, item in enumerate(items, 1):
+        batch.append(item)
+        if progress is not None:
+            progress(done, total)
+        if len(batch) == _MOST_TOGETHER or clock() - begun > _MOST_SECONDS:
+            yield batch
+            batch, begun = [], clock()
+    if batch:
+        yield batch

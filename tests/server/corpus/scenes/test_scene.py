@@ -1,4 +1,4 @@
-"""Scene statistics: what a look finds in clips of known content, and how it is stored."""
+"""Scene statistics: what an analysis finds in clips of known content, and how the index keeps it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from skimage import data
 from tests.clips import damaged, panned_luma, write_clip
 from tests.server.corpus.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
-from v2v_server.corpus import scenes as looking
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.look import look
-from v2v_server.corpus.scene import (
+from v2v_server.corpus.scenes import collect
+from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
     COLUMNS,
@@ -42,6 +42,13 @@ from v2v_server.video.rows import Rows
 Luma = npt.NDArray[np.uint8]
 
 
+def analyse(luma: Luma) -> Scene:
+    analysis = SceneAnalysis()
+    for picture in luma:
+        analysis.add(picture)
+    return analysis.scene()
+
+
 def pan(frames: int, right_px: int, height: int = 96, width: int = 160) -> Luma:
     return panned_luma(frames, height, width, step=(0, right_px))
 
@@ -54,26 +61,26 @@ def other(frames: int, right_px: int = 1, height: int = 96, width: int = 160) ->
 
 
 def test_a_still_clip_neither_moves_nor_changes() -> None:
-    scene = look(np.repeat(pan(1, 0), 40, axis=0))
+    scene = analyse(np.repeat(pan(1, 0), 40, axis=0))
     values = scene.values(0, 40)
     assert scene.end == 40
     assert len(scene.segments) == 3
     assert not values[:, MOTION].any()
     assert not values[:, CHANGE].any()
     assert not values[:, [FLICKER, NOISE]].any()
-    assert scene.cuts == ()
+    assert scene.shot_boundaries == ()
 
 
 @pytest.mark.parametrize("pace_px", [1, 2, 4])
 def test_motion_is_in_pixels_a_frame(pace_px: int) -> None:
-    motion = look(pan(32, pace_px)).values(0, 32)[:, MOTION]
+    motion = analyse(pan(32, pace_px)).values(0, 32)[:, MOTION]
     assert np.median(motion) == pytest.approx(pace_px, rel=0.15)
 
 
 def test_only_the_tiles_that_change_do() -> None:
     luma = np.repeat(pan(1, 0, 96, 128), 17, axis=0)
     luma[:, :24, :32] = other(17, 3, 24, 32)
-    change = look(luma).values(0, 17)[0, CHANGE]
+    change = analyse(luma).values(0, 17)[0, CHANGE]
     assert change[0] > 5
     assert not change[1:].any()
 
@@ -81,7 +88,7 @@ def test_only_the_tiles_that_change_do() -> None:
 def test_change_and_contrast_against_their_definitions() -> None:
     luma = pan(20, 2, 64, 96)
     blocks = luma.reshape(20, 8, 8, 12, 8).mean(axis=(2, 4))
-    values = look(luma).values(0, 20)
+    values = analyse(luma).values(0, 20)
     for segment, (low, high) in enumerate(((0, 16), (16, 19))):
         changes = [np.abs(blocks[t] - blocks[max(0, t - 4)]) for t in range(low + 1, high + 1)]
         tiles = np.max(changes, axis=0).reshape(4, 2, 4, 3).max(axis=(1, 3)).ravel()
@@ -93,7 +100,7 @@ def test_change_and_contrast_against_their_definitions() -> None:
 def test_dark_and_clipped_shares(level: int, dark: float, clipped: float) -> None:
     luma = np.full((5, 40, 64), 100, np.uint8)
     luma[:, :10] = level
-    values = look(luma).values(0, 5)[0]
+    values = analyse(luma).values(0, 5)[0]
     assert values[DARK] == pytest.approx(dark / 4, abs=1e-3)
     assert values[CLIPPED] == pytest.approx(clipped / 4, abs=1e-3)
 
@@ -103,26 +110,26 @@ def test_noise_and_flicker_have_the_strength_they_were_given() -> None:
     flat = np.full((33, 96, 160), 120.0)
     noisy = np.rint(flat + rng.normal(0, 3.0, flat.shape)).astype(np.uint8)
     # The stillest tenth lies a little below the mean.
-    assert look(noisy).values(0, 33)[0, NOISE] == pytest.approx(3.0, rel=0.15)
+    assert analyse(noisy).values(0, 33)[0, NOISE] == pytest.approx(3.0, rel=0.15)
     flickering = (flat + np.where(np.arange(33) % 2, 4, 0)[:, None, None]).astype(np.uint8)
-    assert look(flickering).values(0, 33)[0, FLICKER] == pytest.approx(4.0, abs=0.1)
+    assert analyse(flickering).values(0, 33)[0, FLICKER] == pytest.approx(4.0, abs=0.1)
 
 
 @pytest.mark.parametrize("at", [1, 2, 7, 16, 30, 39])
 def test_a_cut_is_found_where_it_is(at: int) -> None:
-    assert look(np.concatenate([pan(at, 2), other(40 - at, 2)])).cuts == (at,)
+    assert analyse(np.concatenate([pan(at, 2), other(40 - at, 2)])).shot_boundaries == (at,)
 
 
 def test_cuts_in_quick_succession_to_black_and_of_dark_scenes() -> None:
     parts = [pan(12, 1), other(9), pan(11, 1)[:, ::-1], np.zeros((10, 96, 160), np.uint8), pan(12, 1)]
-    assert look(np.concatenate(parts)).cuts == (12, 21, 32, 42)
+    assert analyse(np.concatenate(parts)).shot_boundaries == (12, 21, 32, 42)
     dark = np.concatenate([pan(12, 1), other(12)]) // 12
-    assert look(dark).cuts == (12,)
+    assert analyse(dark).shot_boundaries == (12,)
 
 
 @pytest.mark.parametrize("pace_px", [0, 1, 8, 20])
 def test_motion_is_no_cut(pace_px: int) -> None:
-    assert look(pan(60, pace_px)).cuts == ()
+    assert analyse(pan(60, pace_px)).shot_boundaries == ()
 
 
 def test_flashes_flicker_fades_and_starting_motion_are_no_cuts() -> None:
@@ -132,17 +139,17 @@ def test_flashes_flicker_fades_and_starting_motion_are_no_cuts() -> None:
     fade = (pan(40, 1) * np.linspace(1, 0, 40)[:, None, None]).astype(np.uint8)
     starts = np.concatenate([np.repeat(pan(1, 0), 20, axis=0), pan(21, 3)[1:]])
     for luma in (flash, flicker, fade, starts):
-        assert look(luma).cuts == ()
+        assert analyse(luma).shot_boundaries == ()
 
 
 def test_runs_lie_between_cuts_and_hold_something_to_see() -> None:
     black = np.zeros((48, 96, 160), np.uint8)
-    scene = look(np.concatenate([black, pan(52, 1), other(60)]))
-    assert scene.cuts == (48, 100)
+    scene = analyse(np.concatenate([black, pan(52, 1), other(60)]))
+    assert scene.shot_boundaries == (48, 100)
     assert scene.runs(160) == [(48, 100), (100, 160)]
     # Frames that were not looked at are taken as they come.
     assert scene.runs(500) == [(48, 100), (100, 500)]
-    assert look(black).runs(48) == []
+    assert analyse(black).runs(48) == []
     assert Scene.unknown().runs(30) == [(0, 30)]
 
 
@@ -167,22 +174,22 @@ def test_runs_against_their_definition(scene: Scene) -> None:
     held = [frame for first, end in runs for frame in range(first, end)]
     assert held == [frame for frame in range(frames) if usable[frame]]
     for first, end in runs:
-        assert not any(first < cut < end for cut in scene.cuts)
-        assert first == 0 or first in scene.cuts or not usable[first - 1]
+        assert not any(first < cut < end for cut in scene.shot_boundaries)
+        assert first == 0 or first in scene.shot_boundaries or not usable[first - 1]
 
 
 @given(scenes(), st.data())
 def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
     back = Scene.from_bytes(scene.to_bytes())
     assert back.to_bytes() == scene.to_bytes()
-    assert (back.first, back.end, back.cuts) == (scene.first, scene.end, scene.cuts)
+    assert (back.first, back.end, back.shot_boundaries) == (scene.first, scene.end, scene.shot_boundaries)
     start = data.draw(st.integers(0, 320))
     count = data.draw(st.integers(1, 60))
     part = Scene.from_bytes(scene.slice(start, count).to_bytes())
     low, high = start, min(start + count, scene.end)
     if low < high:
         np.testing.assert_array_equal(part.values(low, high), scene.values(low, high))
-        assert part.cuts == tuple(cut for cut in scene.cuts if low < cut < high)
+        assert part.shot_boundaries == tuple(cut for cut in scene.shot_boundaries if low < cut < high)
     else:
         assert not len(part.segments)
 
@@ -195,12 +202,12 @@ def test_what_is_no_scene_is_refused(data: bytes) -> None:
 
 
 def test_a_scene_that_contradicts_itself_is_refused() -> None:
-    scene = look(pan(40, 1))
+    scene = analyse(pan(40, 1))
     for other_scene in (
         dataclasses.replace(scene, end=60),
-        dataclasses.replace(scene, cuts=(0,)),
-        dataclasses.replace(scene, cuts=(9, 9)),
-        dataclasses.replace(scene, cuts=(41,)),
+        dataclasses.replace(scene, shot_boundaries=(0,)),
+        dataclasses.replace(scene, shot_boundaries=(9, 9)),
+        dataclasses.replace(scene, shot_boundaries=(41,)),
         dataclasses.replace(scene, first=3),
         dataclasses.replace(scene, end=MOST_FRAMES + 1),
     ):
@@ -272,7 +279,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     """Once at once, and else at the next start: otherwise a video would never have had a cut."""
     with opened(folder, scene=False), opened(folder, cache_dir=tmp_path / "other") as undisturbed:
         digest = undisturbed.scene_digest
-    monkeypatch.setattr(looking, "run_isolated", lambda look, jobs, *_, **__: run_isolated(look, jobs, 0))
+    monkeypatch.setattr(collect, "run_isolated", lambda work, jobs, *_, **__: run_isolated(work, jobs, 0))
     left = failing_opens(monkeypatch, cut=2, whole=1)
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}

@@ -1,26 +1,24 @@
-"""The look that fills a :class:`v2v_server.corpus.scene.Scene`: every frame in blocks, every fourth one for motion.
+"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene`: every frame in blocks, every fourth one for motion.
 
-Cuts. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure do not
-count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
+Shot boundaries. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure
+do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
 
 - at least 2 grey levels, and 0.35 of what two unrelated pictures of the same contrasts differ by, which is of the order
   of sqrt(var m_t-1 + var m_t): it is another picture;
 - at least 3 times the median over the five steps before and after: not the pace of this shot;
 - not above twice d(t-1, t+1): the next frame does not go back, as after a flash.
 
-All of this is exact arithmetic, the same everywhere. Slow transitions (fades, dissolves) are not cuts. Motion is that
-of dense inverse search on pictures of a quarter of the size, four frames apart, rounded to 1/64 px a frame.
+All of this is exact arithmetic, the same everywhere. Slow transitions (fades, dissolves) are no shot boundaries. Motion
+is that of dense inverse search on pictures of a quarter of the size, four frames apart, rounded to 1/64 px a frame.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.corpus.scene import (
+from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
     COLUMNS,
@@ -42,9 +40,9 @@ _BLOCK_PX = 8
 _SHRINK = 4
 _MOST_OF_THE_PICTURE = 0.95
 _STILLEST = 0.1
-_LEAST_CUT_LEVELS = 2.0
-_LEAST_CUT_SHARE = 0.35
-_LEAST_CUT_RATIO = 3.0
+_LEAST_BOUNDARY_LEVELS = 2.0
+_LEAST_BOUNDARY_SHARE = 0.35
+_LEAST_BOUNDARY_RATIO = 3.0
 _NEIGHBOURS = 5
 _LARGEST_RETURN = 0.5
 
@@ -52,23 +50,15 @@ _Tiles = npt.NDArray[np.float64]
 """[16], row by row."""
 
 
-def look(pictures: Iterable[Picture]) -> Scene:
-    """The statistics of frames 0, 1, 2 ... of a video; see :class:`Look`."""
-    seen = Look()
-    for picture in pictures:
-        seen.add(picture)
-    return seen.scene()
-
-
-class Look:
-    """Watches a video go by. Memory: three pictures, and some hundred bytes a frame."""
+class SceneAnalysis:
+    """Analyse a video frame by frame. Memory: three pictures, and some hundred bytes a frame."""
 
     def __init__(self) -> None:
         self._search = dis(ULTRAFAST, 1)
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
         self._last: Picture | None = None
-        self._probe: tuple[int, Picture] | None = None  # the last frame looked at for motion, reduced
+        self._reduced: tuple[int, Picture] | None = None  # the last frame with motion measured, and its number
         self._means: list[float] = []
         self._variances: list[float] = []
         self._steps: list[float] = []  # d(t-1, t)
@@ -79,7 +69,7 @@ class Look:
         self._noises: list[tuple[int, float]] = []
 
     def add(self, picture: Picture) -> None:
-        """The next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
+        """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
         with one_thread():
             self._add(np.ascontiguousarray(picture))
 
@@ -99,26 +89,26 @@ class Look:
         if number % LAG_FRAMES == 0:
             levels = np.cumsum(np.bincount(picture.ravel(), minlength=256)) / picture.size
             self._shares.append((number, levels[DARK_BELOW_LEVEL - 1], 1 - levels[CLIPPED_FROM_LEVEL - 1]))
-            self._look_for_motion(number, picture)
+            self._measure_motion(number, picture)
         self._last = picture
 
-    def _look_for_motion(self, number: int, picture: Picture) -> None:
+    def _measure_motion(self, number: int, picture: Picture) -> None:
         reduced = _reduced(picture)
-        if self._probe is not None:
-            before, earlier = self._probe
+        if self._reduced is not None:
+            before, earlier = self._reduced
             field = self._search(earlier, reduced)
             pace = _most(np.hypot(field[..., 0], field[..., 1])) * (_SHRINK / (number - before))
             self._motions.append((before, number, pace))
-        self._probe = (number, reduced)
+        self._reduced = (number, reduced)
 
     def scene(self) -> Scene:
-        """What was seen; no frame may be added any more."""
+        """Return the statistics; no frame may be added afterwards."""
         if not self._frames:
             return Scene.unknown()
         if self._last is not None and (self._frames - 1) % LAG_FRAMES:
             with one_thread():
-                self._look_for_motion(self._frames - 1, self._last)
-        cuts = self._cuts()
+                self._measure_motion(self._frames - 1, self._last)
+        boundaries = self._shot_boundaries()
         values = np.full((-(-self._frames // SEGMENT_FRAMES), COLUMNS), np.nan)
         deviations = np.sqrt(self._variances)
         means = np.array(self._means)
@@ -128,7 +118,7 @@ class Look:
             inside = [
                 pace
                 for before, after, pace in self._motions
-                if before < high and after > low and not any(before < cut <= after for cut in cuts)
+                if before < high and after > low and not any(before < boundary <= after for boundary in boundaries)
             ]
             row[MOTION] = np.max(inside, axis=0) if inside else np.nan
             row[CHANGE] = np.max(self._changes[low:high], axis=0) if low + 1 < self._frames else 0.0
@@ -138,27 +128,27 @@ class Look:
             rippled = ripples[max(0, low - 1) : high - 1]
             row[FLICKER] = rippled.mean() if len(rippled) else 0.0
             row[NOISE] = next((noise for frame, noise in self._noises if low <= frame < high), np.nan)
-        return Scene.of(self._frames, cuts, values)
+        return Scene.of(self._frames, boundaries, values)
 
-    def _cuts(self) -> tuple[int, ...]:
-        cuts = []
+    def _shot_boundaries(self) -> tuple[int, ...]:
+        boundaries = []
         for at, step in enumerate(self._steps):  # from frame ``at`` to ``at + 1``
             contrast = self._variances[at] + self._variances[at + 1]
-            if step < _LEAST_CUT_LEVELS or step**2 < _LEAST_CUT_SHARE**2 * contrast:
+            if step < _LEAST_BOUNDARY_LEVELS or step**2 < _LEAST_BOUNDARY_SHARE**2 * contrast:
                 continue
             around = self._steps[max(0, at - _NEIGHBOURS) : at] + self._steps[at + 1 : at + 1 + _NEIGHBOURS]
-            if around and step < _LEAST_CUT_RATIO * float(np.median(around)):
+            if around and step < _LEAST_BOUNDARY_RATIO * float(np.median(around)):
                 continue
             if at < len(self._returns) and self._returns[at] < _LARGEST_RETURN * step:
                 continue  # a flash begins
             if at and self._returns[at - 1] < _LARGEST_RETURN * step:
                 continue  # it ends
-            cuts.append(at + 1)
-        return tuple(cuts)
+            boundaries.append(at + 1)
+        return tuple(boundaries)
 
 
 def _block_sums(picture: Picture) -> npt.NDArray[np.int64]:
-    """The means of the 8 x 8 blocks of a picture in 1/64 grey level; what does not fill a block is left out."""
+    """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
     height, width = picture.shape
     rows, columns = max(1, height // _BLOCK_PX), max(1, width // _BLOCK_PX)
     if height < _BLOCK_PX or width < _BLOCK_PX:
@@ -172,26 +162,26 @@ def _block_sums(picture: Picture) -> npt.NDArray[np.int64]:
 
 
 def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
-    """Mean absolute difference of block means, each picture's own mean taken off, grey levels."""
+    """Return the mean absolute difference of block means in grey levels, each picture's own mean taken off."""
     change = second - first
     count = change.size
     return float(np.abs(count * change - change.sum()).sum()) / (64 * count**2)
 
 
 def _largest(blocks: npt.NDArray[np.int64]) -> _Tiles:
-    """[16] the largest value of each tile."""
+    """Return [16], the largest value of each tile."""
     rows, columns = (np.arange(TILES) * side // TILES for side in blocks.shape)
     return np.maximum.reduceat(np.maximum.reduceat(blocks, rows, axis=0), columns, axis=1).ravel().astype(np.float64)
 
 
 def _most(pace: npt.NDArray[np.float32]) -> _Tiles:
-    """[16] what 95 % of each tile stays below."""
+    """Return [16], what 95 % of each tile stays below."""
     tiles = [part for row in _parts(pace, 0) for part in _parts(row, 1)]
     return np.array([np.quantile(tile, _MOST_OF_THE_PICTURE) for tile in tiles])
 
 
 def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.float32]]:
-    """Four parts of about equal size, of at least one row or column each."""
+    """Return four parts of about equal size, of at least one row or column each."""
     side = values.shape[axis]
     starts = [at * side // TILES for at in range(TILES)]
     ends = [max(start + 1, (at + 1) * side // TILES) for at, start in enumerate(starts)]
@@ -199,8 +189,11 @@ def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.fl
 
 
 def _noise(first: Picture, second: Picture) -> float:
-    """Standard deviation of one pixel's noise, grey levels, from the tenth of the blocks whose difference varies
-    least; motion adds to it only where no part of the picture stands still."""
+    """Return the standard deviation of one pixel's noise in grey levels.
+
+    It is measured in the tenth of the blocks whose difference varies least; motion adds to it only where no part of the
+    picture stands still.
+    """
     height, width = (max(1, side // _BLOCK_PX) for side in first.shape)
     part = np.s_[: height * _BLOCK_PX, : width * _BLOCK_PX]
     change = cv2.subtract(second[part], first[part], dtype=cv2.CV_32F)
