@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus import refresh
 from v2v_server.corpus.index.columns import VideoTable
 from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.sources.folder import Folder
 
 COUNT = 700
 
@@ -34,14 +34,14 @@ def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: 
         return VideoTable.of(rows)
 
     notices: list[str] = []
-    assert refresh._changed(tmp_path, ids, table(), notices.append) == []
+    assert refresh._changed(Folder(tmp_path), ids, table(), notices.append) == []
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 0 of them new or changed"
     known = table(300, 301)
     (tmp_path / ids[5]).write_bytes(b"x")
     (tmp_path / ids[130]).chmod(0o600)  # changes only the ctime
     (tmp_path / ids[301]).unlink()
     (tmp_path / ids[699]).unlink()
-    assert refresh._changed(tmp_path, ids, known, notices.append) == [5, 130, 300, 301, 699]
+    assert refresh._changed(Folder(tmp_path), ids, known, notices.append) == [5, 130, 300, 301, 699]
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 5 of them new or changed"
 
 
