@@ -28,6 +28,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 
@@ -93,7 +94,9 @@ def served(
 ) -> Server:
     """A server that has made one turn."""
     stale: list[str] = []
-    catalogue = SimpleNamespace(check=check, stale=stale, mark_stale=stale.append, root=folder, videos=(), refusals=())
+    catalogue = SimpleNamespace(
+        check=check, stale=stale, mark_stale=stale.append, source=Folder(folder), videos=(), refusals=()
+    )
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),

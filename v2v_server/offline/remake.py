@@ -113,7 +113,7 @@ class Remaker:
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
             try:
-                decoded = decode_for(lease, lease.indices, catalogue.root)[0]
+                decoded = decode_for(lease, lease.indices, catalogue.source)[0]
                 return RemadeSample(lease, decoded, make_sample(lease, decoded))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
@@ -208,7 +208,7 @@ def simulate_to_file(
         check_event_file(events)
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
-    quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
+    quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
         print(f"cannot be used: {refusal}")

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 
 from v2v_protocol.errors import UsageError
-from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.supervise.local_pool import Pool
 from v2v_server.supervise.protocol import Supervisor
 
 
 def make_supervisor(
-    config: ServeConfig, root: Path | Copies, label: str, flags: list[str], keys: KeyFolder | None = None
+    config: ServeConfig, source: VideoSource, label: str, flags: list[str], keys: KeyFolder | None = None
 ) -> Supervisor:
     """The supervisor that the configuration asks for.
 
     Args:
         config: of the server.
-        root: the corpus folder, or the copies of what is in object storage.
+        source: where the videos come from; workers open it by its name.
         label: prefix of the workers' names, unique to this server.
         flags: more of them for each worker.
         keys: of the server, which lends one to workers on other hosts.
@@ -29,7 +28,7 @@ def make_supervisor(
         UsageError: its engine is not installed, or there is no cluster.
     """
     if config.engine == "local":
-        return Pool(str(root), label, flags)
+        return Pool(source.name, label, flags)
     try:
         engine = import_module("v2v_server.supervise.ray_workers")
     except ModuleNotFoundError as error:
@@ -40,5 +39,5 @@ def make_supervisor(
             "pip install '.[server,ray]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
     key = None if keys is None else keys.lend(f"ray-{label}", "worker")
-    supervisor: Supervisor = engine.RayWorkers(str(root), label, flags, config.ray_address, config.ray_labels, key)
+    supervisor: Supervisor = engine.RayWorkers(source.name, label, flags, config.ray_address, config.ray_labels, key)
     return supervisor
