@@ -9,7 +9,7 @@
     broker/       which worker makes which sample for which consumer
     worker/       from a lease to its sample
     schedule/     which sequence each index is made from
-    catalogue/    which videos exist
+    corpus/       which videos exist
     store/        prepared clips, lossless
     flow/         optical flow
     simulation/   the virtual camera

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError
 from v2v_protocol.progress import Progress
+from v2v_protocol.wire import encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -28,6 +29,7 @@ from v2v_server.broker.actions import (
     Disconnect,
     GiveUp,
     ReportRefusal,
+    SendLease,
     SendStatus,
     ToConsumer,
     ToWorker,
@@ -39,9 +41,9 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
@@ -134,7 +136,7 @@ def serve(config: ServeConfig) -> None:
     for entry in quarantine.entries(quarantine.latest):
         log.say(f"in quarantine: {entry}")
     dispatcher = Dispatcher(
-        catalogue,
+        catalogue.facts,
         config.spec,
         quarantine=quarantine,
         wall_clock=_utc_now,
@@ -304,6 +306,8 @@ class Server:
                 case ToWorker() as message:
                     if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
+                case SendLease() as grant:
+                    todo.extendleft(reversed(self._complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
@@ -317,6 +321,25 @@ class Server:
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
                     todo.extend(self._publisher.ask(request))
+
+    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
+        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
+
+        Args:
+            grant: the lease.
+            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
+        """
+        try:
+            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
+        except IndexUnreadable as error:
+            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
+            later = [each for each in todo if not isinstance(each, SendLease)]
+            todo.clear()
+            todo.extend(later)
+            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
+            return []
+        except V2VError as error:
+            return self._dispatcher.lease_refused(grant, str(error), self._clock())
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

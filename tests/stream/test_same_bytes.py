@@ -17,7 +17,7 @@ from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.status.client import StatusClient
 

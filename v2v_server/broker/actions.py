@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from v2v_protocol.messages import Denied, ErrorCode
+from v2v_protocol.messages import Denied, ErrorCode, Lease
 from v2v_protocol.refusal import Refusal
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import QuarantineEntry
@@ -32,6 +33,21 @@ class ToWorker:
 
     identity: bytes
     frames: Frames
+
+
+@dataclass(frozen=True, slots=True)
+class SendLease:
+    """Complete a lease with what the index on disk holds of its video, send it, and report a failure.
+
+    Attributes:
+        worker: routing id.
+        lease: without ``frame_index`` and ``scene``.
+        spec: the spec that the lease names.
+    """
+
+    worker: bytes
+    lease: Lease
+    spec: StreamSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +124,7 @@ class SendStatus:
 
 
 Action: TypeAlias = (
-    ToConsumer | ToWorker | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
+    ToConsumer | ToWorker | SendLease | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
 )
 
 

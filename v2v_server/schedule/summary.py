@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule.sequences import SequenceTable
 
 _SHOWN = 5
@@ -27,9 +27,10 @@ def corpus_summary(
         f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
     ]
     if spec.scene != "off":
-        cut = 0 if catalogue.videos.cut is None else len(catalogue.videos.cut)
+        split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
         lines.append(
-            f"scene {spec.scene}: {cut} videos have cuts or empty parts; {table.spoilt} sequences are left out or moved"
+            f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
+            "left out or moved"
         )
     if table.refusals:
         lines.append(f"{len(table.refusals)} videos give none under the server's own recipe:")

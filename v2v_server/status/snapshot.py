@@ -20,8 +20,8 @@ from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.status.bottleneck import NOTICEABLE_SHARE, Bottleneck, Shares, find_bottleneck
 from v2v_server.status.history import TimeWindow
 from v2v_server.status.parts import (

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.protocol.wire_messages import messages
-from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL, SMALL_SPEC, corpus, video
 from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import (
@@ -45,9 +45,9 @@ from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToCon
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import MOST_FAULTS
+from v2v_server.broker.grants import work_seconds
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
-from v2v_server.broker.terms import work_seconds
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
@@ -545,6 +545,21 @@ def test_an_index_that_another_process_holds_is_no_videos_fault() -> None:
     assert not any(lease.candidate for lease in at.leases[b"w"])
     assert not trouble(at)
     assert not at.dispatcher.counters.refused_candidates
+
+
+def test_leases_that_the_index_held_back_come_first_again_in_their_order() -> None:
+    held = {"a.mp4"}
+    at = peers(corpus(video("a.mp4", frames=200), held=held))
+    at.join(b"w1")
+    at.join(b"w2")
+    at.hello(shuffle=False)
+    at.want(*range(6))
+    assert at.dispatcher.waiting == 6
+    assert not at.leases[b"w1"]
+    held.clear()
+    at.tick(0.1)
+    granted = {lease.lease: lease.indices[0] for leases in at.leases.values() for lease in leases}
+    assert [granted[number] for number in sorted(granted)] == [0, 1, 2, 3]
 
 
 def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from tests.server.corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
+from tests.server.named_corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.video.rows import Rows

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from typing import Any, cast
 
-from tests.server.corpus import corpus, video
+from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
 from tests.server.queues import Queues, ToySupervisor
 from v2v_protocol.messages import Status as StatusMessage

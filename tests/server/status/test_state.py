@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
 from tests.server.status.services import WALL, Published, View, json_of, published
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
