@@ -79,8 +79,10 @@ class Counters(WorkDone):
     refused_candidates: int = counter("Candidates skipped because their video could not be used.", is_fault=True)
     unavailable: int = counter("Samples without a usable candidate.", "unavailable_samples", is_fault=True)
     returned_leases: int = counter("Leases taken back from workers that died, hung or left.")
-    second_leases: int = counter("Samples given to a second worker because the first was slow.")
-    late_results: int = counter("Results of leases that had been taken back.")
+    second_leases: int = counter("Samples given to a second worker because the first was slow.", is_routine=True)
+    late_results: int = counter(
+        "Results of leases that had been taken back, or whose consumer had left.", is_routine=True
+    )
     workers_lost: int = counter("Workers that died or were given up.", "lost_workers", is_fault=True)
     missing_videos: int = counter(
         "Leases whose worker could not read a video that the server's host has.", is_fault=True

@@ -39,6 +39,8 @@ _MOST_STALE = 64
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0
+AWAY_SECONDS = 2.0
+"""Between two epochs a consumer is away for a shorter time."""
 RETURN_SECONDS = 60.0
 """A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
 _MOST_DEPARTED = 1024
@@ -51,7 +53,7 @@ class ConsumerTotals:
 
     Attributes:
         number: of the consumer, from 0; no other one has it.
-        since: when its first session was opened.
+        since: when it came, or returned after :data:`AWAY_SECONDS` or more.
         served: samples sent.
         waited_seconds: time that it waited for samples, as it reports.
         passed: by how many indices its position advanced, over all epochs.
@@ -192,6 +194,8 @@ class Sessions:
             display, liveness, totals = self._departed[place]
             if display == session.display and liveness.silence(session.since) < RETURN_SECONDS:
                 del self._departed[place]
+                if liveness.silence(session.since) >= AWAY_SECONDS:
+                    totals.since = session.since
                 return totals
         return ConsumerTotals(next(self._numbers), session.since)
 

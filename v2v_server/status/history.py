@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.session import AWAY_SECONDS
 from v2v_server.system.status_fields import values
 
 WINDOW_SECONDS = 10.0
 NOTE_SECONDS = 1.0
-_AWAY_SECONDS = 2.0
 _LEAST_SECONDS = 1.0
 """Shortest time that the rate of a new peer is of."""
 
@@ -114,7 +114,7 @@ class History:
 
     def is_attended(self, now: float) -> bool:
         """Return whether there is a consumer, or was a moment ago: between epochs they leave and return."""
-        return now - self._attended_at < _AWAY_SECONDS or self._dispatcher.consumers > 0
+        return now - self._attended_at < AWAY_SECONDS or self._dispatcher.consumers > 0
 
     def window(self, now: float) -> TimeWindow:
         """Return the last ten seconds, or the time since the start."""

@@ -173,9 +173,14 @@ def test_a_reconnect_continues_the_row_and_a_later_run_begins_one() -> None:
     service = published(at)
     at.join()
     (first,) = run_epochs(at, service, 1)
-    at.now += RETURN_SECONDS - 1.0
+    service.pass_seconds(RETURN_SECONDS - 1.0)
     hello(at, b"again")
-    assert service.view().consumers[0].id == first.id
+    at.consumer_says(b"again", Want(1, (0, 1), waited_seconds=0.0))
+    at.work_off()
+    service.pass_seconds(2.0)
+    again = service.view().consumers[0]
+    assert (again.id, again.served) == (first.id, 12)
+    assert again.samples_per_second == pytest.approx(1.0)  # over the time since it returned
     at.consumer_says(b"again", Goodbye(0.0))
     at.now += RETURN_SECONDS
     hello(at, b"later")

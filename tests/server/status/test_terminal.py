@@ -91,8 +91,8 @@ def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_an
 
 def test_unusual_events_are_named_once_there_are_any() -> None:
     at = peers()
-    at.dispatcher.counters.malformed, at.dispatcher.counters.second_leases = 2, 3
-    assert said(published(at).status()).endswith("faults 2  total 0 samples  3 second leases  2 malformed")
+    at.dispatcher.counters.malformed, at.dispatcher.counters.returned_leases = 2, 3
+    assert said(published(at).status()).endswith("faults 2  total 0 samples  3 returned leases  2 malformed")
 
 
 def test_a_terminal_shows_a_few_lines_in_the_place_of_the_previous_ones() -> None:

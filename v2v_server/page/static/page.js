@@ -261,8 +261,10 @@ function figures(state) {
   return fields.flatMap(({ place, name, help, unit, kind }) => {
     const part = place.split(".").reduce((found, key) => (key ? found && found[key] : found), state);
     if (kind === "text" || kind === "states" || Array.isArray(part) || !part || part[name] === null) return [];
-    const value = typeof part[name] === "number" ? number(part[name]) : String(part[name]);
-    return [[name.replaceAll("_", " "), unit && unit !== "0 to 1" ? `${value} ${unit}` : value, help]];
+    const known = part[name];
+    if (unit === "0 to 1") return [[name.replaceAll("_", " "), share(known), help]];
+    const value = Number.isInteger(known) || typeof known !== "number" ? known.toLocaleString("en") : number(known);
+    return [[name.replaceAll("_", " "), unit ? `${value} ${unit}` : value, help]];
   });
 }
 
