@@ -34,7 +34,7 @@ from v2v_server.console.waiting import Shares, Waiting, who_waits
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.store.cache import GIB
 from v2v_server.store.used import used_bytes
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.pool import Pool
 
 MOST_SHOWN = 1000
 """Workers, and as many consumers, that are told one by one; the others are only counted."""
@@ -50,7 +50,7 @@ class Service:
     """Where the state is read from.
 
     Attributes:
-        config, catalogue, dispatcher, supervisor, quarantine: of the server.
+        config, catalogue, dispatcher, pool, quarantine: of the server.
         history: of the last ten seconds.
         address, worker_address: where consumers and workers connect.
         started: when, by the clock of the loop.
@@ -59,7 +59,7 @@ class Service:
     config: ServeConfig
     catalogue: Catalogue
     dispatcher: Dispatcher
-    supervisor: Supervisor
+    pool: Pool
     quarantine: Quarantine
     history: History
     address: str
@@ -103,7 +103,7 @@ def service_state(service: Service, now: float, time: str, *, is_ready: bool) ->
         queue=dispatcher.waiting,
         queued_share=dispatcher.waiting_share,
         worker_count=dispatcher.workers,
-        worker_processes=service.supervisor.running,
+        worker_processes=service.pool.running,
         workers_wanted=config.workers,
         consumer_count=dispatcher.consumers,
         totals=_totals(dispatcher),
@@ -139,7 +139,7 @@ def _waiting(service: Service, now: float, before: Moment, last: Moment) -> Wait
         Shares.of(before, last),
         is_attended=service.history.is_attended(now) or dispatcher.consumers > 0,
         workers=dispatcher.workers,
-        starting=max(0, service.supervisor.running - dispatcher.workers),
+        starting=max(0, service.pool.running - dispatcher.workers),
         trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(service.config.workers_in_all),
         has_cache=bool(service.config.cache),
     )
@@ -181,7 +181,7 @@ def _cache(config: ServeConfig, dispatcher: Dispatcher) -> CacheState | None:
 
 
 def _workers(service: Service, now: float, before: Moment, last: Moment) -> tuple[WorkerState, ...]:
-    restarts = service.supervisor.restarts
+    restarts = service.pool.restarts
     members = list(service.dispatcher.registry.members().items())[:MOST_SHOWN]
     seconds = last.now - before.now
     return tuple(

@@ -19,7 +19,7 @@ from v2v_server.console.history import History
 from v2v_server.console.state import ServiceState
 from v2v_server.console.survey import Service, service_state
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.pool import Pool
 
 ANSWER_SECONDS = 0.4
 LARGEST_SHARE = 0.02
@@ -86,7 +86,7 @@ def make_watch(
     config: ServeConfig,
     catalogue: Catalogue,
     dispatcher: Dispatcher,
-    supervisor: Supervisor,
+    pool: Pool,
     quarantine: Quarantine,
     transport: ServerTransport,
     now: float,
@@ -94,7 +94,7 @@ def make_watch(
 ) -> Watch:
     """The watch over a server that starts at ``now``."""
     addresses = transport.address, transport.worker_address
-    service = Service(config, catalogue, dispatcher, supervisor, quarantine, History(now), *addresses, started=now)
+    service = Service(config, catalogue, dispatcher, pool, quarantine, History(now), *addresses, started=now)
     before = transport.waited_seconds
     return Watch(service, lambda: transport.waited_seconds - before, wall_clock)
 

@@ -94,8 +94,8 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
 def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     at = peers()
     watched = service(at)
-    watched.supervisor.scale(2)
-    watched.supervisor.watch(0.0, 0)
+    watched.pool.scale(2)
+    watched.pool.watch(0.0, 0)
     at.join(b"toy1")
     at.join(b"elsewhere")
     state = watched.state()

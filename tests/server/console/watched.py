@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
-from tests.server.queues import Queues, ToySupervisor
+from tests.server.queues import Queues, ToyPool
 from v2v_protocol.messages import Seen
 from v2v_protocol.wire import decode
 from v2v_server.broker.actions import Action, Show, ToConsumer, ToWorker
@@ -26,13 +26,13 @@ class Watched:
         at: whom it watches; their clock is its.
         watch: over them.
         transport: which waited for messages all the time, unless a test says otherwise.
-        supervisor: of the server's own workers.
+        pool: of the server's own workers.
     """
 
     at: Peers
     watch: Watch
     transport: Queues
-    supervisor: ToySupervisor
+    pool: ToyPool
 
     def state(self) -> ServiceState:
         return self.watch.state(self.at.now)
@@ -56,12 +56,12 @@ class Watched:
 def service(at: Peers, **settings: Any) -> Watched:
     """A watch that begins now."""
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
-    transport, supervisor = Queues(), ToySupervisor(lambda name, address: None)
+    transport, pool = Queues(), ToyPool(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    watch = make_watch(config, catalogue, at.dispatcher, supervisor, at.quarantine, transport, at.now, lambda: WALL)
+    watch = make_watch(config, catalogue, at.dispatcher, pool, at.quarantine, transport, at.now, lambda: WALL)
     watch._processor_clock = lambda: 0.0  # a slow host makes states less often
     watch.tick(at.now)
-    return Watched(at, watch, transport, supervisor)
+    return Watched(at, watch, transport, pool)
 
 
 def seen(action: ToConsumer | ToWorker) -> bytes:
