@@ -15,7 +15,7 @@ NOT_YET_REWRITTEN = (
     "v2v_server/broker/door.py",
     "v2v_server/corpus/",
     "v2v_server/cloud/",
-    "v2v_server/console/",
+    "v2v_server/status/",
     "v2v_server/system/turn_away.py",
 )
 """Folders and files that may still use them. Remove an entry once it is rewritten."""

@@ -25,11 +25,11 @@ from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
     CheckVideo,
-    CutOff,
+    Disconnect,
     GiveUp,
     ReportRefusal,
     SendLease,
-    Show,
+    SendStatus,
     ToConsumer,
     ToWorker,
 )
@@ -42,16 +42,16 @@ from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, 
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
-from v2v_server.console.progress import catalogue_progress
-from v2v_server.console.shutdown_summary import format_shutdown_summary
-from v2v_server.console.status import summary
-from v2v_server.console.terminal import make_status
-from v2v_server.console.watch import make_watch
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.status.line import summary
+from v2v_server.status.progress import catalogue_progress
+from v2v_server.status.publisher import make_publisher
+from v2v_server.status.shutdown_summary import format_shutdown_summary
+from v2v_server.status.terminal import make_status
 from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Pool
@@ -221,7 +221,9 @@ class Server:
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._status = make_status(self._log, sys.stderr)
-        self._watch = make_watch(config, catalogue, dispatcher, pool, quarantine, transport, self._clock(), _utc_now)
+        self._publisher = make_publisher(
+            config, catalogue, dispatcher, pool, quarantine, transport, self._clock(), _utc_now
+        )
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
@@ -269,14 +271,14 @@ class Server:
                 self._say(line)
             self._warn_if_blocked(now)
             self._scale(now)
-            self._carry_out([*self._watch.tick(now)])
+            self._carry_out([*self._publisher.tick(now)])
             self._show(now)
 
     def close(self) -> None:
         """Stop and end the workers, and close all connections."""
         self._status.close()
         if self._announced:
-            state = self._watch.state(self._clock())
+            state = self._publisher.state(self._clock())
             for line in format_shutdown_summary(state):
                 self._log.say(line)
             if self._log.is_json:
@@ -305,7 +307,7 @@ class Server:
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case SendLease() as grant:
                     todo.extendleft(reversed(self._complete(grant, todo)))
-                case CutOff(identity):
+                case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
@@ -316,8 +318,8 @@ class Server:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
-                case Show() as show:
-                    todo.extend(self._watch.ask(show))
+                case SendStatus() as show:
+                    todo.extend(self._publisher.ask(show))
 
     def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
         """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
@@ -441,9 +443,9 @@ class Server:
             if self._config.port_file:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
-            self._watch.is_ready = True
+            self._publisher.is_ready = True
         if self._announced and self._status.is_due(now):
-            self._status.show(now, self._watch.state(now))
+            self._status.show(now, self._publisher.state(now))
 
     def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
         """Write a log line.

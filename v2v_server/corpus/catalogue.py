@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,13 +18,14 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
 from v2v_server.corpus.corpus import Corpus, find_corpus, told
 from v2v_server.corpus.files import Notice
-from v2v_server.corpus.index.columns import Records
-from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.index.columns import VideoTable
+from v2v_server.corpus.index.file import Store
 from v2v_server.corpus.listfile import ListEntry
 from v2v_server.corpus.manifest import Header, PreparedVideo
-from v2v_server.corpus.refresh import Progress, index_path, up_to_date
-from v2v_server.corpus.scene import Scene
-from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT, check_file
 from v2v_server.store.format import PIECE_FRAMES
@@ -68,8 +69,8 @@ class Catalogue:
     _store: Store = field(repr=False, compare=False)
     _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
-    _looking: Looking | None = field(repr=False, compare=False)
-    _unseen: frozenset[str] = field(repr=False, compare=False)
+    _scenes: SceneCollection | None = field(repr=False, compare=False)
+    _unknown: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
     _long: dict[str, FrameIndex] = field(repr=False, compare=False, default_factory=dict)
 
@@ -178,12 +179,12 @@ class Catalogue:
             VideoChanged: another process has catalogued a changed file under this id since.
         """
         fingerprint = self._fingerprint(id)
-        if self._looking is None:
+        if self._scenes is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
-        if id in self._unseen:
+        if id in self._unknown:
             return Scene.unknown()
         try:
-            data = self._store.scene(id, self._files.get(id, fingerprint), self._looking.key)
+            data = self._store.figures(id, self._files.get(id, fingerprint), self._scenes.kind)
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
@@ -219,7 +220,7 @@ class Catalogue:
         number = self.videos.find(id)
         if number is None:
             raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
-        return self.videos.fingerprint(number)
+        return self.videos.fingerprints[number]
 
 
 def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
@@ -274,40 +275,35 @@ def open_catalogue(
             be used.
     """
     corpus = find_corpus(source, list_file, rows, copies_of(os.fspath(source), copies, copies_gib, cache_dir), notice)
-    looking = Looking(corpus.rows, corpus.manifest) if scene else None
+    scenes = SceneCollection(corpus.rows, corpus.manifest) if scene else None
     path = index_path(corpus.root, cache_dir)
-    store, records, notes = up_to_date(corpus.root, corpus.ids, path, looking, processes, progress, notice)
+    store, table, notes = refresh_index(corpus.root, corpus.ids, path, scenes, processes, progress, notice)
     try:
         with without_collections():
-            return _snapshot(corpus, records, notes, store, looking)
+            return _snapshot(corpus, table, notes, store, scenes)
     except BaseException:
         store.close()
         raise
 
 
-def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, looking: Looking | None) -> Catalogue:
-    root, manifest = corpus.root, corpus.manifest
+def _snapshot(
+    corpus: Corpus, on_disk: VideoTable, notes: list[str], store: Store, scenes: SceneCollection | None
+) -> Catalogue:
+    root, manifest, table = corpus.root, corpus.manifest, on_disk
     problems, files = dict(corpus.refused), dict[str, str]()
     absent: dict[str, PreparedVideo] = {}
-    on_disk = records
     if manifest is not None:
-        records = Records()
-        for record in on_disk:
-            files[record.id] = record.fingerprint
-            if not manifest.describes(record):
-                absent[record.id] = manifest.videos[record.id]
-            records.append(manifest.as_source(record))
-    elif STORE_FORMAT in records.codecs:
-        why = "is a file of a lossless corpus by itself: serve the whole folder"
-        lossless = np.flatnonzero(records.codec == records.codecs[STORE_FORMAT]).tolist()
-        records.problems.update(dict.fromkeys(lossless, why))
-    problems.update((records.ids[place], problem) for place, problem in records.problems.items())
-    usable = np.ones(len(records), bool)
-    usable[list(records.problems)] = False
-    places = np.flatnonzero(usable)
-    videos = Videos(records, places, {})
-    thresholds, shorter = _listed(corpus.listed, videos)
-    videos = Videos(records, places, thresholds)
+        records = [on_disk.row(at) for at in range(len(on_disk))]
+        files = {record.id: record.fingerprint for record in records}
+        absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
+        table = VideoTable.of(manifest.as_source(record).columns for record in records)
+    else:
+        table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
+    usable = table.problem == np.array(None)
+    problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
+    table = table.where(usable)
+    thresholds, shorter = _listed(corpus.listed, Videos(table, {}))
+    videos = Videos(table, thresholds)
     if not videos:
         raise CorpusError(f"{root}: none of {len(problems)} videos can be used{told(problems)}")
     if absent:
@@ -334,13 +330,12 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
     digest = videos.digest(corpus.rows)
-    scene_digest, unseen = None, set(absent)
-    if looking is not None:
-        used = (_of_file(records[place], files) for place in places.tolist())
-        cut, scene_digest = looking.cuts(store, used, unseen, digest)
-        videos = Videos(records, places, thresholds, cut)
-        if died := sorted(unseen - absent.keys()):
-            notes = [*notes, f"{len(died)} videos crash the decoder that looks at their scenes: {died[0]}"]
+    scene_digest, unknown = None, set(absent)
+    if scenes is not None:
+        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        videos = Videos(table, thresholds, split)
+        if died := sorted(unknown - absent.keys()):
+            notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
     return Catalogue(
         root=root,
         rows=corpus.rows,
@@ -353,14 +348,9 @@ def _snapshot(corpus: Corpus, records: Records, notes: list[str], store: Store, 
         _store=store,
         _files=files,
         _absent=absent,
-        _looking=looking,
-        _unseen=frozenset(unseen),
+        _scenes=scenes,
+        _unknown=frozenset(unknown),
     )
-
-
-def _of_file(record: IndexRow, files: Mapping[str, str]) -> IndexRow:
-    """The record under the fingerprint of the file that lies here."""
-    return replace(record, fingerprint=files.get(record.id, record.fingerprint))
 
 
 def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:

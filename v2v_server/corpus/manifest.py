@@ -23,7 +23,7 @@ from v2v_protocol.safe_json import parse_json
 from v2v_server.cloud.copies import Copies
 from v2v_server.corpus.files import UNPRINTABLE, answers, printable
 from v2v_server.corpus.index.file import IndexRow
-from v2v_server.corpus.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import is_same_file

@@ -1,4 +1,4 @@
-"""The catalogue's index on disk, brought up to date: what is new or changed is probed, what is gone is forgotten."""
+"""Bring the index of a corpus up to date: probe what is new or changed, forget what is gone."""
 
 from __future__ import annotations
 
@@ -7,36 +7,30 @@ import hashlib
 import os
 import sqlite3
 import stat
-import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from array import array
+from collections.abc import Sequence
 from contextlib import closing, suppress
-from itertools import islice, pairwise
 from pathlib import Path
 
+import numpy as np
+
 from v2v_server.cloud.copies import Copies
-from v2v_server.corpus.changed import changed
 from v2v_server.corpus.files import Notice, by_parts
-from v2v_server.corpus.index.columns import CHUNK, Records, merged
-from v2v_server.corpus.index.copy import NoCopy, Part, copied, read_copy
-from v2v_server.corpus.index.file import SCHEMA_VERSION, IndexRow, Store
+from v2v_server.corpus.index.columns import VideoTable, joined
+from v2v_server.corpus.index.file import SCHEMA_VERSION, Store
 from v2v_server.corpus.index.parts import Shard
-from v2v_server.corpus.scenes import Looking
-from v2v_server.corpus.survey import survey
+from v2v_server.corpus.probe import Progress, batches, probe_files
+from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.system.process import cache_folder, without_collections
-
-_WRITE_EVERY = 256
-_WRITE_SECONDS = 10.0
-
-Progress = Callable[[int, int], None]
-"""(files probed so far, files to probe)."""
 
 
 def index_path(
     root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None, shard: Shard | None = None
 ) -> Path:
-    """The index file of a corpus, or of a shard of it; ``cache_dir`` as in
-    :func:`v2v_server.corpus.catalogue.open_catalogue`.
+    """Return the path of the index file of a corpus, or of a shard of it.
+
+    Args:
+        cache_dir: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: none was chosen, and this user has no home folder.
@@ -46,112 +40,108 @@ def index_path(
     return cache_folder(cache_dir) / f"catalogue-{name}{of}.sqlite3"
 
 
-def up_to_date(
+def refresh_index(
     root: Path | Copies,
     ids: Sequence[str],
     path: Path,
-    looking: Looking | None,
+    scenes: SceneCollection | None,
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, Records, list[str]]:
-    """An open index that knows every id, its records, and notes for the user.
+) -> tuple[Store, VideoTable, list[str]]:
+    """Return an open index that knows every id, its table, and notes for the user.
 
-    The index is in memory, with a note, where the file cannot serve.
+    The index is in memory, with a note, where the file cannot be used.
 
     Args:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        root: the folder, or the objects, that ids are relative to.
         ids: of the videos to know.
         path: of the index.
-        looking: how to look at what the videos show; None does not.
+        scenes: how to analyse what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
     """
+    ids = sorted(set(ids))  # a list may name a video twice
     try:
-        store, records = _refreshed(path, root, ids, looking, processes, progress, notice)
+        store, table = _refreshed(path, root, ids, scenes, processes, progress, notice)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        return *_refreshed(None, root, ids, looking, processes, progress, notice), [note]
+        return *_refreshed(None, root, ids, scenes, processes, progress, notice), [note]
     if store.replaced_version is None:
-        return store, records, []
+        return store, table, []
     note = (
         f"the catalogue's index {path} was written by another release (version {store.replaced_version}, this one has "
         f"{SCHEMA_VERSION}): every video was probed again"
     )
-    return store, records, [note]
+    return store, table, [note]
 
 
 def _refreshed(
     path: Path | None,
     root: Path | Copies,
-    ids: Sequence[str],
-    looking: Looking | None,
+    ids: list[str],
+    scenes: SceneCollection | None,
     processes: int,
     progress: Progress | None,
     notice: Notice | None,
-) -> tuple[Store, Records]:
+) -> tuple[Store, VideoTable]:
     store = Store(path)
     try:
         with without_collections():
-            records, unasked, mark = _known(store, ids)
-        stale = [records.ids[at] for at in changed(root, records.ids, records.states, processes, notice)]
-        del records.states[:]
+            unasked = list[str]()
+            table = VideoTable.of(joined(ids, store.rows(), unasked))
+            stale = _changed(root, ids, table, notice)
         store.forget(_gone(root, unasked, notice))
-        with closing(survey(root, stale, processes)) as found:
-            for batch in _batches(found, len(stale), progress):
+        with closing(probe_files(root, [ids[at] for at in stale], processes)) as found:
+            for batch in batches(found, len(stale), progress):
                 store.put(batch)
-                for record in batch:
-                    place = records.ids.find(record.id)
-                    assert place is not None, record.id
-                    records.change(place, record)
-        records.fingerprints.settle()
-        if looking is not None:
-            looking.take_in(store, root, records, processes, progress)
-        _copy(store, mark)
-        return store, records
+        if stale:
+            with without_collections():
+                table = VideoTable.of(joined(ids, store.rows(), []))
+        if scenes is not None:
+            scenes.collect(store, root, table, processes, progress)
+        _remove_earlier_caches(path)
+        return store, table
     except BaseException:
         store.close()
         raise
 
 
-def _known(store: Store, ids: Sequence[str]) -> tuple[Records, list[str], str]:
-    """What the index has of these ids; other ids that it has; the mark of its state."""
-    ids = sorted(ids)
-    if any(one == next for one, next in pairwise(ids)):  # a list may name a video twice
-        ids = sorted(set(ids))
-    with store.reading() as mark:
-        unasked = list[str]()
-        with suppress(NoCopy), closing(read_copy(store.path, mark)) as parts:
-            return merged(ids, parts, unasked), unasked, mark
-        unasked = []
-        return merged(ids, _parts(store, mark), unasked), unasked, mark
+def _changed(root: Path | Copies, ids: list[str], table: VideoTable, notice: Notice | None) -> list[int]:
+    """Ask for size and times of every file; return the places of those that the table does not know as they are."""
+    folder = os.path.join(root, "")
+    listed = root.listed if isinstance(root, Copies) else None
+
+    def states(ids: Sequence[str]) -> array[int]:
+        found = array("q")
+        for id in ids:
+            if listed is not None:
+                state = listed.get(id)
+                found.extend((-1, 0, 0) if state is None else (state.size_bytes, state.mark, 0))
+                continue
+            try:
+                status = os.stat(folder + id)
+            except OSError:
+                found.extend((-1, 0, 0))
+            else:
+                found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+        return found
+
+    changed, done = list[int](), 0
+    for part, answer in by_parts(states, ids):
+        found, known = np.asarray(answer).reshape(-1, 3), table.states[done : done + len(part)]
+        changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
+        done += len(part)
+        if notice is not None:
+            notice(f"looking at files: {done} of {len(ids)}, {len(changed)} of them new or changed")
+    return changed
 
 
-def _parts(store: Store, mark: str) -> Iterator[Part]:
-    """All that the index has, of which a copy is left behind."""
-
-    def parts() -> Iterator[Part]:
-        with closing(store.rows()) as rows:
-            while chunk := list(islice(rows, CHUNK)):
-                part = Records()
-                part.extend(chunk)
-                yield part.packed()
-
-    return copied(store.path, mark, parts())
-
-
-def _copy(store: Store, mark: str) -> None:
-    """Leaves a copy behind of what the index has now, if that is not what it had."""
-    with suppress(sqlite3.Error, OSError, UnicodeDecodeError), store.reading() as now:
-        if now != mark:
-            deque(_parts(store, now), maxlen=0)
-
-
-def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> list[str]:
-    """Those of the ids of which there is no file any more. One that cannot be looked at today is not gone."""
+def _gone(root: Path | Copies, ids: Sequence[str], notice: Notice | None) -> list[str]:
+    """Return the ids whose file does not exist any more. One that cannot be asked about today is not gone."""
     if isinstance(root, Copies):
         return [id for id in ids if id not in root.listed]
 
@@ -161,26 +151,18 @@ def _gone(root: Path | Copies, ids: Iterable[str], notice: Notice | None) -> lis
         except OSError as error:
             return error.errno in (errno.ENOENT, errno.ENOTDIR)
 
-    unlisted, gone, done = sorted(ids), list[str](), 0
-    for part, those in by_parts(lambda part: list(filter(is_gone, part)), unlisted):
+    gone, done = list[str](), 0
+    for part, those in by_parts(lambda part: list(filter(is_gone, part)), ids):
         done += len(part)
         gone += those
         if notice is not None:
-            notice(f"looking for files that are gone: {done} of {len(unlisted)} that this corpus does not name")
+            notice(f"looking for files that are gone: {done} of {len(ids)} that this corpus does not name")
     return gone
 
 
-def _batches(
-    records: Iterator[IndexRow], total: int, progress: Progress | None, clock: Callable[[], float] = time.monotonic
-) -> Iterator[list[IndexRow]]:
-    """What a kill may cost is one of them."""
-    batch: list[IndexRow] = []
-    begun = clock()
-    for done, record in enumerate(records, 1):
-        batch.append(record)
-        if progress is not None:
-            progress(done, total)
-        if len(batch) == _WRITE_EVERY or clock() - begun > _WRITE_SECONDS:
-            yield batch
-            batch, begun = [], clock()
-    yield batch
+def _remove_earlier_caches(index: Path | None) -> None:
+    """Remove the files beside the index that releases before 0.2 made of it."""
+    for suffix in (".columns", ".scenes"):
+        if index is not None:
+            with suppress(OSError):
+                index.with_suffix(suffix).unlink(missing_ok=True)

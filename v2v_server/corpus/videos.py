@@ -1,4 +1,4 @@
-"""The videos of a snapshot, in columns; an entry is made when it is looked at."""
+"""The videos of a snapshot in columns; an entry is made when it is read."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import overload
 
-import numpy as np
-import numpy.typing as npt
-
 from v2v_protocol.errors import UsageError
-from v2v_server.corpus.index.columns import CHUNK, Records
-from v2v_server.corpus.index.runs import CutVideos, Runs
+from v2v_server.corpus.index.columns import CHUNK, VideoTable
+from v2v_server.corpus.scenes.runs import Runs, SplitVideos
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -25,15 +22,15 @@ class VideoEntry:
     """A video that can be used.
 
     Attributes:
-        id: relative POSIX path; its name for ever.
+        id: relative POSIX path, the video's permanent name.
         fingerprint: see :mod:`v2v_server.video.fingerprint`.
-        frames: how many frames there are to decode.
+        frames: number of frames to decode.
         width_px, height_px: size of the upright picture, before ``rows``.
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
-        runs: (first frame, frame after the last) of each stretch without a cut and with something to see; None where
-            the catalogue was opened without ``scene``.
+        runs: (first frame, frame after the last) of each stretch without a shot boundary and with something to see;
+            None where the catalogue was opened without ``scene``.
     """
 
     id: str
@@ -49,70 +46,46 @@ class VideoEntry:
 
 
 class Videos(Sequence[VideoEntry]):
-    """The usable ones among records, by id.
+    """The videos of a snapshot by id: facts in memory, looked up by number without reading the index.
 
     Args:
-        records: sorted by id.
-        places: [V] of the usable ones, rising.
-        thresholds: (positive, negative) of those that have some, by number of the video.
-        cut: the videos whose one run is not the whole of them; None where runs are not known.
+        table: the usable rows, sorted by id.
+        thresholds: (positive, negative) of videos that have some, by number.
+        split: the videos whose usable frames are not one run of all; None where that is unknown.
 
     Attributes:
-        frames, width_px, height_px: [V] of each.
-        interlaced: [V], 1 where it is.
-        cut: as given.
+        ids, fingerprints, frames, width_px, height_px, interlaced: columns, one value for each video.
+        split: as given.
     """
 
     def __init__(
-        self,
-        records: Records,
-        places: npt.NDArray[np.intp],
-        thresholds: Mapping[int, Thresholds],
-        cut: CutVideos | None = None,
+        self, table: VideoTable, thresholds: Mapping[int, Thresholds], split: SplitVideos | None = None
     ) -> None:
-        self._records, self._thresholds, self.cut = records, thresholds, cut
-        self._places = None if len(places) == len(records) else places
-        usable = slice(None) if self._places is None else self._places
-        self.frames, self.interlaced = records.frames[usable], records.interlaced[usable]
-        self.width_px, self.height_px = records.width_px[usable], records.height_px[usable]
-        self._frames_per_second = records.frames_per_second[usable]
+        self._table, self._thresholds, self.split = table, thresholds, split
+        self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
+        self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
 
     def find(self, id: str) -> int | None:
-        """The number of the video of that id; None if there is none."""
-        place = self._records.ids.find(id)
-        if place is None or self._places is None:
-            return place
-        number = int(self._places.searchsorted(place))
-        return number if number < len(self._places) and self._places[number] == place else None
-
-    def fingerprint(self, number: int) -> str:
-        """Of that video."""
-        return self._records.fingerprints[self._place(number)]
+        """Return the number of the video with an id; None if there is none."""
+        return self.ids.find(id)
 
     def digest(self, rows: Rows) -> str:
-        """32 hexadecimal digits that name these videos with these rows.
+        """Return 32 hexadecimal digits that name these videos with these rows.
 
         Fingerprints cover the track and its orientation.
         """
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        table = self._table
+        columns = table.ids, table.fingerprints, table.frames, table.width_px, table.height_px, table.frames_per_second
         for start in range(0, len(self), CHUNK):
-            numbers = range(start, min(start + CHUNK, len(self)))
-            first, last = self._place(numbers[0]), self._place(numbers[-1])
-            texts = [texts.part(first, last + 1) for texts in (self._records.ids, self._records.fingerprints)]
-            if self._places is not None:
-                those = (self._places[start : numbers.stop] - first).tolist()
-                texts = [[part[at] for at in those] for part in texts]
-            columns = (self.frames, self.width_px, self.height_px, self._frames_per_second)
-            values = [column[start : numbers.stop].tolist() for column in columns]
+            parts = [column[start : start + CHUNK] for column in columns]
+            lists = [part if isinstance(part, list) else part.tolist() for part in parts]
             lines = []
-            for number, id, mark, frames, width, height, rate in zip(numbers, *texts, *values, strict=True):
-                pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-                lines.append(f"{id}\0{mark}\0{frames}\0{width}\0{height}\0{rate}\0{pos}\0{neg}\n")
+            for number, values in enumerate(zip(*lists, strict=True), start):
+                limits = self._thresholds.get(number, NO_THRESHOLDS)
+                lines.append("\0".join(map(str, (*values, *limits))) + "\n")
             sha.update("".join(lines).encode())
         return sha.hexdigest()[:32]
-
-    def _place(self, number: int) -> int:
-        return number if self._places is None else int(self._places[number])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -134,13 +107,11 @@ class Videos(Sequence[VideoEntry]):
     def __getitem__(self, at: int | slice) -> VideoEntry | tuple[VideoEntry, ...]:
         if isinstance(at, slice):
             return tuple(self[number] for number in range(*at.indices(len(self))))
-        number = at + len(self) if at < 0 else at
-        if not 0 <= number < len(self):
-            raise IndexError(f"video {at} of {len(self)}")
-        record = self._records[self._place(number)]
+        number = range(len(self))[at]
+        record = self._table.row(number)
         pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-        runs = None if self.cut is None else self.cut.runs(number)
-        if runs is None and self.cut is not None:
+        runs = None
+        if self.split is not None and (runs := self.split.runs(number)) is None:
             runs = ((0, record.frames),)
         return VideoEntry(
             id=record.id,

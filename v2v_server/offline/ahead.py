@@ -13,8 +13,9 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.corpus import find_corpus
 from v2v_server.corpus.files import Notice, corpus_root
 from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
-from v2v_server.corpus.refresh import Progress, index_path, up_to_date
-from v2v_server.corpus.scenes import Looking
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.video.rows import Rows
 
 
@@ -95,10 +96,15 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     bucket = copies_of(os.fspath(asked.videos), asked.copies, asked.copies_gib, asked.cache_dir)
     corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    looking = Looking(corpus.rows, corpus.manifest) if asked.scene else None
+    scenes = SceneCollection(corpus.rows, corpus.manifest) if asked.scene else None
     index = index_path(corpus.root, asked.cache_dir, shard)
-    store, records, notes = up_to_date(corpus.root, ids, index, looking, asked.processes, progress, notice)
+    store, table, notes = refresh_index(corpus.root, ids, index, scenes, asked.processes, progress, notice)
     store.close()
     if notes:
         raise CorpusError(notes[0])
-    return Part(write_part(index, out, shard), len(corpus.ids), len(ids), Counter(records.problems.values()))
+    return Part(
+        write_part(index, out, shard),
+        len(corpus.ids),
+        len(ids),
+        Counter(problem for problem in table.problem if problem is not None),
+    )

@@ -26,7 +26,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import Header, PreparedVideo
 from v2v_server.corpus.manifest_writer import ManifestWriter
-from v2v_server.corpus.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files

@@ -19,7 +19,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.index.runs import CutVideos
+from v2v_server.corpus.scenes.runs import SplitVideos
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
@@ -53,14 +53,14 @@ class Columns:
         frames: int64 [N], frames of each video.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        cut: the videos whose usable runs are not just the whole video; None if runs are unknown.
+        split: the videos whose usable frames are not one run of all; None if runs are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
         if isinstance(videos, CatalogueVideos):
-            self.frames, sizes, self.cut = videos.frames, _sizes(videos.height_px, videos.width_px), videos.cut
+            self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
         else:
-            self.frames, sizes, self.cut = _columns(videos)
+            self.frames, sizes, self.split = _columns(videos)
         _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
         self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
@@ -71,15 +71,14 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
     return height_px.astype(np.int64) << 32 | width_px
 
 
-def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], CutVideos | None]:
+def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
     """Return frames, sizes, and the videos with shot boundaries."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [(place, video.runs) for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
-    known = [(place, those) for place, those in runs if those is not None]
-    return frames, sizes, CutVideos.of(known) if len(known) == len(runs) else None
+    runs = [video.runs for video in videos if video.runs is not None]
+    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
 
 
 class SequenceTable:
@@ -104,7 +103,7 @@ class SequenceTable:
 
     def __init__(self, videos: Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        if spec.scene != "off" and self._columns.cut is None:
+        if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                 "start the server with --scene auto"
@@ -168,19 +167,19 @@ class SequenceTable:
         counts = (columns.frames[first:end] - spec.recipe.frames_needed) // spec.recipe.frames_per_sequence + 1
         counts = np.minimum(np.maximum(counts, 0), spec.max_sequences_per_video)
         counts *= self._suits[columns.size[first:end]]
-        if spec.scene == "off" or columns.cut is None:
+        if spec.scene == "off" or columns.split is None:
             return counts, None
-        cut = _between(columns.cut, first, end)
+        cut = _between(columns.split, first, end)
         sequences = _CutSequences(cut, counts[cut.numbers - first], spec)
         counts[cut.numbers - first] = sequences.counts
         return counts, sequences
 
 
-def _between(cut: CutVideos, first: int, end: int) -> CutVideos:
+def _between(cut: SplitVideos, first: int, end: int) -> SplitVideos:
     """Return those of the videos ``first`` .. ``end`` - 1."""
     low, high = cut.numbers.searchsorted(np.array((first, end), np.int32)).tolist()  # int64 would convert them all
     runs = slice(*cut.bounds[[low, high]].tolist())
-    return CutVideos(
+    return SplitVideos(
         cut.numbers[low:high], cut.bounds[low : high + 1] - cut.bounds[low], cut.first[runs], cut.end[runs]
     )
 
@@ -197,7 +196,7 @@ class _CutSequences:
         counts: int64 [C], number of sequences of each video.
     """
 
-    def __init__(self, cut: CutVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
+    def __init__(self, cut: SplitVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
         self._cut, self._whole, self._stride = cut, whole, spec.recipe.frames_per_sequence
         each = np.maximum((cut.end - cut.first - spec.recipe.frames_needed) // self._stride + 1, 0)
         self._upto = np.concatenate(([0], np.cumsum(each)))  # sequences before each run, if a video may have any number

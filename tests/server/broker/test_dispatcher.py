@@ -41,7 +41,7 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import AddToQuarantine, CutOff, GiveUp, ToConsumer
+from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import MOST_FAULTS
@@ -795,7 +795,7 @@ def test_who_sends_nothing_but_nonsense_is_cut_off() -> None:
     for _ in range(MOST_FAULTS):
         (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
         assert isinstance(answer, ToConsumer)
-    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [CutOff(b"bad")]
+    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [Disconnect(b"bad")]
     at.dispatcher.consumer_gone(b"bad", 0.0)
     (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
     assert isinstance(answer, ToConsumer)

@@ -20,12 +20,12 @@ from tests.server.corpus.failing_storage import failing_opens
 from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
 from v2v_server.corpus import catalogue as catalogue_module
-from v2v_server.corpus import survey as survey_module
+from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.corpus.manifest import MANIFEST_NAME
+from v2v_server.corpus.probe import ProbeFile, probe_files
 from v2v_server.corpus.refresh import index_path
-from v2v_server.corpus.survey import Examine, survey
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -243,7 +243,7 @@ def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
     corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     path, aside = corpus / "a.mp4", corpus / "aside"
-    work = getattr(survey_module, step)
+    work = getattr(probe_module, step)
 
     def in_that_moment(of: Path) -> object:
         if of != path:
@@ -256,7 +256,7 @@ def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
             aside.rename(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(survey_module, step, in_that_moment)
+        patch.setattr(probe_module, step, in_that_moment)
         (problem,) = opener(corpus).refusals
     assert (problem.video, problem.reason) == ("a.mp4", "is no regular file")
     assert len(opener(corpus).videos) == 3
@@ -265,7 +265,7 @@ def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
 def test_a_video_that_changes_while_it_is_probed_is_probed_again(
     corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work = survey_module.facts_of
+    work = probe_module.facts_of
 
     def meanwhile(path: Path) -> object:
         facts = work(path)
@@ -274,7 +274,7 @@ def test_a_video_that_changes_while_it_is_probed_is_probed_again(
         return facts
 
     with monkeypatch.context() as patch:
-        patch.setattr(survey_module, "facts_of", meanwhile)
+        patch.setattr(probe_module, "facts_of", meanwhile)
         (problem,) = opener(corpus).refusals
     assert problem.reason == "changes while it is read; the next start tries again"
     assert [video.frames for video in opener(corpus).videos] == [12, 30, 30]
@@ -456,7 +456,7 @@ def test_a_user_without_a_home_is_told_where_to_say(tmp_path: Path, monkeypatch:
 def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
     shutil.copy(corpus / "a.mp4", corpus / "lethal.mp4")
     names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
-    records = {record.id: record for record in survey(corpus, names, 2, lethal)}
+    records = {record.id: record for record in probe_files(corpus, names, 2, lethal)}
     assert set(records) == set(names)
     assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
     assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
@@ -465,12 +465,12 @@ def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
 
 def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
     names = ["a.mp4", "sub/b.mp4"]
-    assert {record.id: record.problem for record in survey(corpus, names, 2, killed_once)} == dict.fromkeys(names)
+    assert {record.id: record.problem for record in probe_files(corpus, names, 2, killed_once)} == dict.fromkeys(names)
 
 
 @pytest.mark.parametrize(("ended", "how"), [(always_killed, "signal SIGKILL"), (always_exits, "exit status 3")])
-def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ended: Examine, how: str) -> None:
-    (record,) = survey(corpus, ["a.mp4"], 2, ended)
+def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ended: ProbeFile, how: str) -> None:
+    (record,) = probe_files(corpus, ["a.mp4"], 2, ended)
     assert f"twice ({how}), which says nothing of the file" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again
 
@@ -489,7 +489,7 @@ def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener,
 @pytest.mark.slow
 def test_a_file_that_is_waited_for_in_vain_costs_only_itself(corpus: Path) -> None:
     names = ["a.mp4", "waiting.mp4", "sub/b.mp4"]
-    records = {record.id: record for record in survey(corpus, names, 2, waiting, longest_seconds=10.0)}
+    records = {record.id: record for record in probe_files(corpus, names, 2, waiting, longest_seconds=10.0)}
     assert [id for id, record in records.items() if record.problem is not None] == ["waiting.mp4"]
     assert records["waiting.mp4"].size_bytes == -1  # to be tried again
     assert "ended after 10 s without a result; the next start" in str(records["waiting.mp4"].problem)

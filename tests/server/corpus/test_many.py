@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from v2v_server.corpus import refresh
+from v2v_server.corpus import probe
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index import columns
 from v2v_server.corpus.index.file import IndexRow, Store
 from v2v_server.corpus.refresh import index_path
 
@@ -53,7 +54,7 @@ def corpus(tmp_path: Path) -> Path:
 
 
 def test_a_video_takes_little_memory(corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refresh, "CHUNK", 64)  # as little beside this corpus as 4096 are beside a million
+    monkeypatch.setattr(columns, "CHUNK", 64)  # as little beside this corpus as 4096 are beside a million
     tracemalloc.start()
     try:
         catalogue = open_catalogue(corpus, cache_dir=tmp_path / "cache")
@@ -88,5 +89,5 @@ def test_what_stays_is_not_looked_through_again_and_again(corpus: Path, tmp_path
 def test_what_was_probed_is_written_down_after_a_while_even_if_it_is_little() -> None:
     """A kill may not cost the hours that a few long videos took."""
     seconds = iter(range(0, 1000, 4))
-    batches = refresh._batches((IndexRow(str(number), 1) for number in range(10)), 10, None, lambda: next(seconds))
+    batches = probe.batches(range(10), 10, None, lambda: next(seconds))
     assert [len(batch) for batch in batches] == [3, 3, 3, 1]

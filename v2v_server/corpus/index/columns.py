@@ -1,89 +1,59 @@
-"""Very many records side by side: one object for each column, not one for each video.
+"""The table of videos in memory: one array for each column, not one object for each video.
 
-A million videos as objects take 850 MB and half a minute; as columns a tenth of that. An object of one is made when
-somebody asks for it.
+A million videos as objects take 850 MB and half a minute; as columns a tenth of that.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from array import array
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import accumulate, chain, islice, pairwise
-from operator import itemgetter
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice, pairwise
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_server.corpus.index.file import IndexRow
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 
 CHUNK = 4096
-"""Records that are worked on at a time."""
-_NUMBERS = ("states", "_frames", "_width", "_height", "_rate", "_codec", "_interlaced")
-"""Columns that are arrays."""
+"""Rows that are converted at a time."""
+_LARGEST_RATE = 1e9
+_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it")
+"""The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
 
 
-class Texts(Sequence[str]):
-    """Texts in one piece of memory, as UTF-8, which sorts as the texts do."""
+class StringColumn(Sequence[str]):
+    """Strings in one piece of memory.
 
-    def __init__(self) -> None:
-        self._utf8 = bytearray()
-        self._ends = array("q", [0])
-        self._changed: dict[int, str] = {}
+    Args:
+        utf8: uint8, their UTF-8 one after the other, which sorts as the strings do.
+        ends: int64 [N + 1], 0 and the end of each.
+    """
 
-    def extend(self, texts: Sequence[str]) -> None:
-        """Adds texts at the end."""
-        joined = "".join(texts)
-        utf8 = joined.encode()
-        lengths = map(len, texts) if len(utf8) == len(joined) else (len(text.encode()) for text in texts)
-        self._ends.extend(islice(accumulate(lengths, initial=self._ends[-1]), 1, None))
-        self._utf8 += utf8
+    def __init__(self, utf8: npt.NDArray[np.uint8], ends: npt.NDArray[np.int64]) -> None:
+        self._utf8, self._ends = utf8, ends
 
-    def packed(self) -> list[bytes]:
-        """All of them as plain bytes, for :meth:`take_in`; equal for equal texts."""
-        self.settle()
-        return [bytes(self._utf8), self._ends.tobytes()]
+    def where(self, mask: npt.NDArray[np.bool_]) -> StringColumn:
+        """Return the strings at which the mask is set."""
+        lengths = np.diff(self._ends)
+        return StringColumn(self._utf8[np.repeat(mask, lengths)], _ends(lengths[mask]))
 
-    def take_in(self, utf8: bytes, ends: bytes) -> None:
-        """Adds those of another's :meth:`packed` at the end."""
-        self._ends.frombytes((np.frombuffer(ends, np.int64)[1:] + self._ends[-1]).tobytes())
-        self._utf8 += utf8
-
-    def change(self, place: int, text: str) -> None:
-        """Puts another text there; :meth:`settle` makes it as small as the others."""
-        self._changed[place] = text
-
-    def settle(self) -> None:
-        """Packs what was changed."""
-        if self._changed:
-            before = iter(self.part(0, len(self)))
-            self._utf8, self._ends, self._changed = bytearray(), array("q", [0]), {}
-            while chunk := list(islice(before, CHUNK)):
-                self.extend(chunk)
-
-    def part(self, start: int, end: int) -> list[str]:
-        """Those at start .. end - 1."""
-        first, last = self._ends[start], self._ends[end]
-        utf8 = self._utf8[first:last]
-        text, ends = utf8.decode(), self._ends[start : end + 1]
-        if len(text) == len(utf8):
-            found = [text[left - first : right - first] for left, right in pairwise(ends)]
-        else:
-            found = [utf8[left - first : right - first].decode() for left, right in pairwise(ends)]
-        for place, changed in self._changed.items():
-            if start <= place < end:
-                found[place - start] = changed
-        return found
-
-    def find(self, text: str) -> int | None:
-        """Where it is; None if it is not. They must be sorted."""
-        place = bisect_left(self, text)
-        return place if place < len(self) and self[place] == text else None
+    def find(self, string: str) -> int | None:
+        """Return the position of a string in a sorted column; None if it is missing."""
+        position = bisect_left(self, string)
+        return position if position < len(self) and self[position] == string else None
 
     def __len__(self) -> int:
         return len(self._ends) - 1
+
+    def __iter__(self) -> Iterator[str]:
+        for start in range(0, len(self), CHUNK):
+            yield from self[start : start + CHUNK]
 
     @overload
     def __getitem__(self, at: int) -> str: ...
@@ -94,213 +64,184 @@ class Texts(Sequence[str]):
     def __getitem__(self, at: int | slice) -> str | list[str]:
         if isinstance(at, slice):
             start, end, step = at.indices(len(self))
-            return self.part(start, max(start, end)) if step == 1 else [self[each] for each in range(start, end, step)]
+            if step != 1:
+                return [self[each] for each in range(start, end, step)]
+            ends = self._ends[start : max(start, end) + 1].tolist()
+            utf8 = self._utf8[ends[0] : ends[-1]].tobytes()
+            return [utf8[low - ends[0] : high - ends[0]].decode() for low, high in pairwise(ends)]
         if not 0 <= at < len(self):
-            raise IndexError(f"text {at} of {len(self)}")
-        if at in self._changed:
-            return self._changed[at]
-        return self._utf8[self._ends[at] : self._ends[at + 1]].decode()
+            raise IndexError(f"string {at} of {len(self)}")
+        return self._utf8[self._ends[at] : self._ends[at + 1]].tobytes().decode()
 
 
-class Records(Sequence[IndexRow]):
-    """Records of an index without frame indices, sorted by id.
+def _ends(lengths: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+    return np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoTable:
+    """Rows of an index without frame indices, sorted by id.
 
     Attributes:
-        ids, fingerprints: of each.
-        states: size, mtime and ctime of each, one after the other; empty once nobody needs them any more.
-        codecs: the names that occur; ``codec`` has the number of each record's.
-        problems: why a record cannot be used, by place.
+        ids, fingerprints: strings [N].
+        states: int64 [N, 3], size in bytes, mtime and ctime in ns of each file when it was probed.
+        frames, width_px, height_px: integers [N].
+        frames_per_second: float64 [N], NaN where unknown.
+        codec, problem: objects [N], strings; no problem is None.
+        interlaced: bool [N].
     """
 
-    def __init__(self) -> None:
-        self.ids, self.fingerprints = Texts(), Texts()
-        self.codecs: dict[str, int] = {}
-        self.problems: dict[int, str] = {}
-        self.states = array("q")
-        self._frames, self._width, self._height = array("q"), array("i"), array("i")
-        self._rate, self._codec, self._interlaced = array("d"), array("i"), array("b")
+    ids: StringColumn
+    states: npt.NDArray[np.int64]
+    fingerprints: StringColumn
+    frames: npt.NDArray[np.int64]
+    width_px: npt.NDArray[np.int32]
+    height_px: npt.NDArray[np.int32]
+    frames_per_second: npt.NDArray[np.float64]
+    codec: npt.NDArray[np.object_]
+    interlaced: npt.NDArray[np.bool_]
+    problem: npt.NDArray[np.object_]
 
-    def extend(self, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Adds rows as the index has them: the attributes of :class:`IndexRow`, but for the last one."""
-        place = len(self)
-        ids, _, _, _, fingerprints, frames, widths, heights, rates, codecs, interlaced, problems = zip(
-            *rows, strict=True
-        )
-        self.states.extend(chain.from_iterable(map(itemgetter(1, 2, 3), rows)))
-        self.ids.extend(ids)
-        self.fingerprints.extend(fingerprints)
-        self._frames.extend(frames)
-        self._width.extend(widths)
-        self._height.extend(heights)
-        self._rate.extend(rates if None not in rates else (math.nan if rate is None else rate for rate in rates))
-        numbers = {codec: self._number(codec) for codec in sorted(set(codecs))}
-        self._codec.extend(map(numbers.__getitem__, codecs))
-        self._interlaced.extend(interlaced)
-        if any(problems):
-            self.problems.update((at, problem) for at, problem in enumerate(problems, place) if problem is not None)
+    @classmethod
+    def of(cls, rows: Iterable[tuple[Any, ...]]) -> VideoTable:
+        """Make a table of rows of :meth:`v2v_server.corpus.index.file.Store.rows`.
 
-    def packed(self) -> dict[str, Any]:
-        """All of them as plain bytes, texts and numbers, for :meth:`take_in`."""
-        return {
-            "ids": self.ids.packed(),
-            "fingerprints": self.fingerprints.packed(),
-            "codecs": list(self.codecs),
-            "problems": list(self.problems.items()),
-            **{name: getattr(self, name).tobytes() for name in _NUMBERS},
-        }
-
-    def take_in(self, packed: Mapping[str, Any]) -> None:
-        """Adds those of another's :meth:`packed` at the end."""
-        place = len(self)
-        self.ids.take_in(*packed["ids"])
-        self.fingerprints.take_in(*packed["fingerprints"])
-        for name in _NUMBERS:
-            getattr(self, name).frombytes(packed[name])
-        self.problems.update((place + at, problem) for at, problem in packed["problems"])
-        numbers = [self._number(codec) for codec in packed["codecs"]]
-        if numbers != list(range(len(numbers))):
-            codec = np.frombuffer(self._codec, np.int32)[place:]
-            codec[:] = np.array(numbers, np.int32)[codec]
-
-    def rows(self) -> Iterator[tuple[Any, ...]]:
-        """What :meth:`extend` was given."""
-        names, count = list(self.codecs), len(self)
-        return zip(
-            self.ids.part(0, count),
-            self.states[::3],
-            self.states[1::3],
-            self.states[2::3],
-            self.fingerprints.part(0, count),
-            self._frames,
-            self._width,
-            self._height,
-            (None if math.isnan(rate) else rate for rate in self._rate),
-            map(names.__getitem__, self._codec),
-            self._interlaced,
-            map(self.problems.get, range(count)),
-            strict=True,
+        A damaged row becomes one that has to be probed, because SQLite accepts any type in any column.
+        """
+        ids, id_lengths, fingerprints, lengths = bytearray(), array("q"), bytearray(), array("q")
+        states, frames, width, height, rate = array("q"), array("q"), array("i"), array("i"), array("d")
+        codec, interlaced, problem = list[str](), array("b"), list[str | None]()
+        columns: list[Any] = [
+            ids,
+            id_lengths,
+            states,
+            fingerprints,
+            lengths,
+            frames,
+            width,
+            height,
+            rate,
+            codec,
+            interlaced,
+            problem,
+        ]
+        left = iter(rows)
+        while chunk := list(islice(left, CHUNK)):
+            for part in _converted(chunk):
+                for column, values in zip(columns, part, strict=True):
+                    column.extend(values)
+        return cls(
+            StringColumn(np.frombuffer(ids, np.uint8), _ends(np.asarray(id_lengths))),
+            np.asarray(states).reshape(-1, 3),
+            StringColumn(np.frombuffer(fingerprints, np.uint8), _ends(np.asarray(lengths))),
+            np.asarray(frames),
+            np.asarray(width),
+            np.asarray(height),
+            np.asarray(rate),
+            np.array(codec, object),
+            np.frombuffer(interlaced, np.bool_),
+            np.array(problem, object),
         )
 
-    def append(self, row: IndexRow) -> None:
-        """Adds one."""
-        self.extend([tuple(getattr(row, name) for name in IndexRow.__slots__[:-1])])
-
-    def _number(self, codec: str) -> int:
-        return self.codecs.setdefault(codec, len(self.codecs))
-
-    def change(self, place: int, row: IndexRow) -> None:
-        """Puts another record of the same id there; :meth:`Texts.settle` is due afterwards."""
-        self.fingerprints.change(place, row.fingerprint)
-        self._frames[place], self._width[place], self._height[place] = row.frames, row.width_px, row.height_px
-        self._rate[place] = math.nan if row.frames_per_second is None else row.frames_per_second
-        self._codec[place], self._interlaced[place] = self._number(row.codec), row.interlaced
-        self.problems.pop(place, None)
-        if row.problem is not None:
-            self.problems[place] = row.problem
-
-    @property
-    def frames(self) -> npt.NDArray[np.int64]:
-        """[N] of each."""
-        return np.frombuffer(self._frames, np.int64)
-
-    @property
-    def width_px(self) -> npt.NDArray[np.int32]:
-        """[N] of each."""
-        return np.frombuffer(self._width, np.int32)
-
-    @property
-    def height_px(self) -> npt.NDArray[np.int32]:
-        """[N] of each."""
-        return np.frombuffer(self._height, np.int32)
-
-    @property
-    def frames_per_second(self) -> npt.NDArray[np.float64]:
-        """[N] of each, NaN where unknown."""
-        return np.frombuffer(self._rate, np.float64)
-
-    @property
-    def codec(self) -> npt.NDArray[np.int32]:
-        """[N], number of each one's name."""
-        return np.frombuffer(self._codec, np.int32)
-
-    @property
-    def interlaced(self) -> npt.NDArray[np.int8]:
-        """[N], 1 where it is."""
-        return np.frombuffer(self._interlaced, np.int8)
+    def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
+        """Return the rows at which the mask is set."""
+        if mask.all():
+            return self
+        columns: list[Any] = [getattr(self, name) for name in self.__slots__]
+        columns = [column.where(mask) if isinstance(column, StringColumn) else column[mask] for column in columns]
+        return VideoTable(*columns)
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.frames)
 
-    @overload
-    def __getitem__(self, at: int) -> IndexRow: ...
-
-    @overload
-    def __getitem__(self, at: slice) -> list[IndexRow]: ...
-
-    def __getitem__(self, at: int | slice) -> IndexRow | list[IndexRow]:
-        if isinstance(at, slice):
-            return [self[place] for place in range(*at.indices(len(self)))]
-        rate = self._rate[at]
+    def row(self, at: int) -> IndexRow:
+        """Return one row, without its frame index."""
+        size, mtime, ctime = self.states[at].tolist()
+        rate = float(self.frames_per_second[at])
         return IndexRow(
-            self.ids[at],
-            0,
+            id=self.ids[at],
+            size_bytes=size,
+            mtime_ns=mtime,
+            ctime_ns=ctime,
             fingerprint=self.fingerprints[at],
-            frames=self._frames[at],
-            width_px=self._width[at],
-            height_px=self._height[at],
+            frames=int(self.frames[at]),
+            width_px=int(self.width_px[at]),
+            height_px=int(self.height_px[at]),
             frames_per_second=None if math.isnan(rate) else rate,
-            codec=self.codec_name(at),
-            interlaced=bool(self._interlaced[at]),
-            problem=self.problems.get(at),
+            codec=self.codec[at],
+            interlaced=bool(self.interlaced[at]),
+            problem=self.problem[at],
         )
 
-    def codec_name(self, at: int) -> str:
-        """FFmpeg's name of its format."""
-        return next(islice(self.codecs, self._codec[at], None))
+
+def _converted(rows: list[tuple[Any, ...]]) -> Iterator[tuple[Sequence[Any], ...]]:
+    """Yield rows as columns in the order of the fields of :class:`VideoTable`, in as few parts as damage allows."""
+    try:
+        yield _columns(rows)
+    except (TypeError, AttributeError, ValueError, OverflowError):
+        if len(rows) == 1:
+            yield _columns([(rows[0][0], *_UNREADABLE)])
+        else:
+            for row in rows:
+                yield from _converted([row])
 
 
-def merged(ids: Sequence[str], parts: Iterable[Mapping[str, Any]], unasked: list[str]) -> Records:
-    """The record of each id; with a size of -1, which no file has, where there is none.
+def _columns(rows: list[tuple[Any, ...]]) -> tuple[Sequence[Any], ...]:
+    """Convert rows to columns.
+
+    Raises:
+        TypeError, AttributeError, ValueError, OverflowError: no probe writes such a row.
+    """
+    ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates, codecs, interlaced, problems = zip(
+        *rows, strict=True
+    )
+    usable = np.array([problem is None for problem in problems])
+    numbers = array("q", frames), array("i", widths), array("i", heights)
+    for column, most in zip(numbers, (LARGEST_FRAMES, LARGEST_SIDE_PX, LARGEST_SIDE_PX), strict=True):
+        values = np.asarray(column)
+        if (values < usable).any() or (values > most).any():
+            raise ValueError
+    rate = array("d", [math.nan if rate is None else rate for rate in rates])
+    if (np.asarray(rate) < 0).any() or (np.asarray(rate) > _LARGEST_RATE).any():
+        raise ValueError
+    if not {0, 1}.issuperset(interlaced) or not {str, type(None)}.issuperset(map(type, problems)):
+        raise ValueError
+    utf8 = [[string.encode() for string in strings] for strings in (ids, fingerprints)]
+    return (
+        b"".join(utf8[0]),
+        array("q", map(len, utf8[0])),
+        array("q", chain.from_iterable(zip(sizes, mtimes, ctimes, strict=True))),
+        b"".join(utf8[1]),
+        array("q", map(len, utf8[1])),
+        *numbers,
+        rate,
+        list(map(sys.intern, codecs)),
+        array("b", interlaced),
+        list(problems),
+    )
+
+
+def joined(
+    ids: Sequence[str], rows: Iterable[tuple[Any, ...]], unasked: list[str], missing: tuple[Any, ...] = _UNREADABLE
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the row of each id.
 
     Args:
         ids: sorted, each once.
-        parts: of the index, :meth:`Records.packed`, sorted.
-        unasked: receives the ids of all other records.
-    """
-    records, at = Records(), 0
-    for packed in parts:
-        part = Records()
-        part.take_in(packed)
-        asked = ids[at : (end := bisect_right(ids, part.ids[len(part) - 1], at))]
-        at = end
-        names = Texts()
-        names.extend(asked)
-        if names.packed() == packed["ids"]:
-            records.take_in(packed)
-        elif rows := list(joined(asked, part.rows(), unasked)):
-            records.extend(rows)
-    for start in range(at, len(ids), CHUNK):
-        records.extend(list(joined(ids[start : start + CHUNK], iter(()), unasked)))
-    return records
-
-
-def joined(ids: Sequence[str], rows: Iterator[tuple[Any, ...]], unasked: list[str]) -> Iterator[tuple[Any, ...]]:
-    """The row of each id, both sorted; with a size of -1, which no file has, where there is none.
-
-    Args:
+        rows: sorted by their first column, the id.
         unasked: receives the ids of all other rows.
+        missing: the columns after the id where there is no row.
     """
-    nothing = (-1, 0, 0, "", 0, 0, 0, None, "", 0, None)
-    row = next(rows, None)
+    left = iter(rows)
+    row = next(left, None)
     for id in ids:
         while row is not None and row[0] < id:
             unasked.append(row[0])
-            row = next(rows, None)
+            row = next(left, None)
         if row is not None and row[0] == id:
             yield row
-            row = next(rows, None)
+            row = next(left, None)
         else:
-            yield id, *nothing
-    while row is not None:
-        unasked.append(row[0])
-        row = next(rows, None)
+            yield id, *missing
+    if row is not None:
+        unasked += [row[0] for row in chain((row,), left)]

@@ -8,25 +8,19 @@ alone, it does not matter which of them wrote it.
 
 from __future__ import annotations
 
-import os
 import sqlite3
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from v2v_server.system.private import make_private
-from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 
 SCHEMA_VERSION = 5
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
 
-MARKED_FROM = 10_000
-"""Records from which on it is worth knowing that nothing has changed."""
 _BUSY_SECONDS = 30.0
-_HEADER_BYTES = 100  # of a SQLite file, see its format
-_WAL = 2
 _TABLE = """
 CREATE TABLE video (
     id TEXT PRIMARY KEY,
@@ -44,29 +38,45 @@ CREATE TABLE video (
     frame_index BLOB
 )"""
 
-_SOUND = f"""
-    typeof(id) = 'text' AND typeof(fingerprint) = 'text' AND typeof(codec) = 'text'
-    AND typeof(size_bytes) = 'integer' AND typeof(mtime_ns) = 'integer' AND typeof(ctime_ns) = 'integer'
-    AND typeof(interlaced) = 'integer' AND interlaced IN (0, 1)
-    AND typeof(frames) = 'integer' AND typeof(width_px) = 'integer' AND typeof(height_px) = 'integer'
-    AND (frames_per_second IS NULL OR typeof(frames_per_second) = 'real' AND frames_per_second BETWEEN 0 AND 1e9)
-    AND CASE WHEN problem IS NULL THEN
-        frames BETWEEN 1 AND {LARGEST_FRAMES} AND width_px BETWEEN 1 AND {LARGEST_SIDE_PX}
-        AND height_px BETWEEN 1 AND {LARGEST_SIDE_PX} AND typeof(frame_index) IN ('blob', 'null')
-    ELSE
-        typeof(problem) = 'text' AND frames BETWEEN 0 AND {LARGEST_FRAMES}
-        AND width_px BETWEEN 0 AND {LARGEST_SIDE_PX} AND height_px BETWEEN 0 AND {LARGEST_SIDE_PX}
-    END"""
-"""Records that :meth:`Store.put` can have written: SQLite takes any type in any column."""
-
-_SCENES = """
-CREATE TABLE IF NOT EXISTS scene (
+_FIGURES = """
+CREATE TABLE IF NOT EXISTS figures (
+    kind TEXT NOT NULL,
+    version TEXT NOT NULL,
     id TEXT NOT NULL,
     fingerprint TEXT NOT NULL,
-    look TEXT NOT NULL,
+    summary BLOB NOT NULL,
     data BLOB NOT NULL,
-    PRIMARY KEY (id, look)
+    PRIMARY KEY (kind, version, id)
 )"""
+
+
+@dataclass(frozen=True, slots=True)
+class FigureKind:
+    """Figures of one kind.
+
+    Attributes:
+        name: what was measured, such as "scene".
+        version: how it was measured, and on which part of the pictures. Figures of other versions do not count.
+    """
+
+    name: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures of a video.
+
+    Attributes:
+        id, fingerprint: of the video.
+        summary: what a start reads of every video.
+        data: all figures, encoded.
+    """
+
+    id: str
+    fingerprint: str
+    summary: bytes
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +108,18 @@ class IndexRow:
     problem: str | None = None
     frame_index: bytes | None = None
 
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        """Return the attributes without the frame index."""
+        return tuple(getattr(self, name) for name in _COLUMNS)
 
-_COLUMNS = ", ".join(name for name in IndexRow.__slots__ if name != "frame_index")
+
+_COLUMNS = IndexRow.__slots__[:-1]
+_FIGURE_COLUMNS = "kind", "version", "id", "fingerprint", "summary", "data"
+
+
+def _insert(table: str, columns: Sequence[str]) -> str:
+    return f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
 
 
 class Store:
@@ -150,42 +170,16 @@ class Store:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
     def rows(self) -> Generator[tuple[Any, ...], None, None]:
-        """Yield all sound records by id, as the attributes of :class:`IndexRow` without their frame indices.
+        """Yield all records by id, as the attributes of :class:`IndexRow` without their frame indices.
 
-        Damaged ones are left out, so that their files are probed again.
+        Another program may have put any type into any column but the id.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        query = f"SELECT {_COLUMNS} FROM video WHERE {_SOUND} ORDER BY id"
+        query = f"SELECT {', '.join(_COLUMNS)} FROM video WHERE typeof(id) = 'text' ORDER BY id"
         with closing(self._database.execute(query)) as rows:
             yield from rows
-
-    @contextmanager
-    def reading(self) -> Iterator[str]:
-        """Nobody writes meanwhile. Gives the mark of the state that the index is in: two that are equal are of equal
-        contents. Empty where it has none: in memory, with a write-ahead log, and where it is small.
-
-        Raises:
-            sqlite3.Error, OSError: the file is damaged or cannot be read, or is held by another process for too long.
-        """
-        self._database.execute("BEGIN")
-        try:
-            query = f"SELECT 1 FROM video LIMIT 1 OFFSET {MARKED_FROM - 1}"
-            is_large = self._database.execute(query).fetchone() is not None  # only this takes the lock
-            yield self._mark() if is_large else ""
-        finally:
-            self._database.rollback()
-
-    def _mark(self) -> str:
-        if self.path is None:
-            return ""
-        with self.path.open("rb") as file:
-            head, status = file.read(_HEADER_BYTES), os.fstat(file.fileno())
-        if len(head) < _HEADER_BYTES or _WAL in head[18:20]:
-            return ""
-        changes = int.from_bytes(head[24:28], "big")  # counts transactions that wrote
-        return f"{SCHEMA_VERSION} {status.st_ino} {status.st_size} {status.st_mtime_ns} {changes}"
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
         """The encoded frame index of a file; None if the index does not know that state of it.
@@ -205,25 +199,57 @@ class Store:
         row = self._database.execute("SELECT size_bytes, mtime_ns FROM video WHERE id = ?", (id,)).fetchone()
         return None if row is None else (row[0], row[1])
 
-    def not_looked_at(self, look: str) -> list[str]:
-        """The sound files whose scene is not known as they are.
-
-        Args:
-            look: how and at which rows, see :class:`v2v_server.corpus.scenes.Looking`.
+    def make_figures(self) -> bool:
+        """Make the table of figures if it is missing; return whether there is also a table of an earlier release.
 
         Raises:
-            sqlite3.Error: the file is damaged or cannot be written.
+            sqlite3.Error: as for :meth:`put`.
         """
-        self._database.execute(_SCENES)
-        query = (
-            "SELECT video.id FROM video LEFT JOIN scene ON scene.id = video.id AND scene.look = ? "
-            "AND scene.fingerprint = video.fingerprint WHERE scene.id IS NULL AND video.problem IS NULL "
-            "ORDER BY video.id"
-        )
-        return [id for (id,) in self._database.execute(query, (look,))]
+        self._database.execute(_FIGURES)
+        return _has_table(self._database, "scene")
 
-    def scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
-        """The encoded scene of a file; None if the index has none of that state of it.
+    def summaries(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
+        """Yield (id, summary) of each video whose figures are those of its present fingerprint, sorted by id.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        yield from self._figures("summary", kind)
+
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
+        """Yield (id, summary, encoded figures) like :meth:`summaries`."""
+        yield from self._figures("summary, data", kind)
+
+    def _figures(self, columns: str, kind: FigureKind) -> Generator[tuple[Any, ...], None, None]:
+        query = (
+            f"SELECT id, {columns} FROM video JOIN figures USING (id, fingerprint) WHERE kind = ? AND version = ? "
+            "AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY id"
+        )
+        with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
+            yield from rows
+
+    def figures(self, id: str, fingerprint: str, kind: FigureKind) -> bytes | None:
+        """Return the encoded figures of a video; None if the index has none of this state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT data FROM figures WHERE id = ? AND fingerprint = ? AND kind = ? AND version = ?"
+        return _blob(self._database.execute(query, (id, fingerprint, kind.name, kind.version)).fetchone())
+
+    def put_figures(self, kind: FigureKind, figures: Iterable[Figures]) -> None:
+        """Add or replace figures, in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        rows = [(kind.name, kind.version, each.id, each.fingerprint, each.summary, each.data) for each in figures]
+        self._change(_insert("figures", _FIGURE_COLUMNS), rows)
+
+    def earlier_scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
+        """Return the encoded scene of a video in the table of releases before 0.2; None if there is none.
+
+        The table stays as it is for servers of these releases that share the file.
 
         Raises:
             sqlite3.Error: the file is damaged.
@@ -231,48 +257,37 @@ class Store:
         query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
         return _blob(self._database.execute(query, (id, fingerprint, look)).fetchone())
 
-    def put_scenes(self, scenes: Iterable[tuple[str, str, str, bytes]]) -> None:
-        """Add or replace (id, fingerprint, look, encoded scene), in one transaction.
-
-        Raises:
-            sqlite3.Error: as for :meth:`put`.
-        """
-        self._change("INSERT OR REPLACE INTO scene (id, fingerprint, look, data) VALUES (?, ?, ?, ?)", list(scenes))
-
     def put(self, records: Iterable[IndexRow]) -> None:
         """Add or replace records, in one transaction.
 
         Raises:
             sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
         """
-        rows = [tuple(getattr(record, name) for name in IndexRow.__slots__) for record in records]
-        places = ", ".join("?" * len(IndexRow.__slots__))
-        self._change(f"INSERT OR REPLACE INTO video ({_COLUMNS}, frame_index) VALUES ({places})", rows)
+        rows = [(*record.columns, record.frame_index) for record in records]
+        self._change(_insert("video", IndexRow.__slots__), rows)
 
-    def take_in(self, path: Path) -> int:
-        """Adds or replaces all that another index knows, in one transaction.
+    def merge(self, path: Path) -> int:
+        """Add or replace all that another index knows, in one transaction.
 
         Returns:
-            how many records it has.
+            the number of its records.
 
         Raises:
-            ValueError: it is an index of another version, or none.
-            sqlite3.Error: it is damaged; or as for :meth:`put`.
+            ValueError: the file is no index of this version.
+            sqlite3.Error: the file is damaged; or as for :meth:`put`.
         """
-        # Immutable: it may lie where SQLite's locks do not work.
+        # Immutable: the file may be on storage where SQLite's locks do not work.
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as other:
             (version,) = other.execute("PRAGMA user_version").fetchone()
             if version != SCHEMA_VERSION:
                 raise ValueError(f"is an index of version {version}, this program reads {SCHEMA_VERSION}")
-            self._database.execute(_SCENES)
+            self.make_figures()
             self._database.execute("BEGIN IMMEDIATE")
             with self._database:
-                for table, columns in ("video", f"{_COLUMNS}, frame_index"), ("scene", "id, fingerprint, look, data"):
-                    if other.execute("SELECT 1 FROM sqlite_master WHERE name = ?", (table,)).fetchone() is None:
-                        continue
-                    places = ", ".join("?" * (columns.count(",") + 1))
-                    rows = other.execute(f"SELECT {columns} FROM {table}")
-                    self._database.executemany(f"INSERT OR REPLACE INTO {table} ({columns}) VALUES ({places})", rows)
+                for table, columns in ("video", IndexRow.__slots__), ("figures", _FIGURE_COLUMNS):
+                    if _has_table(other, table):
+                        rows = other.execute(f"SELECT {', '.join(columns)} FROM {table}")
+                        self._database.executemany(_insert(table, columns), rows)
             return int(other.execute("SELECT COUNT(*) FROM video").fetchone()[0])
 
     def forget(self, ids: Iterable[str]) -> None:
@@ -305,6 +320,13 @@ class Store:
     def close(self) -> None:
         """Close the file."""
         self._database.close()
+
+
+def _has_table(database: sqlite3.Connection, name: str) -> bool:
+    return (
+        database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone()
+        is not None
+    )
 
 
 def _blob(row: tuple[Any] | None) -> bytes | None:

@@ -134,7 +134,7 @@ def take_in_parts(index: Path, parts: list[Path]) -> int:
     with closing(store):
         for part in parts:
             try:
-                records += store.take_in(part)
+                records += store.merge(part)
             except ValueError as error:
                 raise CorpusError(f"{part}: {error}; make that shard again with this program") from error
             except sqlite3.Error as error:
