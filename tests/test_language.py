@@ -14,7 +14,6 @@ NOT_YET_REWRITTEN = (
     "v2v_client/position/",
     "v2v_server/broker/door.py",
     "v2v_server/corpus/",
-    "v2v_server/supervise/",
     "v2v_server/system/turn_away.py",
 )
 """Folders and files that may still use them. Remove an entry once it is rewritten."""
