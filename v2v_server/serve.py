@@ -390,9 +390,10 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
         except (VideoChanged, VideoGone):
-            self._catalogue.mark_stale(missing.video)
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -401,8 +402,9 @@ class Server:
             self._missing_told = now
             name = clean_name(self._name(missing.identity).decode())
             is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
-                f"worker {name} failed on {missing.video}, which "
+                f"worker {name} failed on {file}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",

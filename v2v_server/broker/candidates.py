@@ -126,11 +126,14 @@ class Candidates:
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions
+        return [*actions, *self.fail(request, "; ".join(dict.fromkeys(map(str, passed_over.refusals))))]
+
+    def fail(self, request: Request, text: str) -> list[Action]:
+        """Tell the consumer that a sample is unavailable, without blaming its video."""
         if not self._sessions.mark_answered(request, 0.0):
-            return actions
+            return []
         self._counters.unavailable += 1
-        text = "; ".join(dict.fromkeys(map(str, passed_over.refusals)))
-        return [*actions, ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
+        return [ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
 
 
 def next_candidate(request: Request, refusal: Refusal) -> Request:

@@ -380,7 +380,7 @@ class Dispatcher:
             now: monotonic time, seconds.
         """
         if not found:
-            return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._grants.assign(now)]
+            return [*self._blame(missing), *self._grants.assign(now)]
         self.counters.missing_videos += 1
         self.registry.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)
@@ -477,12 +477,23 @@ class Dispatcher:
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
             return self._grants.assign(now)
+        video, sidecar = self.candidates.sequence(session, request).video, failed.sidecar
+        fingerprint = self._facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
+        failure = CheckVideo(
+            video.id, fingerprint or "", identity, failed.frame, failed.reason, request, sidecar if fingerprint else ""
+        )
         if not failed.here:
             self.registry.can_work(identity)
-            return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._grants.assign(now)]
-        # The catalogue lists this host's files: if the video is here, other workers can probably read it.
-        video = self.candidates.sequence(session, request).video
-        return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
+            return [*self._blame(failure), *self._grants.assign(now)]
+        # The catalogue lists this host's files: if the file is here, other workers can probably read it.
+        return [failure]
+
+    def _blame(self, failure: CheckVideo) -> list[Action]:
+        """Refuse a video. A sidecar never changes which video is shown: its consumer gets an error instead."""
+        if failure.sidecar:
+            text = f"{failure.video}: its sidecar {failure.sidecar}: {failure.reason}"
+            return self.candidates.fail(failure.request, text)
+        return self.candidates.refuse(failure.request, failure.frame, failure.reason)
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
         """Charge a consumer for a sample that it asked for and then abandoned."""

@@ -29,7 +29,7 @@ from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -92,6 +92,7 @@ class Remaker:
         Raises:
             UsageError: an index outside the epoch.
             SampleUnavailable: no candidate could give the sample.
+            SidecarError: a file beside the video, which an array is made from, cannot be used.
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
@@ -114,7 +115,8 @@ class Remaker:
             )
             try:
                 decoded = decode_for(lease, lease.indices, catalogue.source)[0]
-                return RemadeSample(lease, decoded, make_sample(lease, decoded))
+                with open_sidecars(lease, catalogue.source) as sidecars:
+                    return RemadeSample(lease, decoded, make_sample(lease, decoded, sidecars=sidecars))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise

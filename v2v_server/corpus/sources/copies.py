@@ -15,22 +15,28 @@ import hashlib
 import os
 import time
 from array import array
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import islice, takewhile
 from pathlib import Path, PurePosixPath
 from typing import IO
+from zipfile import Path as ZipPath
+from zipfile import ZipFile
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoGone, VideoUnreadable
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.sources.bucket import Bucket, is_url
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name, printable
+from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
+from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
 from v2v_server.store.used import PARTIAL, locked_use
 from v2v_server.system.private import make_private, open_private
 from v2v_server.system.process import cache_folder
-from v2v_server.video.fingerprint import fingerprint as fingerprint_of
+from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 from v2v_server.video.fingerprint import is_same_file
 
 _SLOTS = 64
@@ -68,7 +74,7 @@ class Copies(VideoSource):
     ) -> None:
         super().__init__(bucket.url, listed)
         self.bucket, self.copies, self.most_bytes = bucket, copies, most_bytes
-        self._at_hand: tuple[tuple[str, str], IO[bytes]] | None = None
+        self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
 
     def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int]]:
         return Copies, (self.bucket, self.copies, self.most_bytes)
@@ -81,6 +87,10 @@ class Copies(VideoSource):
             CorpusError: they cannot be listed.
         """
         return self.bucket.objects()
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return sorted(self._objects)
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the objects that a folder would list as videos, see :meth:`VideoSource.videos`."""
@@ -142,32 +152,55 @@ class Copies(VideoSource):
             VideoGone, VideoChanged: the object is gone, or another one by now.
         """
         try:
-            found = self.bucket.state(id, tries=1)
+            if is_sidecar(id):
+                found = self.bucket.find(id) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
+                changed = state_text(sorted(found.items())) != self.sidecar_states([id])[0]
+            else:
+                changed = self.bucket.state(id, tries=1) != state and state is not None
         except VideoGone:
             raise
         except VideoUnreadable:
             return
-        if state is not None and found != state:
+        if changed:
             raise VideoChanged(id, None, f"changed in {self} since it was catalogued")
 
-    def has(self, id: str, fingerprint: str) -> bool:
-        """Return whether the copy is there. If so, it stays until the next one is asked for, or fetched."""
-        if self._at_hand is not None and self._at_hand[0] == (id, fingerprint):
-            return True
-        held = self._hold(self._path(id, fingerprint))
-        if held is not None:
-            self._keep(id, fingerprint, held)
-        return held is not None
+    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
+        """Return texts that stand for the listed objects' states, see :meth:`VideoSource.sidecar_states`."""
+        return [state_text([(name[len(id) :], self._objects[name]) for name in self._below(id)]) for id in ids]
 
-    def fetch(self, id: str, fingerprint: str) -> None:
-        """Fetch the copy if it is missing; afterwards :meth:`has` returns True.
+    def _below(self, id: str) -> Iterator[str]:
+        """Yield the names of the listed objects of a sidecar, sorted."""
+        start = bisect_left(self._names, id)
+        if id.endswith("/"):
+            yield from takewhile(lambda name: name.startswith(id), islice(self._names, start, None))
+        elif id in self._objects:
+            yield id
+
+    def has(self, files: Mapping[str, str]) -> bool:
+        """Return whether the copies are there. If so, they stay until others are asked for, or fetched."""
+        if self._at_hand.keys() == files.items():
+            return True
+        held: dict[tuple[str, str], IO[bytes]] = {}
+        for id, fingerprint in files.items():
+            copy = self._hold(self._path(id, fingerprint))
+            if copy is None:
+                _close(held)
+                return False
+            held[id, fingerprint] = copy
+        self.release()
+        self._at_hand = held
+        return True
+
+    def fetch(self, files: Mapping[str, str]) -> None:
+        """Fetch the copies that are missing; afterwards :meth:`has` returns True.
 
         Raises:
-            VideoUnreadable: it cannot be had.
-            VideoChanged: the object is another one by now.
+            VideoUnreadable: one cannot be had.
+            VideoChanged: an object is another one by now.
         """
         self.release()
-        self._keep(id, fingerprint, self._get(id, fingerprint))
+        for id, fingerprint in files.items():
+            self._at_hand[id, fingerprint] = self._get(id, fingerprint)
 
     @contextlib.contextmanager
     def open_local(self, id: str, fingerprint: str) -> Iterator[Path]:
@@ -179,22 +212,20 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable, VideoChanged: see :meth:`fetch`.
         """
-        if fingerprint and self.has(id, fingerprint):
+        if (id, fingerprint) in self._at_hand:
             yield self._path(id, fingerprint)
             return
-        self.release()
-        with self._get(id, fingerprint) as held:
+        held = self._hold(self._path(id, fingerprint)) if fingerprint else None
+        if held is None:
+            self.release()
+            held = self._get(id, fingerprint)
+        with held:
             yield Path(held.name)
 
-    def _keep(self, id: str, fingerprint: str, held: IO[bytes]) -> None:
-        self.release()
-        self._at_hand = (id, fingerprint), held
-
     def release(self) -> None:
-        """Allow eviction of the copy that :meth:`has` or :meth:`fetch` keeps."""
-        if self._at_hand is not None:
-            self._at_hand[1].close()
-            self._at_hand = None
+        """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
+        _close(self._at_hand)
+        self._at_hand = {}
 
     def _path(self, id: str, fingerprint: str) -> Path:
         mark = "-".join(fingerprint.split("-")[:2])  # what a file's head and tail tell
@@ -241,9 +272,12 @@ class Copies(VideoSource):
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
         try:
             make_private(slot)
-            self.bucket.fetch(id, slot)
+            if id.endswith("/"):
+                self._pack(id, slot)
+            else:
+                self.bucket.fetch(id, slot)
             slot.chmod(0o600)  # where the store's own tools put another file there
-            found = fingerprint_of(slot)
+            found = self._fingerprint(id, slot)
             if fingerprint and not is_same_file(found, fingerprint):
                 why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
                 raise VideoChanged(id, None, why)
@@ -257,6 +291,25 @@ class Copies(VideoSource):
             return held
         finally:
             slot.unlink(missing_ok=True)
+
+    def _pack(self, id: str, slot: Path) -> None:
+        """Fetch a folder into one file, a ZIP archive without compression."""
+        part = slot.with_suffix(".part")
+        try:
+            with ZipFile(slot, "w") as packed:
+                for name in self.bucket.find(id):
+                    self.bucket.fetch(f"{id}{name}", part)
+                    packed.write(part, name)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def _fingerprint(self, id: str, slot: Path) -> str:
+        if not is_sidecar(id):
+            return video_fingerprint(slot)
+        if not id.endswith("/"):
+            return sidecar_fingerprint(slot)
+        with ZipFile(slot) as packed:
+            return sidecar_fingerprint(ZipPath(packed))
 
     def _place(self, id: str, slot: Path, path: Path) -> None:
         """Give the fetched file its name. If space runs out, evict copies without a reader, least recently read first.
@@ -296,6 +349,11 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
     copies = Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
     copies.make()
     return copies
+
+
+def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:
+    for file in held.values():
+        file.close()
 
 
 def _lock(file: IO[bytes], end: float) -> bool:
