@@ -25,9 +25,10 @@ from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine.file import read_quarantine
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 

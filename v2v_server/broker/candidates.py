@@ -16,8 +16,8 @@ from v2v_protocol.wire import encode
 from v2v_server.broker.actions import Action, AddToQuarantine, ReportRefusal, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import VideoSequence
 

@@ -12,10 +12,10 @@ from v2v_protocol.messages import ErrorCode, Status
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker, denial
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.history import History
 from v2v_server.status.snapshot import Service, service_state
 from v2v_server.status.state import ServiceState

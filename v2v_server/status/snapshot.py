@@ -15,11 +15,11 @@ from pathlib import Path
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.bottleneck import Shares, Waiting, find_bottleneck
 from v2v_server.status.history import History, Moment
 from v2v_server.status.state import (

@@ -17,7 +17,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
-from v2v_server.broker.quarantine import QuarantineEntry
+from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.status.publisher import ANSWER_SECONDS, MOST_LOOKERS
 from v2v_server.status.snapshot import MOST_SHOWN
 from v2v_server.status.state import STATE_VERSION
