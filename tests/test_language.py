@@ -14,7 +14,6 @@ NOT_YET_REWRITTEN = (
     "v2v_client/position/",
     "v2v_server/broker/door.py",
     "v2v_server/corpus/",
-    "v2v_server/cloud/",
     "v2v_server/status/",
     "v2v_server/system/turn_away.py",
 )

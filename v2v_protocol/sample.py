@@ -21,7 +21,27 @@ from v2v_protocol.tables import html_table
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
-ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
+ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
+
+
+@dataclass(frozen=True, slots=True)
+class FromSidecar:
+    """The form of an array that is made from a sidecar, a file or folder beside the video.
+
+    Attributes:
+        ending: of the sidecar's name, in the place of the video's: ".boxes.json" for ``clip.boxes.json`` beside
+            ``clip.mp4``; with a slash at its end for a folder.
+        form: dtype and shape, as for any array.
+    """
+
+    ending: str
+    form: ArrayForm
+
+    def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
+        return self.form(recipe, voxel_dtype)
+
+
+ARRAYS: dict[str, ArrayForm] = {
     "voxels": lambda recipe, voxel_dtype: (
         voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, *recipe.crop_px)
     ),
@@ -138,6 +158,7 @@ class Provenance:
         decoder: codec name, and whether its decoding is bit-exact on every host.
         quarantine: number of the quarantine snapshot it was made under.
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
+        sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
     """
 
     id: SampleId
@@ -152,6 +173,7 @@ class Provenance:
     decoder: str
     quarantine: int = 0
     scene: str = ""
+    sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -164,14 +186,17 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; ``scene`` is left out if it is empty."""
+        """Return plain values, as they travel in the sample's header; ``scene`` and ``sidecars`` are left out if they
+        are empty.
+        """
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        if not self.scene:
-            del values["scene"]
+        for name in ("scene", "sidecars"):
+            if not values[name]:
+                del values[name]
         return values
 
     @classmethod
@@ -219,6 +244,12 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
     return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
+
+
+def sidecar_endings(arrays: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the endings of the sidecars that these arrays are made from, sorted."""
+    forms = (ARRAYS.get(name) for name in arrays)
+    return tuple(sorted({form.ending for form in forms if isinstance(form, FromSidecar)}))
 
 
 def layout_bytes(layout: Layout) -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import (
     Action,
@@ -39,7 +39,6 @@ from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
-from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
@@ -130,7 +129,7 @@ def serve(config: ServeConfig) -> None:
     catalogue.fail_fast()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
-    quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
+    quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
     quarantine = read_quarantine(quarantine_file)
     for entry in quarantine.entries(quarantine.latest):
         log.say(f"in quarantine: {entry}")
@@ -151,13 +150,12 @@ def serve(config: ServeConfig) -> None:
         folder = Path(config.cache).absolute()
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
-    if isinstance(catalogue.root, Copies):
-        worker_flags += ["--copies", str(catalogue.root.folder), "--copies-gib", str(config.copies_gib)]
+    worker_flags += catalogue.source.worker_flags()
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with _stop_on_signals(stop):
-        pool = make_pool(config, str(catalogue.root), label, worker_flags, keys)
+        pool = make_pool(config, catalogue.source.name, label, worker_flags, keys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
@@ -391,9 +389,10 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint)
-        except VideoChanged:
-            self._catalogue.mark_stale(missing.video)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+        except (VideoChanged, VideoGone):
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -401,9 +400,10 @@ class Server:
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
             name = clean_name(self._name(missing.identity).decode())
-            is_local = not isinstance(self._catalogue.root, Copies)
+            is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
-                f"worker {name} failed on {missing.video}, which "
+                f"worker {name} failed on {file}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",

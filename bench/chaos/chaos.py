@@ -43,7 +43,7 @@ from v2v_client.tools.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.files import VIDEO_SUFFIXES
+from v2v_server.corpus.sources.names import VIDEO_SUFFIXES
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
 
 _POLL_SECONDS = 0.05

@@ -81,13 +81,14 @@ class AddToQuarantine:
 
 @dataclass(frozen=True, slots=True)
 class CheckVideo:
-    """Check whether this host has a video as catalogued, because a worker cannot read it on its own host.
+    """Check whether this host has a video (or its sidecar) as catalogued, because a worker cannot read it on its host.
 
     Attributes:
         video, fingerprint: of the file.
         identity: routing id of the worker.
         frame, reason: what the worker reported.
         request: the request that it could not make.
+        sidecar: ending of the video's sidecar that is meant, with its fingerprint; "": the video itself.
     """
 
     video: str
@@ -96,6 +97,7 @@ class CheckVideo:
     frame: int | None
     reason: str
     request: Request
+    sidecar: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,6 +127,7 @@ class Admission:
             sequences=schedule.count,
             credit=session.credit,
             quarantine=quarantine,
+            sidecars=self._facts.sidecars_digest(hello.arrays),
         )
 
     def _check_sizes(self, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:

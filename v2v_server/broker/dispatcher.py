@@ -107,7 +107,7 @@ class Dispatcher:
         self.registry = Workers(self.leases)
         self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates)
         self._worker_side = WorkerSide(
-            self.sessions, self.leases, self.registry, self.candidates, self._grants, self.counters
+            facts, self.sessions, self.leases, self.registry, self.candidates, self._grants, self.counters
         )
         self._faults: dict[bytes, int] = {}  # malformed messages of connected consumers
 
@@ -342,7 +342,7 @@ class Dispatcher:
             now: monotonic time, seconds.
         """
         if not found:
-            return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._grants.assign(now)]
+            return [*self.candidates.blame(missing), *self._grants.assign(now)]
         self.counters.missing_videos += 1
         self.registry.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)

@@ -32,6 +32,7 @@ from v2v_server.broker.grants import Grants, check_result
 from v2v_server.broker.leases import LeaseBook, Request, Stall
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.worker_registry import MOST_WORKERS, Workers, clean_name
+from v2v_server.corpus.videos import CorpusFacts
 
 _LONGEST_SECRET_BYTES = 64
 _LONGEST_NAME_BYTES = 255
@@ -42,6 +43,7 @@ class WorkerSide:
 
     def __init__(
         self,
+        facts: CorpusFacts,
         sessions: Sessions,
         leases: LeaseBook,
         registry: Workers,
@@ -49,6 +51,7 @@ class WorkerSide:
         grants: Grants,
         counters: Counters,
     ) -> None:
+        self._facts = facts
         self._sessions = sessions
         self._leases = leases
         self._registry = registry
@@ -182,12 +185,16 @@ class WorkerSide:
         session = None if request is None else self._sessions.get(request.session)
         if request is None or session is None:
             return self._grants.assign(now)
+        video, sidecar = self._candidates.sequence(session, request).video, failed.sidecar
+        fingerprint = self._facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
+        failure = CheckVideo(
+            video.id, fingerprint or "", identity, failed.frame, failed.reason, request, sidecar if fingerprint else ""
+        )
         if not failed.here:
             self._registry.can_work(identity)
-            return [*self._candidates.refuse(request, failed.frame, failed.reason), *self._grants.assign(now)]
-        # The catalogue lists this host's files: if the video is here, other workers can probably read it.
-        video = self._candidates.sequence(session, request).video
-        return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
+            return [*self._candidates.blame(failure), *self._grants.assign(now)]
+        # The catalogue lists this host's files: if the file is here, other workers can probably read it.
+        return [failure]
 
     def _charge(self, lease: int, worker: bytes, now: float) -> None:
         """Charge a consumer for a sample that it asked for and then abandoned."""

@@ -30,7 +30,7 @@ from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.status.progress import catalogue_progress
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, make_sample, open_sidecars
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -93,6 +93,7 @@ class Remaker:
         Raises:
             UsageError: an index outside the epoch.
             SampleUnavailable: no candidate could give the sample.
+            SidecarError: a file beside the video, which an array is made from, cannot be used.
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
@@ -114,8 +115,9 @@ class Remaker:
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
             try:
-                decoded = decode_for(lease, lease.indices, catalogue.root)[0]
-                return RemadeSample(lease, decoded, make_sample(lease, decoded))
+                decoded = decode_for(lease, lease.indices, catalogue.source)[0]
+                with open_sidecars(lease, catalogue.source) as sidecars:
+                    return RemadeSample(lease, decoded, make_sample(lease, decoded, sidecars=sidecars))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise
@@ -212,7 +214,7 @@ def simulate_to_file(
             raise UsageError("--events needs the array voxels: add it to --arrays")
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
-    quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
+    quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
         print(f"cannot be used: {refusal}")

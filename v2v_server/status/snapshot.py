@@ -90,7 +90,7 @@ def service_state(service: Service, now: float, time: str, *, is_ready: bool) ->
         is_ready=is_ready,
         address=service.address,
         worker_address=service.worker_address,
-        videos=str(catalogue.root),
+        videos=str(catalogue.source),
         video_count=len(catalogue.videos),
         unusable_count=len(catalogue.refusals),
         spec=config.spec.to_dict(),

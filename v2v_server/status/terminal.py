@@ -9,7 +9,7 @@ from typing import TextIO
 from rich.console import Console, Group
 from rich.text import Text
 
-from v2v_server.corpus.files import printable
+from v2v_server.corpus.sources.names import printable
 from v2v_server.status.line import StatusLine, figures
 from v2v_server.status.log import StatusLog
 from v2v_server.status.state import ServiceState

@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from v2v_server.corpus.files import printable
+from v2v_server.corpus.sources.names import printable
 from v2v_server.status.shutdown_summary import format_duration
 
 _MOST_ROWS = 30

@@ -19,11 +19,11 @@ import zmq
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.errors import SidecarError, UsageError, VideoError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
-from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -54,7 +54,7 @@ from v2v_server.worker.conversation import (
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.produce import kernels_of, make_sample, open_sidecars, sample_layout, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
@@ -79,7 +79,7 @@ class Worker:
 
     Args:
         name: unique name, see :func:`unshared_name`.
-        root: the corpus folder on this host, or local copies of a corpus in object storage.
+        source: where the videos come from.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: cache of decoded clips for later epochs; None stores nothing.
@@ -94,7 +94,7 @@ class Worker:
     def __init__(
         self,
         name: str,
-        root: Path | Copies,
+        source: VideoSource,
         address: str,
         logbook: int | None = None,
         cache: Cache | None = None,
@@ -105,12 +105,12 @@ class Worker:
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
-        self._clips = Clips(root, cache)
+        self._clips = Clips(source, cache)
         self._at = IDLE  # the lease in work
         if cache is not None:
             cache.on_wait = self._note_wait
-        self._copies = root if isinstance(root, Copies) else None
-        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
+        self._source = source
+        self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
         self._handover_seconds = 0.0  # not yet reported in a result
@@ -217,12 +217,12 @@ class Worker:
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
-                except VideoError as error:
+                    made: tuple[Frames, Timings] | VideoError | SidecarError = self._make_sample(lease)
+                except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
-                if isinstance(made, VideoError):
+                if isinstance(made, VideoError | SidecarError):
                     return conversation.on_failure(made, now)
                 frames, timings = made
                 return conversation.on_sample(frames, now, timings)
@@ -237,19 +237,20 @@ class Worker:
         """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
         reported.
         """
-        if self._copies is None or self._clips.has(lease):
+        if self._clips.has(lease):
             return True
-        video = lease.video, lease.fingerprint
-        return (self._unfetched is not None and self._unfetched[0] == video) or self._copies.has(*video)
+        files = _files(lease)
+        return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:
-        """Fetch the lease's video before the lease is begun, so that network time does not count against the sample."""
-        if self._copies is None or self._has_video(lease):
+        """Fetch the lease's files before the lease is begun, so that network time does not count against the sample."""
+        if self._has_video(lease):
             return
+        files = _files(lease)
         try:
-            self._copies.fetch(lease.video, lease.fingerprint)
+            self._source.fetch(files)
         except VideoError as error:
-            self._unfetched = (lease.video, lease.fingerprint), error
+            self._unfetched = files, error
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """Return the first frames of all available messages."""
@@ -270,11 +271,12 @@ class Worker:
         """Make a lease's sample and return its message with the timings.
 
         Raises:
-            VideoError: its video cannot be used.
+            VideoError, SidecarError: its video, or a file beside it, cannot be used.
         """
-        if self._unfetched is not None and self._unfetched[0] == (lease.video, lease.fingerprint):
+        if self._unfetched is not None and self._unfetched[0] == _files(lease):
             error, self._unfetched = self._unfetched[1], None
-            raise error
+            if error.video == lease.video:
+                raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
         buffer = open_output_buffer(lease, sample_layout(lease))
         has_room = time.monotonic()
@@ -286,7 +288,8 @@ class Worker:
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sample = make_sample(lease, clip, buffer.arrays)
+        with open_sidecars(lease, self._source) as sidecars:
+            sample = make_sample(lease, clip, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -335,18 +338,23 @@ def _size_bytes(lease: Lease) -> int:
     return int(size) if size.isdecimal() else 0
 
 
-def _written(root: Path | Copies, address: str, cache: Cache | None) -> list[Path] | None:
+def _files(lease: Lease) -> dict[str, str]:
+    """Return the fingerprints of the files that a lease's sample is made from, by id."""
+    return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
+
+
+def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:
     """Return the folders that a worker writes to; None if they cannot be listed, because its samples may go to a
     consumer's memory or the tools for object storage write elsewhere.
     """
-    if isinstance(root, Copies) or not leaves_host(address):
+    if not source.is_local or not leaves_host(address):
         return None
     return [*compile_cache(), *([] if cache is None else [cache.folder])]
 
 
 def run_worker(
     address: str,
-    root: Path | Copies,
+    source: VideoSource,
     name: str | None,
     parent_pid: int | None,
     logbook: int | None = None,
@@ -358,7 +366,7 @@ def run_worker(
 
     Args:
         address: where the server listens for workers.
-        root: the corpus folder on this host, or local copies of a corpus in object storage.
+        source: where the videos come from.
         name: unique name; by default host, process id and a random suffix.
         parent_pid: process id of the server if it started this worker, which then ends with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
@@ -382,8 +390,8 @@ def run_worker(
     # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    confine(_written(root, address, cache), network=not address.startswith("ipc:") or isinstance(root, Copies))
-    worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys, log)
+    confine(_written(source, address, cache), network=not address.startswith("ipc:") or not source.is_local)
+    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

@@ -5,24 +5,37 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from importlib.resources.abc import Traversable
+from pathlib import PurePosixPath
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
-from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
+from v2v_protocol.sample import (
+    Layout,
+    Provenance,
+    Sample,
+    SampleId,
+    SampleParams,
+    array_layout,
+    new_arrays,
+    sidecar_endings,
+)
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.variants import Variant, variants
@@ -35,7 +48,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
@@ -98,14 +111,14 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 
 
 def decode_for(
-    lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
+    lease: Lease, indices: Sequence[int], source: VideoSource, cache: Cache | None = None
 ) -> tuple[Decoded, ...]:
     """Decode, in one pass, exactly the frames that some of a lease's indices need.
 
     Args:
         lease: the work.
         indices: a subset of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        source: where the videos come from.
         cache: cache of decoded pieces for later epochs; None stores nothing.
 
     Raises:
@@ -119,7 +132,7 @@ def decode_for(
         index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
-        with open_local(root, lease.video, lease.fingerprint) as path:
+        with source.open_local(lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
@@ -143,15 +156,56 @@ def sample_layout(lease: Lease) -> Layout:
         raise ProtocolError(f"lease {lease.lease}: {error}") from error
 
 
-def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
+def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:
+    """Return id and fingerprint of each sidecar that a lease's arrays are made from and that the video has, by ending.
+
+    Raises:
+        ProtocolError: the lease is malformed.
+    """
+    found = {}
+    for ending in sidecar_endings(lease.arrays):
+        fingerprint = lease.sidecars.get(ending)
+        if fingerprint is not None and not isinstance(fingerprint, str):
+            raise ProtocolError(f"lease {lease.lease}: fingerprint {fingerprint!r:.80} of the sidecar {ending}")
+        if fingerprint:
+            found[ending] = sidecar_id(lease.video, ending), fingerprint
+    return found
+
+
+@contextmanager
+def open_sidecars(lease: Lease, source: VideoSource) -> Iterator[dict[str, Traversable | None]]:
+    """Lend the sidecars that a lease's arrays are made from, by ending, until the end of the context.
+
+    Raises:
+        SidecarError: one cannot be had as catalogued.
+        ProtocolError: the lease is malformed.
+    """
+    opened: dict[str, Traversable | None] = dict.fromkeys(sidecar_endings(lease.arrays))
+    with ExitStack() as stack:
+        for ending, (id, fingerprint) in sidecar_files(lease).items():
+            try:
+                opened[ending] = stack.enter_context(open_sidecar(source, id, fingerprint))
+            except VideoError as error:
+                raise SidecarError(lease.video, ending, error.reason, here=True) from error
+        yield opened
+
+
+def make_sample(
+    lease: Lease,
+    decoded: Decoded,
+    into: Mapping[str, npt.NDArray[Any]] | None = None,
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
+) -> Sample:
     """Make a lease's sample from its decoded clip: view, flow, simulation.
 
     Args:
         lease: the work.
         decoded: its decoded clip.
         into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
+        sidecars: what :func:`open_sidecars` lends; needed if an array is made from one.
 
     Raises:
+        SidecarError: an array cannot be made from its sidecar.
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
         ProtocolError: the lease is malformed.
@@ -171,7 +225,8 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
         seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
     if into is None:
         into = new_arrays(sample_layout(lease))
-    context = SampleContext(lease.video, plan.spec, params, source, view, seconds, flow)
+    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
+    context = SampleContext(lease.video, clip, plan.spec, params, source, view, seconds, flow)
     for name, array in into.items():
         ARRAY_BUILDERS[name](context, array)
     return Sample(
@@ -189,6 +244,7 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
+            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
         ),
     )
 

@@ -13,6 +13,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.counters import Counters
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.status.line import StatusLine, summary
@@ -67,7 +68,7 @@ def test_many_refusals_are_counted_and_a_length_of_clip_named_that_admits_them()
 
 def test_files_that_cannot_be_used_are_named() -> None:
     problems = tuple(Refusal(f"p{number}.mp4", None, "has no video track") for number in range(7))
-    named = NamedCorpus((video("a.mp4"),), Rows(), problems, Path("/elsewhere"))
+    named = NamedCorpus((video("a.mp4"),), Rows(), problems, Folder(Path("/elsewhere")))
     said = lines(named)  # type: ignore[arg-type]
     assert said[0].startswith("1 videos in /elsewhere: 1 give 10 sequences")
     assert said[1:] == [

@@ -506,7 +506,7 @@ def remade(
         return (lease,)
 
     monkeypatch.setattr(remake_module, "decode_for", decode_for)
-    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded: cast(Sample, decoded))
+    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded, sidecars: cast(Sample, decoded))
     remake(catalogue, spec, seed=0, epoch=0, index=index, arrays=("voxels",), quarantine=quarantine, snapshot=snapshot)
     return leases[0]
 
