@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from v2v_server.status.state import ServiceState, Totals
-from v2v_server.store.cache import GIB
+from v2v_server.store.quota import GIB
 
 _FAULTS = {
     "refused_candidates": "candidates refused",

@@ -32,8 +32,7 @@ from v2v_server.status.state import (
     Totals,
     WorkerState,
 )
-from v2v_server.store.cache import GIB
-from v2v_server.store.used import used_bytes
+from v2v_server.store.quota import GIB, used_bytes
 from v2v_server.supervise.pool import Pool
 
 MOST_SHOWN = 1000
