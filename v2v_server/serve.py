@@ -39,7 +39,6 @@ from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
@@ -47,6 +46,8 @@ from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogu
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.status.publisher import StatusPublisher
