@@ -76,7 +76,19 @@ def test_the_packages_have_modules_to_check(package: str) -> None:
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
     may = PROTOCOL_MAY | {"yaml"} if path.name == "safe_yaml.py" else PROTOCOL_MAY
+    may = may | {"zmq"} if path.parent.name == "link" else may
     assert imported(path.read_text(encoding="utf-8")) - may == set()
+
+
+def test_at_most_four_files_import_the_transport() -> None:
+    users = {
+        path.relative_to(ROOT)
+        for name in PACKAGES
+        for path in modules(name)
+        if "zmq" in imported(path.read_text("utf-8"))
+    }
+    assert {path.parent.as_posix() for path in users} == {"v2v_protocol/link"}
+    assert len(users) <= 4
 
 
 def test_yaml_is_read_in_one_place() -> None:

@@ -34,10 +34,10 @@ from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_client.session.brokers import addresses, order
 from v2v_client.session.connection import Connection
-from v2v_client.session.link import Link
 from v2v_client.session.liveness import Patience
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, ServerLost, StateMismatch, UsageError
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Hello
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
@@ -438,7 +438,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             pinned=pinned,
             pinned_by="the saved state" if state is not None else "this dataset",
             patience=patience or self._patience,
-            transport=functools.partial(Link, keys=self._keys),
+            transport=functools.partial(Dealer, keys=self._keys),
         )
 
 

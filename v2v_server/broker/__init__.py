@@ -1,9 +1,8 @@
-"""The broker decides which worker makes which sample for which consumer. It handles no pixels. Only three files do I/O.
+"""The broker decides which worker makes which sample for which consumer. It handles no pixels. Only two files do I/O.
 
 dispatcher        takes messages and lost peers, returns actions
 actions           what the dispatcher wants done; the loop in ``serve.py`` does it
-transport         the protocol of the two sockets, and its ZeroMQ implementation (I/O)
-door              limits on consumer connections, and which connections have ended (I/O)
+transport         the protocol of the two sockets, and its implementation (I/O)
 admission         turns a consumer's Hello into a session
 session           what each consumer has asked for, its credit, and the order of service
 leases            requests, and which worker holds which of them
