@@ -47,7 +47,7 @@ from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key
 from v2v_protocol.link.curve import new_key_pair
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Goodbye, Hello, See, Seen, Want
+from v2v_protocol.messages import GetStatus, Goodbye, Hello, Status, Want
 from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
 
@@ -125,12 +125,12 @@ def leave(address: str, number: int) -> None:
 def thief(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
-        peer.send(encode(See()))
+        peer.send(encode(GetStatus()))
         frames = peer.receive(_REFUSAL_SECONDS)
         if frames is None:
             return
         seen = decode(frames[0])
-    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Seen) else []
+    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Status) else []
     for each in shown:
         for name in (each["id"].encode(), bytes.fromhex(each["id"])):
             with _dealer(address, name) as peer:
@@ -143,7 +143,7 @@ def look(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
         while True:
-            peer.send(encode(See()))
+            peer.send(encode(GetStatus()))
 
 
 def idle(address: str, number: int) -> None:
