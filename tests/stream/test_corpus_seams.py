@@ -180,14 +180,18 @@ assert plain and toys == [f"toys/{video}" for video in plain]
 """
 
 
-@pytest.fixture
-def tree(tmp_path: Path) -> Path:
-    """A copy of the packages, and two clips."""
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the packages with both additions, and two clips."""
+    tmp_path = tmp_path_factory.mktemp("tree")
     for package in ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "clips").mkdir()
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
+    (tmp_path / "v2v_server/worker/label.py").write_text(LABEL)
+    (tmp_path / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
+    add(tmp_path, (*LABEL_LINES, SOURCE_LINE))
     return tmp_path
 
 
@@ -202,14 +206,10 @@ def run(tree: Path, program: str) -> None:
 
 @pytest.mark.slow
 def test_an_array_with_a_sidecar_is_a_file_and_two_lines(tree: Path) -> None:
-    (tree / "v2v_server/worker/label.py").write_text(LABEL)
-    add(tree, LABEL_LINES)
     (tree / "clips/a.label.json").write_text(str([10 * frame for frame in range(30)]))
     run(tree, USE_SIDECAR)
 
 
 @pytest.mark.slow
 def test_a_kind_of_source_is_a_file_and_a_line(tree: Path) -> None:
-    (tree / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
-    add(tree, (SOURCE_LINE,))
     run(tree, USE_SOURCE)
