@@ -295,7 +295,8 @@ def _snapshot(
         records = [on_disk.row(at) for at in range(len(on_disk))]
         files = {record.id: record.fingerprint for record in records}
         absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        table, _ = VideoTable.read((manifest.as_source(record).columns for record in records), len(records))
+        rows = ((*manifest.as_source(record).columns, None) for record in records)
+        table = replace(VideoTable.read(rows, len(records))[0], summaries=on_disk.summaries)
     else:
         table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
     usable = table.problem == np.array(None)
@@ -334,7 +335,7 @@ def _snapshot(
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
-        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]

@@ -48,6 +48,8 @@ CREATE TABLE IF NOT EXISTS figures (
     data BLOB NOT NULL,
     PRIMARY KEY (kind, version, id)
 )"""
+_SUMMARIES = "CREATE INDEX IF NOT EXISTS summaries ON figures (kind, version, id, fingerprint, summary)"
+"""Summaries are read without the data beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,16 +171,25 @@ class Store:
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
-    def rows(self) -> Generator[tuple[Any, ...], None, None]:
-        """Yield all records by id, as the attributes of :class:`IndexRow` without their frame indices.
+    def rows(self, kind: FigureKind | None) -> Generator[tuple[Any, ...], None, None]:
+        """Yield all records by id: the attributes of :class:`IndexRow` without the frame index, and a summary.
 
         Another program may have put any type into any column but the id.
+
+        Args:
+            kind: figures whose summary is read. It is None where a video has none for its present fingerprint.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        query = f"SELECT {', '.join(_COLUMNS)} FROM video WHERE typeof(id) = 'text' ORDER BY id"
-        with closing(self._database.execute(query)) as rows:
+        names = ", ".join(f"video.{name}" for name in _COLUMNS)
+        join = (
+            "LEFT JOIN figures ON kind = ? AND version = ? AND figures.id = video.id "
+            "AND figures.fingerprint = video.fingerprint"
+        )
+        summary, join, values = ("summary", join, (kind.name, kind.version)) if kind else ("NULL", "", ())
+        query = f"SELECT {names}, {summary} FROM video {join} WHERE typeof(video.id) = 'text' ORDER BY video.id"
+        with closing(self._database.execute(query, values)) as rows:
             yield from rows
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
@@ -206,24 +217,18 @@ class Store:
             sqlite3.Error: as for :meth:`put`.
         """
         self._database.execute(_FIGURES)
+        self._database.execute(_SUMMARIES)
         return _has_table(self._database, "scene")
 
-    def summaries(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, summary) of each video whose figures are those of its present fingerprint, sorted by id.
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
+        """Yield (id, encoded figures) of each video that has figures for its present fingerprint, sorted by id.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        yield from self._figures("summary", kind)
-
-    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
-        """Yield (id, summary, encoded figures) like :meth:`summaries`."""
-        yield from self._figures("summary, data", kind)
-
-    def _figures(self, columns: str, kind: FigureKind) -> Generator[tuple[Any, ...], None, None]:
         query = (
-            f"SELECT id, {columns} FROM video JOIN figures USING (id, fingerprint) WHERE kind = ? AND version = ? "
-            "AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY id"
+            "SELECT figures.id, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? AND version = ? "
+            "AND typeof(data) = 'blob' ORDER BY figures.id"
         )
         with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
             yield from rows

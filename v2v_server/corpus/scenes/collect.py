@@ -7,16 +7,16 @@ fingerprint and the rows that were analysed, together with the runs that follow 
 from __future__ import annotations
 
 import hashlib
-from array import array
+import sqlite3
 from base64 import b64decode
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 
 import numpy as np
-import numpy.typing as npt
+import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.corpus.index.columns import VideoTable, joined
@@ -32,6 +32,9 @@ from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
+
+_PAIR_BYTES = 8
+"""Of the hash and of each run in a summary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,62 +58,83 @@ class SceneCollection:
 
     def collect(
         self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
-    ) -> None:
-        """Make sure that the index has the scene of each usable video, if it can be had.
+    ) -> bool:
+        """Put the scene of each usable video that has none into the index, if it can be had.
+
+        Returns:
+            whether there were such videos.
 
         Raises:
             sqlite3.Error: the index cannot be written.
         """
-        has_earlier = store.make_figures()
-        known = joined(table.ids, store.summaries(self.kind), [], (None,))
-        missing = [table.row(at) for at, (_, runs) in enumerate(known) if runs is None and table.problem[at] is None]
-        with closing(self._found(store, source, missing, has_earlier, processes)) as found:
+        missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
+        with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
-                store.put_figures(self.kind, (figures(record, scene) for record, scene in batch))
+                store.put_figures(self.kind, (figures(*each) for each in batch))
+        return bool(missing)
 
-    def read(
-        self, store: Store, ids: Sequence[str], frames: npt.NDArray[np.int64], unknown: set[str], digest: str
-    ) -> tuple[SplitVideos, str]:
+    def read(self, store: Store, table: VideoTable, unknown: set[str], digest: str) -> tuple[SplitVideos, str]:
         """Return the usable runs of videos, and a digest that names all that is known of them.
 
         Args:
-            ids, frames: of the videos of a snapshot, in its order.
+            table: the videos of a snapshot, with the summaries of their scenes.
             unknown: ids of videos of which nothing is known; receives those that the index has no scene of.
             digest: of the snapshot.
 
         Raises:
             sqlite3.Error: the index is damaged.
         """
+        lengths = table.summaries.lengths
+        is_known = (lengths >= _PAIR_BYTES) & (lengths % _PAIR_BYTES == 0)
+        is_known[[place for id in unknown if (place := table.ids.find(id)) is not None]] = False
+        places = np.flatnonzero(is_known)
+        unknown.update(table.ids[place] for place in np.flatnonzero(~is_known).tolist())
+        summaries = table.summaries.where(is_known)
+        pairs = summaries.utf8.view("<i4").reshape(-1, 2).astype(np.int32)
+        counts = summaries.lengths // _PAIR_BYTES
+        is_run = np.ones(len(pairs), bool)
+        is_run[np.cumsum(counts) - counts] = False  # the hash at the beginning of each summary
+        split = SplitVideos.select(table.frames[places], pairs[is_run], counts - 1)
+        split = replace(split, numbers=places[split.numbers].astype(np.int32))
+        state = hashlib.sha256(b"".join(column.tobytes() for column in (is_known, counts, pairs))).hexdigest()
+        return split, self._digest(store, table.ids, unknown, digest, state)
+
+    def _digest(self, store: Store, ids: Sequence[str], unknown: set[str], digest: str, state: str) -> str:
+        """Return the digest of all scenes. It takes reading them all, so the index keeps it for one state of them."""
+        kept, key = FigureKind("scene digest", self.kind.version), f"{digest} {state}"
+        if (known := store.figures("", key, kept)) is not None:
+            return known.decode()
         sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
-        encoded, lengths, nothing = bytearray(), array("q"), Scene.unknown().to_bytes()
-        whole = np.stack((0 * frames, frames), 1).astype("<i4")
-        known = joined(ids, store.all_figures(self.kind), [], (None, nothing))
-        for number, (id, runs, data) in enumerate(known):
-            if runs is None or len(runs) % 8 or id in unknown:
-                unknown.add(id)
-                runs, data = whole[number].tobytes(), nothing
-            sha.update(data)
-            encoded += runs
-            lengths.append(len(runs))
-        return SplitVideos.decode(frames, bytes(encoded), np.asarray(lengths)), sha.hexdigest()[:32]
+        nothing = Scene.unknown().to_bytes()
+        for id, data in joined(ids, store.all_figures(self.kind), [], (nothing,)):
+            sha.update(nothing if id in unknown else data)
+        with suppress(sqlite3.Error):  # a locked index costs the next start this time again
+            store.put_figures(kept, [Figures("", key, b"", sha.hexdigest()[:32].encode())])
+        return sha.hexdigest()[:32]
 
     def _found(
-        self, store: Store, source: VideoSource, missing: list[IndexRow], has_earlier: bool, processes: int
-    ) -> Generator[tuple[IndexRow, Scene], None, None]:
-        by_id: dict[str, IndexRow] = {}
-        for record in missing:
+        self,
+        store: Store,
+        source: VideoSource,
+        table: VideoTable,
+        missing: list[int],
+        processes: int,
+    ) -> Generator[tuple[IndexRow | _Job, Scene], None, None]:
+        left, has_earlier = [], store.make_figures()
+        for place in missing:
+            record = table.row(place)
             data = self._prepared(record)
             if data is None and has_earlier:
                 data = store.earlier_scene(record.id, record.fingerprint, self.kind.version)
             if data is None:
-                by_id[record.id] = record
+                left.append(place)
             else:
                 yield record, Scene.from_bytes(data)
 
         def jobs() -> Iterator[_Job]:
-            for record in by_id.values():
+            for record in map(table.row, left):
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _Job(record.id, record.fingerprint, index, self._window(record))
+                yield _Job(record.id, record.fingerprint, record.frames, index, self._window(record))
 
         isolated = partial(
             run_isolated,
@@ -126,12 +150,12 @@ class SceneCollection:
             if isinstance(found, Died) or not found:
                 suspects.append(job)
             else:
-                yield by_id[job.id], Scene.from_bytes(found)
+                yield job, Scene.from_bytes(found)
         # Once more, alone: the process may have been killed from outside, or for lack of memory, or its storage failed
         # for a moment. A second failure is not kept: such a video counts as unknown, and the next start tries again.
         for job, found in isolated(suspects, 1):
             if not isinstance(found, Died) and found:
-                yield by_id[job.id], Scene.from_bytes(found)
+                yield job, Scene.from_bytes(found)
 
     def _prepared(self, record: IndexRow) -> bytes | None:
         """Return the encoded scene that the manifest states."""
@@ -147,16 +171,18 @@ class SceneCollection:
         return top, 0, bottom - top, record.width_px
 
 
-def figures(record: IndexRow, scene: Scene) -> Figures:
-    """Return what the index keeps of a scene."""
-    runs = np.array(scene.runs(record.frames), "<i4").tobytes()
-    return Figures(record.id, record.fingerprint, runs, scene.to_bytes())
+def figures(video: IndexRow | _Job, scene: Scene) -> Figures:
+    """Return what the index keeps of a scene; the summary is a hash of it and the usable runs."""
+    data = scene.to_bytes()
+    summary = xxhash.xxh3_64_digest(data) + np.array(scene.runs(video.frames), "<i4").tobytes()
+    return Figures(video.id, video.fingerprint, summary, data)
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
     id: str
     fingerprint: str
+    frames: int
     index: bytes
     window: Window | None
 
