@@ -53,7 +53,8 @@ from v2v_server.worker.conversation import (
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, open_sidecars, sample_layout, sidecar_files
+from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.sidecars import open_sidecars, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
