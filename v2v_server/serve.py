@@ -21,6 +21,7 @@ from typing import Any
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.wire import encode
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -483,14 +484,10 @@ def _private_address(label: str) -> str:
 
 def _write_port_file(file: str, address: str) -> None:
     """Write the address in one step, so that readers see the whole content or no file."""
-    path = Path(file)
-    partial = path.parent / f".{path.name}.{os.getpid()}"
     try:
-        partial.write_text(address + "\n", encoding="utf-8")
-        partial.replace(path)
+        with write_aside_and_rename(Path(file)) as partial:
+            partial.write_text(address + "\n", encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise UsageError(f"--port-file {file}: {error.strerror}") from error
 
 
