@@ -76,8 +76,19 @@ def test_the_packages_have_modules_to_check(package: str) -> None:
 
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
-    may = PROTOCOL_MAY | {"yaml"} if path.name == "safe_yaml.py" else PROTOCOL_MAY
+    may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}}.get(path.name, set())
     assert imported(path.read_text(encoding="utf-8")) - may == set()
+
+
+def test_one_file_draws_progress() -> None:
+    """Every command shows its progress in the same way."""
+    users = [
+        path
+        for package in PACKAGES
+        for path in modules(package)
+        if "rich.progress" in imported_modules(path.read_text("utf-8"))
+    ]
+    assert users == [ROOT / "v2v_protocol" / "progress.py"]
 
 
 def test_yaml_is_read_in_one_place() -> None:

@@ -20,6 +20,7 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.progress import Progress
 from v2v_protocol.wire import encode
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.actions import (
@@ -48,11 +49,11 @@ from v2v_server.page.child import PageProcess
 from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.status.line import summary
-from v2v_server.status.progress import catalogue_progress
-from v2v_server.status.publisher import make_publisher
-from v2v_server.status.shutdown_summary import format_shutdown_summary
-from v2v_server.status.terminal import make_status
+from v2v_server.schedule.summary import corpus_summary
+from v2v_server.status.publisher import StatusPublisher
+from v2v_server.status.snapshot import Service
+from v2v_server.status.terminal import StatusView
+from v2v_server.status.text import format_shutdown_summary
 from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Pool
@@ -91,7 +92,8 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
         CorpusError: there are no videos, or no usable ones.
     """
     cores = usable_cores()
-    with catalogue_progress(log=Log(is_json=config.log_format == "json")) as progress:
+    log = Log(is_json=config.log_format == "json")
+    with Progress("probing videos", say=log.say if log.is_json else None) as progress:
         catalogue = open_catalogue(
             config.videos,
             list_file=config.list or None,
@@ -125,7 +127,7 @@ def serve(config: ServeConfig) -> None:
     for note in catalogue.notes:
         log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
+    for line in corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused):
         log.say(line)
     catalogue.fail_fast()
     if not table.count:
@@ -156,7 +158,7 @@ def serve(config: ServeConfig) -> None:
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with _stop_on_signals(stop):
-        pool = make_pool(config, catalogue.source.name, label, worker_flags, keys)
+        pool = make_pool(config, catalogue.source, label, worker_flags, keys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
@@ -220,10 +222,9 @@ class Server:
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
-        self._status = make_status(self._log, sys.stderr)
-        self._publisher = make_publisher(
-            config, catalogue, dispatcher, pool, quarantine, transport, self._clock(), _utc_now
-        )
+        self._view = StatusView(self._log, sys.stderr)
+        service = Service(config, catalogue, dispatcher, pool, quarantine, transport)
+        self._publisher = StatusPublisher(service, self._clock(), _utc_now)
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
@@ -276,13 +277,13 @@ class Server:
 
     def close(self) -> None:
         """Stop and end the workers, and close all connections."""
-        self._status.close()
+        self._view.close()
         if self._announced:
-            state = self._publisher.state(self._clock())
-            for line in format_shutdown_summary(state):
+            status = self._publisher.status(self._clock())
+            for line in format_shutdown_summary(status):
                 self._log.say(line)
             if self._log.is_json:
-                self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)
+                self._log.say("the end", totals=status["totals"], uptime_seconds=status["uptime_seconds"])
         for stop in self._dispatcher.stop_workers():
             self._transport.send(stop)
         self._pool.stop()
@@ -318,8 +319,8 @@ class Server:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
-                case SendStatus() as show:
-                    todo.extend(self._publisher.ask(show))
+                case SendStatus() as request:
+                    todo.extend(self._publisher.ask(request))
 
     def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
         """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
@@ -446,8 +447,8 @@ class Server:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
-        if self._announced and self._status.is_due(now):
-            self._status.show(now, self._publisher.state(now))
+        if self._announced and self._view.is_due(now):
+            self._view.show(now, self._publisher.status(now))
 
     def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
         """Write a log line.
@@ -457,7 +458,7 @@ class Server:
             sample: the request that the line is about.
             about: additional fields for programs.
         """
-        self._status.interrupt()
+        self._view.interrupt()
         identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
         if identity is not None:
             about["sample"] = asdict(identity)

@@ -298,7 +298,7 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
 def test_the_end_is_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     served(Scripted(), tmp_path).close()
     said = capsys.readouterr().err
-    assert "in all 0 samples" in said
+    assert "in total 0 samples" in said
     assert "\nfaults 0\n" in said
 
 

@@ -171,7 +171,7 @@ class WorkerSide:
                 return [refused, *self.lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
-                self._counters.work.add(result, header.cpu_seconds)
+                self._counters.add(result, header.cpu_seconds)
                 self._registry.worked(identity, result, header.cpu_seconds)
                 actions.append(ToConsumer(request.session, payload))
         self._registry.can_work(identity)
@@ -203,11 +203,10 @@ class WorkerSide:
             self._sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Count a sample; return False if no session waits for it."""
+        """Count what was sent of a sample; return False if no session waits for it."""
         if not self._sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self._counters.late_results += 1
             return False
-        self._counters.samples += 1
         self._counters.decodes += header.decoded
         self._counters.count_cache(header.cache)
         self._counters.batches += 1 / session.batch_size

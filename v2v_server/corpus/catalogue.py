@@ -295,7 +295,7 @@ def _snapshot(
         records = [on_disk.row(at) for at in range(len(on_disk))]
         files = {record.id: record.fingerprint for record in records}
         absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        table = VideoTable.of(manifest.as_source(record).columns for record in records)
+        table, _ = VideoTable.read((manifest.as_source(record).columns for record in records), len(records))
     else:
         table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
     usable = table.problem == np.array(None)

@@ -7,9 +7,11 @@ import os
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing, suppress
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import SCHEMA_VERSION, Store
@@ -58,7 +60,7 @@ def refresh_index(
         scenes: how to analyse what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
     """
-    ids = sorted(set(ids))  # a list may name a video twice
+    ids = [id for id, _ in groupby(sorted(ids))]  # a list may name a video twice
     try:
         store, table = _refreshed(path, source, ids, scenes, processes, progress, notice)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
@@ -90,15 +92,16 @@ def _refreshed(
     try:
         with without_collections():
             unasked = list[str]()
-            table = VideoTable.of(joined(ids, store.rows(), unasked))
-            stale = _changed(source, ids, table, notice)
+            table, states = VideoTable.read(joined(ids, store.rows(), unasked), len(ids))
+            stale = _changed(source, ids, states, notice)
+        del states
         store.forget(_gone(source, unasked, notice))
         with closing(probe_files(source, [ids[at] for at in stale], processes)) as found:
             for batch in batches(found, len(stale), progress):
                 store.put(batch)
         if stale:
             with without_collections():
-                table = VideoTable.of(joined(ids, store.rows(), []))
+                table, _ = VideoTable.read(joined(ids, store.rows(), []), len(ids))
         if scenes is not None:
             scenes.collect(store, source, table, processes, progress)
         _remove_earlier_caches(path)
@@ -108,11 +111,11 @@ def _refreshed(
         raise
 
 
-def _changed(source: VideoSource, ids: list[str], table: VideoTable, notice: Notice | None) -> list[int]:
-    """Ask for size and times of every file; return the places of those that the table does not know as they are."""
+def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64], notice: Notice | None) -> list[int]:
+    """Ask for size and times of every file; return the places of those that differ from the known [N, 3] states."""
     changed, done = list[int](), 0
     for part, answer in by_parts(source.states, ids):
-        found, known = np.asarray(answer).reshape(-1, 3), table.states[done : done + len(part)]
+        found, known = np.asarray(answer).reshape(-1, 3), states[done : done + len(part)]
         changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
         done += len(part)
         if notice is not None:

@@ -6,16 +6,19 @@ from importlib import import_module
 
 from v2v_protocol.errors import UsageError
 from v2v_server.config import ENGINES, ServeConfig
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.supervise.pool import Pool
 
 
-def make_pool(config: ServeConfig, root: str, label: str, flags: list[str], keys: KeyFolder | None = None) -> Pool:
+def make_pool(
+    config: ServeConfig, source: VideoSource, label: str, flags: list[str], keys: KeyFolder | None = None
+) -> Pool:
     """Return the pool that the configuration asks for.
 
     Args:
         config: of the server.
-        root: the corpus, a folder or an address.
+        source: where the videos come from; workers open it by its name.
         label: prefix of the workers' names, unique to this server.
         flags: further flags of each worker.
         keys: keys of the server, which lends one to workers on other hosts.
@@ -35,4 +38,4 @@ def make_pool(config: ServeConfig, root: str, label: str, flags: list[str], keys
         ) from error
     is_remote = keys is not None and name != "local"
     key = keys.lend(f"{name}-{label}", "worker") if keys is not None and is_remote else None
-    return Pool(engine.make_host(config, root, label, flags, key), label)
+    return Pool(engine.make_host(config, source.name, label, flags, key), label)

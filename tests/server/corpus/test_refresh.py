@@ -6,10 +6,11 @@ import os
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from v2v_server.corpus import refresh
-from v2v_server.corpus.index.columns import VideoTable
 from v2v_server.corpus.index.file import IndexRow, Store
 from v2v_server.corpus.sources.folder import Folder
 
@@ -25,18 +26,18 @@ def ids(tmp_path: Path) -> list[str]:
 
 
 def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: list[str]) -> None:
-    def table(*unknown: int) -> VideoTable:
+    def states(*unknown: int) -> npt.NDArray[np.int64]:
         rows = []
         for number, id in enumerate(ids):
             status = (tmp_path / id).stat()
             size = -1 if number in unknown else status.st_size
-            rows.append(IndexRow(id, size, status.st_mtime_ns, status.st_ctime_ns, problem="is no video").columns)
-        return VideoTable.of(rows)
+            rows.append((size, status.st_mtime_ns, status.st_ctime_ns))
+        return np.array(rows)
 
     notices: list[str] = []
-    assert refresh._changed(Folder(tmp_path), ids, table(), notices.append) == []
+    assert refresh._changed(Folder(tmp_path), ids, states(), notices.append) == []
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 0 of them new or changed"
-    known = table(300, 301)
+    known = states(300, 301)
     (tmp_path / ids[5]).write_bytes(b"x")
     (tmp_path / ids[130]).chmod(0o600)  # changes only the ctime
     (tmp_path / ids[301]).unlink()

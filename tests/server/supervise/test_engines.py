@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from v2v_protocol.errors import UsageError
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.supervise.engines import make_pool
 
 RAY = {"videos": "videos", "engine": "ray", "worker_bind": "tcp://127.0.0.1:5556"}
 
 
 def test_the_usual_one_is_this_hosts_pool() -> None:
-    assert make_pool(ServeConfig(videos="videos"), "videos", "w", []).is_local
+    assert make_pool(ServeConfig(videos="videos"), Folder(Path("videos")), "w", []).is_local
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "v2v_server.supervise.ray_host", raising=False)
     with pytest.raises(UsageError, match=r"needs the Python package ray.*pip install '\.\[server,ray\]'"):
-        make_pool(ServeConfig(**RAY), "videos", "w", [])
+        make_pool(ServeConfig(**RAY), Folder(Path("videos")), "w", [])
 
 
 def test_workers_elsewhere_need_an_address_they_can_reach() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.server.supervise.toy_host import ToyHost
 from v2v_server import config
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Death, Pool
 
@@ -16,7 +19,7 @@ from v2v_server.supervise.pool import Death, Pool
 def pool(monkeypatch: pytest.MonkeyPatch) -> Pool:
     monkeypatch.setitem(config.ENGINES, "toy", "tests.server.supervise.toy_host")
     asked = ServeConfig(videos="videos", engine="toy", worker_bind="tcp://127.0.0.1:5556")
-    made = make_pool(asked, "videos", "label", [])
+    made = make_pool(asked, Folder(Path("videos")), "label", [])
     made.start("tcp://10.0.0.1:5556")
     return made
 
