@@ -19,8 +19,9 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, State
+from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation
 from v2v_client.session.liveness import ListeningClock, Patience
+from v2v_client.session.states import Event, State
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer
