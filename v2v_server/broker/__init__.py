@@ -3,8 +3,7 @@
 dispatcher        takes messages and lost peers, returns actions; the consumers' half
 worker_side       the workers' half
 actions           what the dispatcher wants done; the loop in ``serve.py`` does it
-transport         the protocol of the two sockets, and its ZeroMQ implementation (I/O)
-door              limits on consumer connections, and which connections have ended (I/O)
+transport         the protocol of the two sockets, and its implementation (I/O)
 admission         turns a consumer's Hello into a session
 session           what each consumer has asked for, its credit, and the order of service
 leases            requests, and which worker holds which of them

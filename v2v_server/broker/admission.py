@@ -20,7 +20,7 @@ from v2v_server.schedule.sequences import Columns, SequenceTable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
-"""Less than ``transport.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
+"""Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
 

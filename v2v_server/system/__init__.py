@@ -5,7 +5,6 @@ isolate         a function applied to many items in processes of their own, so t
 sandbox         restrictions of a process that decodes: programs, networks, writing
 compile_cache   where numba stores compiled kernels
 private         files that other users of the host cannot open
-turn_away       has the kernel drop newcomers from some addresses
 locks           locks on files that processes share
 status_fields   what each number of the status means
 log             log lines, as text or JSON
