@@ -3,7 +3,7 @@
 The server keeps no position: a consumer asks for indices, each of which is one unit of its credit until it is answered,
 and an index that was answered is forgotten. So a session can be dropped and opened again at any time.
 
-Worker time is shared by deficit round robin (:mod:`v2v_server.schedule.fair_queue`). A repeated Hello changes none of
+Worker time is shared by deficit round robin (:mod:`v2v_server.broker.fair_queue`). A repeated Hello changes none of
 this: the new session takes over the debt of the old one, and its abandoned requests count against its credit until the
 workers have finished them.
 
@@ -23,9 +23,9 @@ from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import runs_alone
+from v2v_server.broker.fair_queue import FairQueue
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.fair_queue import FairQueue
 
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
