@@ -60,7 +60,7 @@ class Routers:
 
     def __init__(self, keys: KeyStore | None = None) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        # Otherwise each small frame of a peer may keep the whole buffer of 18 KiB that it was read into.
+        # Otherwise each small frame of a peer may keep the whole buffer of 8 KiB that it was read into.
         self.context.set(_ZERO_COPY_RECEIVE, 0)
         self._routers: list[Router] = []
         self._poller = zmq.Poller()
