@@ -19,12 +19,13 @@ from trainer.config import TrainConfig
 from trainer.config_file import show_config
 from trainer.pictures import Image, Video, add_header, contact_sheet
 from trainer.run.board import Board
-from trainer.run.checkpoint import replacing, unwritable
+from trainer.run.checkpoint import unwritable
 from trainer.run.distributed import Ranks
 from v2v_client import V2VStreamDataset
 from v2v_pictures.files import png_bytes
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
+from v2v_protocol.write_aside import write_aside_and_rename
 
 METRICS = "metrics.jsonl"
 CONFIGURATION = "config.yaml"
@@ -275,8 +276,8 @@ def _drop_after(path: Path, step: int) -> None:
     if path.exists():
         records = read_metrics(path) if step else []
         kept = [json.dumps(record) + "\n" for record in records if record["step"] <= step]
-        with replacing(path) as file:
-            file.write("".join(kept).encode())
+        with write_aside_and_rename(path, durable=True) as partial:
+            partial.write_text("".join(kept), encoding="utf-8")
 
 
 def _clock(seconds: float) -> str:

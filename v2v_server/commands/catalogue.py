@@ -13,9 +13,9 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
-from v2v_server.cloud.copies import COPIES_GIB
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.sources.source import COPIES_GIB
 from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -119,7 +119,7 @@ def _of_part(part: Part, shard: Shard) -> list[str]:
 
 def _of_all(catalogue: Catalogue) -> list[str]:
     with closing(catalogue):
-        lines = [*catalogue.notes, f"{catalogue.root}: {len(catalogue.videos)} videos can be used"]
+        lines = [*catalogue.notes, f"{catalogue.source}: {len(catalogue.videos)} videos can be used"]
         if catalogue.refusals:
             lines.append(f"{len(catalogue.refusals)} files cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]

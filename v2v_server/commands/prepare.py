@@ -21,7 +21,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.listfile import LIST_SUFFIXES
+from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
 from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding

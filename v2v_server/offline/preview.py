@@ -25,7 +25,6 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cloud.copies import open_local
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
@@ -175,7 +174,7 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
-    with open_local(catalogue.root, provenance.video, provenance.fingerprint) as path:
+    with catalogue.source.open_local(provenance.video, provenance.fingerprint) as path:
         (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
     picture: npt.NDArray[np.uint8] = clip.frames[0]
     return picture

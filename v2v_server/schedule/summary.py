@@ -23,7 +23,7 @@ def corpus_summary(
     """
     recipe = spec.recipe
     lines = [
-        f"{len(catalogue.videos)} videos in {catalogue.root}: {table.videos} give {table.count} sequences of "
+        f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
         f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
     ]
     if spec.scene != "off":

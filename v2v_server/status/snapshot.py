@@ -36,7 +36,7 @@ from v2v_server.status.parts import (
     WorkerPart,
 )
 from v2v_server.store.used import used_bytes
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, values
 
 MOST_SHOWN = 1000
@@ -53,7 +53,7 @@ class Service:
     config: ServeConfig
     catalogue: Catalogue
     dispatcher: Dispatcher
-    supervisor: Supervisor
+    pool: Pool
     quarantine: Quarantine
     transport: ServerTransport
 
@@ -101,7 +101,7 @@ class Service:
             is_ready=is_ready,
             address=self.transport.address,
             worker_address=self.transport.worker_address,
-            videos=str(self.catalogue.root),
+            videos=str(self.catalogue.source),
             video_count=len(self.catalogue.videos),
             unusable_count=len(self.catalogue.refusals),
             spec=self.config.spec.to_dict(),
@@ -119,7 +119,7 @@ class Service:
             queue=dispatcher.waiting,
             queued_share=dispatcher.waiting_share,
             worker_count=dispatcher.workers,
-            worker_processes=self.supervisor.running,
+            worker_processes=self.pool.running,
             workers_wanted=self.config.workers,
             consumer_count=dispatcher.consumers,
             quarantine_snapshot=self.quarantine.latest,
@@ -135,7 +135,7 @@ class Service:
             shares,
             is_attended=is_attended,
             workers=dispatcher.workers,
-            starting=max(0, self.supervisor.running - dispatcher.workers),
+            starting=max(0, self.pool.running - dispatcher.workers),
             trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(self.config.workers_in_all),
             has_cache=bool(self.config.cache),
         )
@@ -148,7 +148,7 @@ class Service:
         return CachePart(folder, held, most, counters.cache_hits, counters.cache_misses, counters.cache_trouble)
 
     def _workers(self, window: TimeWindow) -> list[dict[str, Any]]:
-        members, restarts = self.dispatcher.registry.members(), self.supervisor.restarts
+        members, restarts = self.dispatcher.registry.members(), self.pool.restarts
         return [
             values(_worker(self.dispatcher, identity, member, restarts.get(member.name.encode()), window))
             for identity, member in list(members.items())[:MOST_SHOWN]

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from v2v_protocol.progress import format_duration
-from v2v_server.corpus.files import printable
+from v2v_server.corpus.sources.names import printable
 from v2v_server.status.parts import Status
 from v2v_server.status.text import figures
 

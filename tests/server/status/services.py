@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
-from tests.server.queues import Queues, ToySupervisor
+from tests.server.queues import Queues, ToyPool
 from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import decode
 from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
@@ -41,13 +41,13 @@ class Published:
         at: the peers whose service it publishes; their clock is its.
         publisher: the publisher.
         transport: it waited for messages all the time, unless a test says otherwise.
-        supervisor: of the server's own workers.
+        pool: of the server's own workers.
     """
 
     at: Peers
     publisher: StatusPublisher
     transport: Queues
-    supervisor: ToySupervisor
+    pool: ToyPool
 
     def status(self) -> Status:
         return self.publisher.status(self.at.now)
@@ -79,13 +79,13 @@ class Published:
 def published(at: Peers, **settings: Any) -> Published:
     """Return a publisher that begins now."""
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
-    transport, supervisor = Queues(), ToySupervisor(lambda name, address: None)
+    transport, pool = Queues(), ToyPool(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    service = Service(config, catalogue, at.dispatcher, supervisor, at.quarantine, transport)
+    service = Service(config, catalogue, at.dispatcher, pool, at.quarantine, transport)
     publisher = StatusPublisher(service, at.now, lambda: WALL)
     publisher._processor_clock = lambda: 0.0  # a slow host builds a status less often
     publisher.tick(at.now)
-    return Published(at, publisher, transport, supervisor)
+    return Published(at, publisher, transport, pool)
 
 
 def json_of(action: ToConsumer | ToWorker) -> bytes:

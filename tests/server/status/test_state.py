@@ -96,8 +96,8 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
 def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     at = peers()
     service = published(at)
-    service.supervisor.scale(2)
-    service.supervisor.watch(0.0, 0)
+    service.pool.scale(2)
+    service.pool.watch(0.0, 0)
     at.join(b"toy1")
     at.join(b"elsewhere")
     state = service.view()

@@ -19,9 +19,9 @@ from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.supervise import child as child_module
-from v2v_server.supervise import local_pool as pool_module
-from v2v_server.supervise.local_pool import Pool
-from v2v_server.supervise.protocol import Death, Supervisor
+from v2v_server.supervise import local_host as host_module
+from v2v_server.supervise.local_host import LocalHost
+from v2v_server.supervise.pool import Death, Pool
 from v2v_server.worker.logbook import note
 
 SLEEPS = "import time\ntime.sleep(600)"
@@ -48,7 +48,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
         monkeypatch.setattr(
             child_module, "command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
         )
-        pools.append(Pool(Path("/corpus"), "label"))
+        pools.append(Pool(LocalHost("/corpus"), "label"))
         pools[-1].start("tcp://127.0.0.1:1")
         pools[-1].scale(workers)
         return pools[-1]
@@ -56,6 +56,11 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
     yield make
     for each in pools:
         each.stop(join_seconds=0.0, terminate_seconds=0.0)
+
+
+def pids_of(pool: Pool) -> list[int]:
+    """Process ids of the workers that are alive."""
+    return [slot.place.process.pid for slot in pool._slots if slot.place.is_running]
 
 
 def all_dead(pool: Pool) -> None:
@@ -81,10 +86,10 @@ def is_gone(pid: int) -> bool:
 
 def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
-    assert (pool.running, pool.pids()) == (0, [])
+    assert (pool.running, pids_of(pool)) == (0, [])
     assert pool.watch(0.0, 0) == []
     assert pool.running == 2
-    pids = pool.pids()
+    pids = pids_of(pool)
 
     def names() -> list[bytes]:
         # The argument before the logbook's two; a process has none to show until its program has been loaded.
@@ -93,7 +98,7 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     until(lambda: b"" not in names())
     assert names() == [b"label-0.1", b"label-1.1"]
     assert pool.watch(100.0, 0) == []
-    assert pool.pids() == pids
+    assert pids_of(pool) == pids
 
 
 def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
@@ -103,7 +108,7 @@ def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
 
 
 def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
-    pool: Supervisor = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + NAPS)
+    pool = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + NAPS)
     assert pool.watch(0.0, 0) == []
     pool.scale(1)
     assert [pool.watches(name) for name in (b"label-0.1", b"label-2.1")] == [True, True]
@@ -118,7 +123,7 @@ def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callabl
 def test_one_that_dies_while_it_leaves_is_reported_and_not_replaced(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, "import os, signal, time\nsignal.signal(15, lambda *_: os.kill(os.getpid(), 11))\n" + NAPS)
     pool.watch(0.0, 0)
-    until(lambda: is_loaded(pool.pids()[0]) and _catches_terminate(pool.pids()[0]))
+    until(lambda: is_loaded(pids_of(pool)[0]) and _catches_terminate(pids_of(pool)[0]))
     pool.scale(0)
     all_dead(pool)
     assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(Cause.CRASHED, "was ended by SIGSEGV"))]
@@ -138,7 +143,7 @@ def _catches_terminate(pid: int) -> bool:
 def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
-    (pid,) = pool.pids()
+    (pid,) = pids_of(pool)
     assert os.getpgid(pid) == pid != os.getpgid(0)
 
 
@@ -157,7 +162,7 @@ def test_a_process_that_the_system_does_not_start_is_tried_again(
 
     monkeypatch.setattr(subprocess, "Popen", spawn)
     assert pool.watch(0.0, 0) == []
-    os.kill(pool.pids()[0], signal.SIGKILL)
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
     until(lambda: pool.running == 1)
     short[0] = True
     assert [death.identity for death in pool.watch(1.0, 0)] == [b"label-0.1"]
@@ -204,11 +209,11 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
 def test_a_crash_is_told_from_a_kill(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
 ) -> None:
-    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: 5)
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: 5)
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
-    until(lambda: is_loaded(pool.pids()[0]))
-    os.kill(pool.pids()[0], number)
+    until(lambda: is_loaded(pids_of(pool)[0]))
+    os.kill(pids_of(pool)[0], number)
     all_dead(pool)
     assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
 
@@ -217,7 +222,7 @@ def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
     causes = []
@@ -234,11 +239,11 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(pool_module, "out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
     pool = start(2, SLEEPS)
 
     def causes_of_deaths_at(now: float) -> list[Cause]:
-        for pid in pool.pids():
+        for pid in pids_of(pool):
             os.kill(pid, signal.SIGKILL)
         all_dead(pool)
         return [death.loss.cause for death in pool.watch(now, 1)]
@@ -273,7 +278,7 @@ def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], 
 def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
     pool.watch(0.0, 0)
-    hung, other = pool.pids()
+    hung, other = pids_of(pool)
     assert pool.watches(b"label-0.1")
     assert pool.give_up(b"label-9.9", "slept") is None
     assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", for_all=False)
@@ -285,13 +290,13 @@ def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Call
     ]
     until(lambda: pool.running == 1)
     assert pool.watch(0.0, 0) == []
-    assert pool.pids() == [other]
+    assert pids_of(pool) == [other]
     assert pool.watch(100.0, 0) == []
     assert pool.running == 2
     assert is_gone(hung)
     # The next life of the slot is a new worker: its death is reported.
     assert pool.watches(b"label-0.2")
-    os.kill(pool.pids()[0], signal.SIGKILL)
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
     until(lambda: pool.running == 1)
     assert [death.identity for death in pool.watch(200.0, 0)] == [b"label-0.2"]
     assert not pool.watches(b"label-0.2")
@@ -300,7 +305,7 @@ def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Call
 def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
-    (pid,) = pool.pids()
+    (pid,) = pids_of(pool)
     os.kill(pid, signal.SIGSTOP)
     until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
     loss = pool.give_up(b"label-0.1", "slept")
@@ -313,7 +318,7 @@ def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int
     """It may go on just before its deadline, and look like any other then."""
     pool = start(2, SLEEPS)
     pool.watch(0.0, 0)
-    pid, _ = pool.pids()
+    pid, _ = pids_of(pool)
 
     def stopped(now: float) -> dict[bytes, float]:
         seconds = {name: stalled.stopped_seconds for name, stalled in pool.stalled(now).items()}
@@ -335,7 +340,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
     pool = start(4, "while True: pass")
     pool.watch(0.0, 0)
     core = min(os.sched_getaffinity(0))
-    for pid in pool.pids():
+    for pid in pids_of(pool):
         os.sched_setaffinity(pid, {core})
     looks = count(1.0)  # a second between one look and the next, as it goes by the clock that it is told
 
@@ -349,7 +354,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
 def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
-    book = pool._posts[0].logbook
+    book = pool._slots[0].place.logbook
     assert book is not None
     with open(f"/proc/self/fd/{book.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=True)
@@ -373,7 +378,7 @@ def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
 
 
 def kill_one(pool: Pool) -> None:
-    os.kill(pool.pids()[0], signal.SIGKILL)
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
     all_dead(pool)
 
 
@@ -393,19 +398,18 @@ def test_each_death_in_a_row_doubles_the_wait(start: Callable[[int, str], Pool])
 
 def test_the_wait_is_bounded_however_large_the_pool() -> None:
     """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
-    pool = Pool(Path("/corpus"), "label")
+    pool = Pool(LocalHost("/corpus"), "label")
     pool.scale(1000)
-    for post in pool._posts[:1]:
-        post.start_at = 0.0
-    for post in pool._posts[1:]:
-        post.start_at = float("inf")
+    for slot in pool._slots[1:]:
+        slot.start_at = float("inf")
     pool._restarts._deaths_in_a_row = pool.crash_budget - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
-    pool._posts[0].process, pool._posts[0].identity = dead, b"label-0.1"
+    pool._slots[0].place.process = dead
+    pool._slots[0].is_started, pool._slots[0].name = True, "label-0.1"
     (death,) = pool.watch(100.0, 0)
     assert death.identity == b"label-0.1"
-    assert pool._posts[0].start_at == 110.0
+    assert pool._slots[0].start_at == 110.0
 
 
 def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
@@ -440,7 +444,7 @@ def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None
 def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, "import time\ntime.sleep(0.05)")
     pool.watch(0.0, 0)
-    pids = pool.pids()
+    pids = pids_of(pool)
     pool.stop(join_seconds=60.0)
     assert all(is_gone(pid) for pid in pids)
 
@@ -455,7 +459,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
     )
     pool = start(2, stubborn)
     pool.watch(0.0, 0)
-    pids = pool.pids()
+    pids = pids_of(pool)
     until(lambda: len(list(tmp_path.iterdir())) == 2)
     pool.stop(join_seconds=0.0, terminate_seconds=0.1)
     assert pool.running == 0
@@ -465,7 +469,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
 def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
     pool.watch(0.0, 0)
-    pids = pool.pids()
+    pids = pids_of(pool)
     os.kill(pids[0], signal.SIGKILL)
     pool.stop(join_seconds=0.0)
     pool.stop()

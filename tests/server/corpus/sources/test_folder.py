@@ -14,18 +14,11 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.files import (
-    MOST_PATHS,
-    PSEUDO,
-    answers,
-    by_parts,
-    corpus_root,
-    left_out_note,
-    printable,
-    regular_files,
-    video_files,
-)
-from v2v_server.corpus.listfile import read_list
+from v2v_server.corpus.sources.asking import answers, by_parts
+from v2v_server.corpus.sources.folder import MOST_PATHS, PSEUDO, Folder, video_files
+from v2v_server.corpus.sources.listfile import ListEntry, read_list
+from v2v_server.corpus.sources.names import left_out_note, printable
+from v2v_server.corpus.sources.source import open_source
 
 STEERING = {
     "red\x1b[31m.mp4": r"red\x1b[31m.mp4",
@@ -44,7 +37,7 @@ def test_a_name_that_would_steer_a_terminal_is_shown_escaped_and_refused(tmp_pat
     assert printable(name) == STEERING[name]
     (tmp_path / name).touch()
     refused: dict[str, str] = {}
-    assert not list(video_files(tmp_path, refused))
+    assert not list(video_files(tmp_path, refused, Counter()))
     assert list(refused) == [STEERING[name]]
     if name.isprintable() or "\udcff" in name or "\u2028" in name:
         return  # no text that a list file could hold in one line
@@ -59,16 +52,17 @@ def test_a_name_that_would_steer_a_terminal_is_shown_escaped_and_refused(tmp_pat
 def test_names_of_any_language_are_taken_as_they_are(tmp_path: Path, name: str) -> None:
     (tmp_path / name).touch()
     assert printable(name) == name
-    assert list(video_files(tmp_path, {})) == [name]
+    assert list(video_files(tmp_path, {}, Counter())) == [name]
 
 
 def test_the_root_of_a_corpus_is_its_folder_or_that_of_its_video_or_list(tmp_path: Path) -> None:
     for name in ("clip.mp4", "list.txt"):
         (tmp_path / name).touch()
-        assert corpus_root(tmp_path / name) == tmp_path.resolve()
-    assert corpus_root(tmp_path) == tmp_path.resolve()
+        (tmp_path / name).touch()
+        assert open_source(tmp_path / name).folder == tmp_path.resolve()
+    assert open_source(tmp_path).folder == tmp_path.resolve()
     with pytest.raises(CorpusError, match="no such folder, video or list file on this host"):
-        corpus_root(tmp_path / "missing")
+        open_source(tmp_path / "missing")
 
 
 @pytest.mark.parametrize("files", [0, 1, 63, 64, 65, 1000])
@@ -166,7 +160,7 @@ def test_folders_linked_to_each_other_are_searched_by_a_bounded_number_of_paths(
             (tmp_path / name / other).symlink_to(tmp_path / other)
     (tmp_path / "a" / "x.mp4").touch()
     refused: dict[str, str] = {}
-    found = list(video_files(tmp_path, refused))
+    found = list(video_files(tmp_path, refused, Counter()))
     assert {"a/x.mp4", *(f"{name}/a/x.mp4" for name in names[1:])} <= set(found)
     assert len(found) <= 8 + MOST_PATHS
     assert len(refused) <= len(names)
@@ -179,7 +173,7 @@ def test_a_folder_that_several_links_lead_to_has_its_videos_under_each(tmp_path:
     for number in range(MOST_PATHS + 10):
         (tmp_path / f"link{number}").symlink_to("all")
     refused: dict[str, str] = {}
-    assert len(list(video_files(tmp_path, refused))) == MOST_PATHS + 11
+    assert len(list(video_files(tmp_path, refused, Counter()))) == MOST_PATHS + 11
     assert not refused
 
 
@@ -187,10 +181,10 @@ def test_links_to_files_of_the_kernel_are_refused(tmp_path: Path) -> None:
     (tmp_path / "proc").symlink_to("/proc")
     (tmp_path / "x.mp4").symlink_to("/proc/kmsg")
     refused: dict[str, str] = {}
-    assert not list(video_files(tmp_path, refused))
+    assert not list(video_files(tmp_path, refused, Counter()))
     assert refused == {"proc": PSEUDO, "x.mp4": PSEUDO}
     refused.clear()
-    assert regular_files(tmp_path, ["x.mp4"], refused) == ()
+    assert not list(Folder(tmp_path, lambda: (ListEntry("x.mp4"),)).videos(refused, Counter()))
     assert refused == {"x.mp4": "is no regular file"}
 
 

@@ -6,6 +6,7 @@ import fcntl
 import multiprocessing
 import pickle
 import stat
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,11 +14,20 @@ from typing import Any
 
 import pytest
 
-from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoChanged, VideoUnreadable
-from v2v_server.cloud import bucket as bucket_module
-from v2v_server.cloud import copies as copies_module
-from v2v_server.cloud.bucket import AccessDenied, Bucket, ObjectGone, StoreFault, is_url
-from v2v_server.cloud.copies import Copies, copies_of
+from v2v_protocol.errors import (
+    CorpusError,
+    ProtocolError,
+    UsageError,
+    VideoChanged,
+    VideoDenied,
+    VideoGone,
+    VideoUnreadable,
+)
+from v2v_server.corpus.sources import bucket as bucket_module
+from v2v_server.corpus.sources import copies as copies_module
+from v2v_server.corpus.sources.bucket import Bucket, is_url
+from v2v_server.corpus.sources.copies import Copies
+from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
 from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
@@ -29,7 +39,7 @@ SIZE = 1000
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bucket_module, "_FIRST_WAIT_SECONDS", 0.001)
-    monkeypatch.setattr("v2v_server.cloud.copies._ROOM_SECONDS", 0.01)
+    monkeypatch.setattr("v2v_server.corpus.sources.copies._ROOM_SECONDS", 0.01)
 
 
 @pytest.fixture
@@ -60,19 +70,19 @@ def copies(store: Path, most: int = 10 * SIZE) -> Copies:
 
 def files(made: Copies) -> set[bytes]:
     """The first byte of each copy."""
-    found = list(made.folder.glob("??/*"))
-    assert sum(path.stat().st_size for path in found) == used_bytes(made.folder) == count_bytes(made.folder)
+    found = list(made.copies.glob("??/*"))
+    assert sum(path.stat().st_size for path in found) == used_bytes(made.copies) == count_bytes(made.copies)
     return {path.read_bytes()[:1] for path in found}
 
 
 def test_what_an_address_holds(store: Path) -> None:
-    listed = copies(store).listed
-    assert {name: state.size_bytes for name, state in listed.items()} == dict.fromkeys(
-        ("a.mp4", "b.mp4", "deep/c.mp4"), SIZE
-    )
-    assert len({state.mark for state in listed.values()}) >= 1
+    made, names = copies(store), ("a.mp4", "b.mp4", "deep/c.mp4")
+    assert set(made.videos({}, Counter())) == set(names)
+    states = made.states([*names, "none.mp4"])
+    assert list(states[::3]) == [SIZE, SIZE, SIZE, GONE[0]]
     (store / "a.mp4").write_bytes(b"x" * SIZE)
-    assert copies(store).listed["a.mp4"] != listed["a.mp4"]
+    assert made.states(["a.mp4"]) == states[:3], "the states are those of one listing"
+    assert copies(store).states(["a.mp4"]) != states[:3]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +92,7 @@ def test_what_an_address_holds(store: Path) -> None:
 def test_an_address_is_told_from_a_path(source: str, expected: bool) -> None:
     assert is_url(source) is expected
     if not expected:
-        assert copies_of(source, None, 1.0) is None
+        assert copies_module.open_source(source, SourceOptions()) is None
 
 
 def test_a_video_is_fetched_once(store: Path) -> None:
@@ -95,7 +105,7 @@ def test_a_video_is_fetched_once(store: Path) -> None:
     assert made.has("a.mp4", mark)
     with made.open_local("a.mp4", mark) as path:
         assert path.stat().st_size == SIZE
-    assert [each.name for each in (made.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+    assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
 
 def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,11 +113,11 @@ def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkey
     made, mark = copies(store), fingerprint(store / "a.mp4")
     with ExitStack() as held:
         for number in range(63):
-            lock = held.enter_context((made.folder / PARTIAL / f"{number:02}.lock").open("wb"))
+            lock = held.enter_context((made.copies / PARTIAL / f"{number:02}.lock").open("wb"))
             fcntl.flock(lock, fcntl.LOCK_EX)
         made.fetch("a.mp4", mark)
         assert made.has("a.mp4", mark)
-        last = held.enter_context((made.folder / PARTIAL / "63.lock").open("wb"))
+        last = held.enter_context((made.copies / PARTIAL / "63.lock").open("wb"))
         fcntl.flock(last, fcntl.LOCK_EX)
         with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
             made.fetch("b.mp4", fingerprint(store / "b.mp4"))
@@ -117,22 +127,25 @@ def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkey
 def test_other_users_cannot_lock_a_copy(store: Path) -> None:
     made = copies(store)
     made.fetch("a.mp4", fingerprint(store / "a.mp4"))
-    found = [path for path in made.folder.rglob("*") if path.is_file()]
+    found = [path for path in made.copies.rglob("*") if path.is_file()]
     assert {path.suffix for path in found} >= {".mp4", ".lock"}
     assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}
 
 
 def test_an_object_that_is_gone_or_changed(store: Path) -> None:
     made, mark = copies(store), fingerprint(store / "a.mp4")
-    state = made.listed["a.mp4"]
-    assert made.is_there("a.mp4", state.size_bytes, state.mark)
+    state = made.state("a.mp4")
+    made.verify("a.mp4", mark, state)
     (store / "a.mp4").write_bytes(b"y" * SIZE)
-    assert not made.is_there("a.mp4", state.size_bytes, state.mark)
+    with pytest.raises(VideoChanged, match="changed in file:"):
+        made.verify("a.mp4", mark, state)
+    made.verify("a.mp4", mark, None)
     with pytest.raises(VideoChanged, match="changed in file:"):
         made.fetch("a.mp4", mark)
     (store / "a.mp4").unlink()
-    assert not made.is_there("a.mp4", state.size_bytes, state.mark)
-    with pytest.raises(VideoUnreadable, match=r"is not in file:.* any more"):
+    with pytest.raises(VideoGone):
+        made.verify("a.mp4", mark, state)
+    with pytest.raises(VideoGone, match=r"is not in file:.* any more"):
         made.fetch("a.mp4", mark)
     assert files(made) == set()
 
@@ -168,14 +181,14 @@ def test_what_may_pass_is_tried_again(store: Path) -> None:
     made.fetch("a.mp4", fingerprint(store / "a.mp4"))
     assert asked.asked == 3
     made, asked = flaky(store, *[OSError("SlowDown")] * 9)
-    with pytest.raises(VideoUnreadable, match="cannot be fetched after 3 tries: OSError: SlowDown"):
+    with pytest.raises(VideoUnreadable, match=r"the store gives no answer \(OSError: SlowDown; tried 3 times\)"):
         made.fetch("b.mp4", fingerprint(store / "b.mp4"))
     assert asked.asked == 3
-    assert made.is_there("b.mp4", SIZE, 0), "a store that does not answer condemns nothing"
+    made.verify("b.mp4", "", (SIZE, 0, 0))  # a store that does not answer condemns nothing
     assert asked.asked == 4
-    with pytest.raises(StoreFault):
+    with pytest.raises(VideoUnreadable):
         made.bucket.state("b.mp4")
-    with pytest.raises(ObjectGone):
+    with pytest.raises(VideoGone):
         copies(store).bucket.state("none.mp4")
 
 
@@ -183,10 +196,10 @@ def test_what_may_pass_is_tried_again(store: Path) -> None:
 def test_a_credentials_problem_is_one_message_and_not_tried_again(store: Path, error: Exception) -> None:
     made, asked = flaky(store, error, error)
     with pytest.raises(CorpusError, match=r"access is denied .* AWS_PROFILE") as raised:
-        _ = made.listed
+        list(made.videos({}, Counter()))
     assert "\n" not in str(raised.value)
     assert asked.asked == 1
-    with pytest.raises(AccessDenied):
+    with pytest.raises(VideoDenied):
         made.bucket.state("a.mp4")
 
 
@@ -250,11 +263,11 @@ def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
     with pytest.raises(CorpusError, match="cannot be written to"):
         Copies(Bucket("file:///x"), tmp_path / "file", 1).make()
     with pytest.raises(UsageError, match="--copies-gib 0"):
-        copies_of("file:///x", tmp_path, 0.0)
+        open_source("file:///x", SourceOptions(copies=tmp_path, copies_gib=0.0))
 
 
 def test_it_travels_to_processes(store: Path) -> None:
     made = copies(store)
     made.fetch("a.mp4", fingerprint(store / "a.mp4"))
     again = pickle.loads(pickle.dumps(made))
-    assert (str(again), again.folder, again.most_bytes) == (f"file://{store}", made.folder, made.most_bytes)
+    assert (str(again), again.copies, again.most_bytes) == (f"file://{store}", made.copies, made.most_bytes)

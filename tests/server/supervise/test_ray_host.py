@@ -10,9 +10,10 @@ import pytest
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 
-from v2v_server.supervise import ray_workers
-from v2v_server.supervise.ray_actor import RayWorker, Sight
-from v2v_server.supervise.ray_workers import WORKER_BYTES, RayWorkers
+from v2v_server.supervise import ray_host
+from v2v_server.supervise.pool import Pool
+from v2v_server.supervise.ray_actor import ActorStatus, RayWorker
+from v2v_server.supervise.ray_host import WORKER_BYTES, RayHost
 
 _BUNDLE = {"CPU": 1.0, "memory": float(WORKER_BYTES)}
 
@@ -31,7 +32,7 @@ class _Call:
 class _Actor:
     def __init__(self, done: list[tuple[Any, ...]], options: dict[str, Any], arguments: tuple[Any, ...]) -> None:
         self.options, self.arguments = options, arguments
-        for name in ("run", "look", "signal"):
+        for name in ("run", "status", "signal"):
             setattr(self, name, _Call(done, name))
 
 
@@ -56,16 +57,16 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     def noted(name: str) -> Callable[..., None]:
         return lambda *given, **named: done.append((name, *given, *named.values()))
 
-    monkeypatch.setattr(ray_workers.ray, "is_initialized", lambda: True)
-    monkeypatch.setattr(ray_workers.ray, "remote", Remote)
-    monkeypatch.setattr(ray_workers.ray, "kill", noted("kill"))
-    monkeypatch.setattr(ray_workers.ray, "wait", lambda calls, **how: ([], calls))
-    monkeypatch.setattr(ray_workers, "request_resources", noted("request"))
+    monkeypatch.setattr(ray_host.ray, "is_initialized", lambda: True)
+    monkeypatch.setattr(ray_host.ray, "remote", Remote)
+    monkeypatch.setattr(ray_host.ray, "kill", noted("kill"))
+    monkeypatch.setattr(ray_host.ray, "wait", lambda calls, **how: ([], calls))
+    monkeypatch.setattr(ray_host, "request_resources", noted("request"))
     return done
 
 
 def test_an_actor_takes_a_core_comes_back_for_ever_and_goes_where_the_corpus_is(done: list[tuple[Any, ...]]) -> None:
-    workers = RayWorkers("/videos", "w1", ["--flag"], selector={"corpus": "webvid"})
+    workers = Pool(RayHost("/videos", "w1", ["--flag"], selector={"corpus": "webvid"}), "w1")
     workers.scale(2)
     actors = [call[1] for call in done if call[0] == "actor"]
     assert [actor.options["name"] for actor in actors] == ["w1-0", "w1-1"]
@@ -78,7 +79,7 @@ def test_an_actor_takes_a_core_comes_back_for_ever_and_goes_where_the_corpus_is(
 
 
 def test_the_cluster_is_asked_for_room_for_as_many_as_there_shall_be(done: list[tuple[Any, ...]]) -> None:
-    workers = RayWorkers("/videos", "w1")
+    workers = Pool(RayHost("/videos", "w1"), "w1")
     for count in (2, 6, 3):
         workers.scale(count)
     workers.stop()
@@ -87,12 +88,12 @@ def test_the_cluster_is_asked_for_room_for_as_many_as_there_shall_be(done: list[
 
 def test_who_is_too_many_is_told_to_leave_and_killed_only_at_the_end(done: list[tuple[Any, ...]]) -> None:
     """ray.kill skips what a worker does when it is told to stop."""
-    workers = RayWorkers("/videos", "w1")
+    workers = Pool(RayHost("/videos", "w1"), "w1")
     workers.start("tcp://10.0.0.1:5556")
     workers.scale(2)
     workers.watch(0.0, 0)
-    for berth in workers._berths:
-        berth.seen = Sight("node", berth.name)
+    for slot in workers._slots:
+        slot.place.seen = ActorStatus("node", slot.name)
     del done[:]
     workers.scale(1)
     assert [call[0] for call in done] == ["signal", "request"]

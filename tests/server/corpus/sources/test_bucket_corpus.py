@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.clips import panned_luma, write_clip
-from v2v_protocol.errors import CorpusError, VideoChanged
-from v2v_server.cloud.bucket import Bucket
-from v2v_server.cloud.copies import Copies
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoGone
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources.bucket import Bucket
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
 
@@ -64,7 +63,7 @@ def test_it_is_the_catalogue_of_the_folder(store: Path, fetched: list[str]) -> N
     with catalogue(store, is_folder=True) as local, catalogue(store) as remote:
         assert remote.digest == local.digest
         assert list(remote.videos) == list(local.videos)
-        assert isinstance(remote.root, Copies)
+        assert not remote.source.is_local
         with pytest.raises(CorpusError, match="is no folder of this host"):
             remote.path("a.mp4")
     assert sorted(fetched) == ["a.mp4", "deep/b.mkv"]
@@ -79,7 +78,7 @@ def test_what_is_new_or_changed_is_fetched(store: Path, fetched: list[str]) -> N
         os.rename(store / "deep" / "b.mkv", store / "c.mkv")
         with pytest.raises(VideoChanged):
             first.check("a.mp4", first.videos[0].fingerprint)
-        with pytest.raises(VideoChanged):
+        with pytest.raises(VideoGone):
             first.check("deep/b.mkv", first.videos[1].fingerprint)
     with catalogue(store) as later:
         assert [video.id for video in later.videos] == ["a.mp4", "c.mkv"]
@@ -96,7 +95,7 @@ def test_a_list_restricts_it(store: Path, tmp_path: Path, fetched: list[str]) ->
     with catalogue(store, list_file=names) as remote:
         assert [video.id for video in remote.videos] == ["deep/b.mkv"]
         assert [(each.video, each.reason) for each in remote.refusals] == [
-            ("none.mp4", "cannot be looked at: the store has no such object")
+            ("none.mp4", f"is not in file://{store} any more")
         ]
     assert fetched == ["deep/b.mkv"]
 
