@@ -12,7 +12,7 @@ from v2v_protocol.errors import IndexUnreadable, ProtocolError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
@@ -49,6 +49,9 @@ class NamedCorpus:
     def facts(self) -> CorpusFacts:
         """What is known in memory; these videos have no statistics."""
         return CorpusFacts(self.videos, self.rows, self.digest, None)
+
+    def part(self) -> CorpusPart:
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
     def digest_under(self, scene: str) -> str:
         return self.facts.digest_under(scene)
