@@ -17,6 +17,7 @@ import zmq
 from tests.waiting import until
 from v2v_protocol.link import guard
 from v2v_protocol.link.dealer import Dealer
+from v2v_protocol.link.router import MOST_FRAMES
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
@@ -103,10 +104,10 @@ def next_from(sockets: Sockets, kind: type) -> Arrival:
 
 
 @pytest.mark.parametrize("part", [b"\x01\x00" * 8192, (b"\x01\xff" + bytes(255)) * 64], ids=["empty", "of 255 bytes"])
-def test_parts_without_end_are_cut_off_before_they_are_collected(
+def test_a_message_without_end_ends_its_connection(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], part: bytes
 ) -> None:
-    """One peer's parts grew the server byte for byte, empty ones a hundredfold; the honest consumer notices nothing."""
+    """Memory stays bounded, and the honest consumer is served meanwhile."""
     sockets = serve()
     honest = consumer(sockets, b"honest")
     before = psutil.Process().memory_info().rss
@@ -130,7 +131,7 @@ def test_parts_without_end_are_cut_off_before_they_are_collected(
     assert honest.poll(5000)
 
 
-def test_whose_connection_has_ended_is_said(
+def test_the_end_of_a_connection_is_reported(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
 ) -> None:
     sockets = serve()
@@ -141,7 +142,7 @@ def test_whose_connection_has_ended_is_said(
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
 
 
-def test_who_asks_for_more_than_it_takes_is_cut_off(
+def test_a_peer_that_requests_more_than_it_reads_is_disconnected(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(guard, "_SLACK_BYTES", MIB)
@@ -157,10 +158,10 @@ def test_who_asks_for_more_than_it_takes_is_cut_off(
 
 
 @pytest.mark.parametrize(("kind", "to"), [(FromConsumer, ToConsumer), (FromWorker, ToWorker)])
-def test_connections_are_bounded_and_those_that_say_nothing_make_room(
+def test_connections_are_bounded_and_silent_ones_make_room(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], kind: type, to: type
 ) -> None:
-    """Idle ones took every file that the process may open, and ended it."""
+    """Otherwise idle connections take every descriptor that the process may open, and end it."""
     sockets = serve(most_connections=4)
     address = sockets.address if kind is FromConsumer else sockets.worker_address
     watched = (sockets._consumers if kind is FromConsumer else sockets._workers).guard
@@ -335,7 +336,9 @@ def test_idle_connections_are_not_measured(
     assert set(measured) == {watched._descriptors[b"active"]}
 
 
-def test_who_is_to_be_cut_off_is(serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]) -> None:
+def test_disconnect_ends_the_connection(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
     sockets = serve()
     peer = consumer(sockets, b"c")
     peer.send_multipart(encode(Ping()))
@@ -352,7 +355,7 @@ def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("unwatched")
-def test_who_is_heard_before_the_watch_looks_is_cut_off_and_its_end_is_said(
+def test_a_peer_is_disconnected_before_the_guard_runs_and_its_end_is_reported(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
 ) -> None:
     sockets = serve()
@@ -373,7 +376,7 @@ def test_who_is_heard_before_the_watch_looks_is_cut_off_and_its_end_is_said(
 
 
 @pytest.mark.usefixtures("unwatched")
-def test_who_has_gone_before_it_is_heard_is_said_to_be_gone(
+def test_the_end_of_a_connection_is_reported_after_its_late_message(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
 ) -> None:
     sockets = serve()
@@ -396,7 +399,7 @@ def test_who_has_gone_before_it_is_heard_is_said_to_be_gone(
     until(all_gone)
 
 
-def test_a_connection_that_has_just_ended_ends_no_watch() -> None:
+def test_a_connection_that_has_just_ended_is_no_error() -> None:
     """Its descriptor is closed before its event comes."""
     ours, theirs = socket.socketpair()
     file = ours.fileno()
@@ -404,3 +407,20 @@ def test_a_connection_that_has_just_ended_ends_no_watch() -> None:
     theirs.close()
     assert guard._counted(file) is None
     assert guard._peer(file) is None
+
+
+def test_a_message_of_too_many_frames_is_dropped_and_ends_its_connection(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
+) -> None:
+    """A thousand frames take a thousand times as long to receive as one."""
+    sockets = serve()
+    peer = consumer(sockets, b"c")
+    peer.send_multipart(encode(Ping()))
+    next_from(sockets, FromConsumer)
+    peer.send_multipart([b""] * (MOST_FRAMES + 1))
+    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
+    other = consumer(sockets, b"d")
+    other.send_multipart([b""] * MOST_FRAMES)
+    arrival = next_from(sockets, FromConsumer)
+    assert isinstance(arrival, FromConsumer)
+    assert len(arrival.frames) == MOST_FRAMES
