@@ -77,7 +77,7 @@ class Interleaving(RuleBasedStateMachine):
         for identity, heard in self.at.heard.items():
             for number, message in enumerate(heard[self.read.get(identity, 0) :], self.read.get(identity, 0)):
                 if isinstance(message, SampleHeader):
-                    self.take_in(identity, message, in_message=len(self.at.frames[identity][number]) > 1)
+                    self.receive_sample(identity, message, in_message=len(self.at.frames[identity][number]) > 1)
                 if isinstance(message, SampleHeader | Unavailable):
                     # The heart of the promise: nothing comes that is not waited for.
                     self.owed[identity].remove((message.epoch, message.index))
@@ -102,7 +102,7 @@ class Interleaving(RuleBasedStateMachine):
     def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
         self.at.want(*indices, identity=identity, epoch=epoch)
 
-    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+    def receive_sample(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         assert in_message
         assert header.slot == NO_SLOT
 
@@ -305,7 +305,7 @@ class Interleaving(RuleBasedStateMachine):
                     self._listen()
         assert not any(self.owed.values())
         assert self.at.dispatcher.waiting == 0
-        assert not self.at.dispatcher._lone
+        assert not self.at.dispatcher._grants.lone
         assert len(self.at.dispatcher.leases) == 0
         assert not self.at.dispatcher.leases._held
         assert not self.at.dispatcher.leases._out
@@ -366,7 +366,7 @@ class WithSlots(Interleaving):
             slots.want(epoch, list(fresh))
             self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=arena, slots=numbers)
 
-    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+    def receive_sample(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         slots = self.slots[identity]
         key = header.epoch * 1000 + header.index
         slot = slots._named.get(key)
@@ -469,7 +469,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         model.a_lone_request_is_alone()
         book = model.at.dispatcher.leases
         seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
-        seen["lone waiting"] += bool(model.at.dispatcher._lone)
+        seen["lone waiting"] += bool(model.at.dispatcher._grants.lone)
     seen["twins"] = model.at.dispatcher.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)
     seen["samples"] = model.at.dispatcher.counters.samples

@@ -1,0 +1,13 @@
+"""The catalogue: which videos there are, under stable names, and what each of them holds.
+
+catalogue        the snapshot that everything else works from
+videos           its videos in columns
+sources          where the videos come from
+corpus           the files of a corpus, before one of them is opened
+probe            probing many files in processes of their own
+index            what probing found, on disk and in memory
+refresh          bring the index up to date
+scenes           statistics of what the videos show
+manifest         what a prepared folder states about itself
+manifest_writer  writing a manifest
+"""
