@@ -132,13 +132,6 @@ def test_server_folders_import_only_lower_folders() -> None:
     assert upward == set()
 
 
-def test_server_folders_are_small() -> None:
-    server = ROOT / "v2v_server"
-    assert len(list(server.glob("*.py"))) <= 6
-    for folder in server.rglob("*/"):
-        assert len(list(folder.glob("*.py"))) <= 14, folder
-
-
 @pytest.mark.parametrize(
     "room",
     ["corpus/index", "corpus/sources", *sorted(set(FLOORS) - {"config", "serve", "simulation", "flow", "offline"})],

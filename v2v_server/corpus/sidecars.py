@@ -44,7 +44,8 @@ def collect_sidecars(
     known = dict[str, tuple[bytes, bytes]]()
     with suppress(sqlite3.Error):  # an index that cannot be read or written costs time only
         store.make_figures()
-        known = {id: (state, mark) for id, state, mark in store.all_figures(kind)}
+        pairs = zip(store.summaries(kind), store.all_figures(kind), strict=True)  # both sorted by id
+        known = {id: (state, mark) for (id, state), (_, mark) in pairs}
     fingerprints, fresh, unreadable, done = dict[str, str](), list[Figures](), list[str](), 0
 
     def states(part: Sequence[str]) -> list[str]:

@@ -197,7 +197,7 @@ def _worker(
 
 def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
     now, totals = window.last.now, session.totals
-    samples, waited, passed = window.rates_of(totals.number, totals.since)
+    samples, waited, passed = window.rates_of(totals.number)
     share, left = min(1.0, waited), session.schedule.count - session.position
     if session.left_at is not None:
         state = "gone"

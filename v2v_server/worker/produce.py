@@ -234,8 +234,8 @@ def make_sample(
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
-            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
             saturated={name: count for name, count in saturated.items() if count},
+            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
         ),
     )
 
@@ -246,7 +246,7 @@ def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
     Raises:
         VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
     """
-    context, _ = _context(lease, decoded, {}, {})
+    context, _ = _context(lease, decoded, {})
     made, (seconds, _) = simulate(context, {}), _step_seconds(lease, decoded)
     return list_events(made.given, made.real, 1e6 * seconds)
 
@@ -255,7 +255,7 @@ def _context(
     lease: Lease,
     decoded: Decoded,
     into: Mapping[str, npt.NDArray[Any]],
-    sidecars: Mapping[str, Traversable | None],
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
 ) -> tuple[SampleContext, int]:
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
