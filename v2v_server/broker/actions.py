@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from v2v_protocol.errors import ProtocolError, VersionMismatch
 from v2v_protocol.messages import Denied, ErrorCode, Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import QuarantineEntry
+from v2v_server.quarantine.snapshots import QuarantineEntry
 
 _LONGEST_TEXT = 2000
 """Characters of a denial. It quotes what the peer sent, which may be long, and must fit a header."""
@@ -133,3 +134,8 @@ Action: TypeAlias = (
 def denial(code: ErrorCode, text: str) -> Frames:
     """Build a Denied message, shortened to fit a header."""
     return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
+
+
+def malformed(error: ProtocolError) -> Frames:
+    """Build the reply to a message that cannot be used."""
+    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))

@@ -15,14 +15,13 @@ import socket
 import time
 from pathlib import Path
 
-import zmq
-
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import SidecarError, UsageError, VideoError
-from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
+from v2v_protocol.keys import key_for
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
+from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
@@ -67,8 +66,8 @@ LONGEST_LEASE_SECONDS = 3600.0
 ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; with what is added to it a name has 255 at most."""
-_MORE = int(zmq.SNDMORE)
-"""A plain number: send_multipart combines flags of an enumeration, which takes longer than sending a small frame."""
+_LINGER_MS = 5000
+"""Time that leaving may spend on sending the last sample."""
 
 
 class Worker:
@@ -102,7 +101,7 @@ class Worker:
         keys: str | None = None,
         log: Log | None = None,
     ) -> None:
-        key = key_for(address, "worker", keys)
+        self._link = Dealer(address, keys, "worker")
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
@@ -129,39 +128,11 @@ class Worker:
             ),
             is_watched=logbook is not None,
         )
-        self._address, self._key = address, key
-        self._handshakes = Handshakes(address, key, "worker")
-        self._context = zmq.Context()
         try:
-            self._connect()
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
-
-    def _connect(self) -> None:
-        """Open a socket under a new routing id, which no other peer knows."""
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.ROUTING_ID, b"\x01" + secrets.token_bytes(15))  # a first byte of 0 is ZeroMQ's own
-        self._socket.setsockopt(zmq.LINGER, 5000)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
-        # Leases bound the queues: at most CREDIT samples in either direction.
-        self._socket.setsockopt(zmq.SNDHWM, 0)
-        self._socket.setsockopt(zmq.RCVHWM, 0)
-        self._socket.setsockopt(zmq.IPV6, int("[" in self._address))
-        if self._key is not None:
-            self._key.secure(self._socket)
-        self._monitor = self._socket.get_monitor_socket(HANDSHAKE_EVENTS)
-        self._handshakes.begin()
-        self._socket.connect(self._address)
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(self._monitor, zmq.POLLIN)
-
-    def _reconnect(self) -> None:
-        before = self._socket, self._monitor
-        self._connect()  # before the old ones are closed: the address of a monitor is made from a descriptor
-        for each in before:
-            each.close(linger=0)
+            self._link.connect()
+        except UsageError as error:
+            self._link.close()
+            raise UsageError(f"--connect: {error}") from error
 
     def stop(self) -> None:
         """Finish the current sample, return the other leases, and leave. Safe to call from a signal handler."""
@@ -183,18 +154,16 @@ class Worker:
                     self._do(action)
                 actions = self._take(step)
         finally:
-            self._context.destroy()
+            self._link.disconnect(linger_ms=_LINGER_MS)
+            self._link.close()
 
     def _do(self, action: Action) -> None:
         if isinstance(action, Send):
             began = time.monotonic()
-            *first, last = action.frames
-            for frame in first:
-                self._socket.send(frame, _MORE, copy=False)
-            self._socket.send(last, copy=False)
+            self._link.send(action.frames)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Reconnect):
-            self._reconnect()
+            self._link.connect(again=True)
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -256,16 +225,11 @@ class Worker:
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """Return the first frames of all available messages."""
         messages: list[bytes] = []
-        timeout_ms = math.ceil(wait_seconds * 1000)
-        while ready := dict(self._poller.poll(0 if messages else timeout_ms)):
-            if self._monitor in ready:
-                self._handshakes.take(
-                    lambda: self._monitor.poll(0), lambda: self._monitor.recv_multipart(flags=zmq.NOBLOCK)
-                )
-            if self._socket not in ready:
-                break  # the conversation checks the time
-            first, *_ = self._socket.recv_multipart()
-            messages.append(first)
+        frames = self._link.receive(wait_seconds)
+        while frames is not None:
+            messages.append(bytes(frames[0]))
+            frames = self._link.receive(0)
+        self._link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
         return messages
 
     def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:

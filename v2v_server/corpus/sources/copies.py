@@ -33,7 +33,8 @@ from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_vide
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
-from v2v_server.store.used import PARTIAL, locked_use
+from v2v_server.store.quota import PARTIAL, QuotaFolder
+from v2v_server.system.locks import lock
 from v2v_server.system.private import make_private, open_private
 from v2v_server.system.process import cache_folder
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
@@ -41,14 +42,11 @@ from v2v_server.video.fingerprint import is_same_file
 
 _SLOTS = 64
 """Videos that a host can fetch at a time, and so the most unfinished files that killed processes leave behind."""
-_KEPT_SHARE = 0.9
-"""Share of the limit that is used after an eviction. Evicting lists every file, so it frees space for several."""
 _LOCK_SECONDS = 30.0
 """Longest wait for another process that evicts copies. No lease has begun yet, so no video is blamed for it."""
 _SLOT_SECONDS = 20.0
 """Longest wait for another process that fetches a video of the same slot. Then the next free slot is used: the process
 may be stopped, and fetching one video twice costs less than a waiting worker."""
-_POLL_SECONDS = 0.05
 _ROOM_SECONDS = 2.0
 """Wait before the next try if all copies are being read."""
 
@@ -74,6 +72,7 @@ class Copies(VideoSource):
     ) -> None:
         super().__init__(bucket.url, listed)
         self.bucket, self.copies, self.most_bytes = bucket, copies, most_bytes
+        self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
         self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
 
     def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int]]:
@@ -120,9 +119,7 @@ class Copies(VideoSource):
             CorpusError: it cannot be created or written to.
         """
         try:
-            (self.copies / PARTIAL).mkdir(parents=True, exist_ok=True)
-            with locked_use(self.copies, _LOCK_SECONDS):
-                pass
+            self._quota.make()
         except OSError as error:
             raise CorpusError(f"--copies {self.copies}: cannot be written to: {error.strerror or error}") from error
 
@@ -264,10 +261,14 @@ class Copies(VideoSource):
         end = time.monotonic() + _SLOT_SECONDS
         for other in range(_SLOTS):
             slot = self.copies / PARTIAL / f"{(number + other) % _SLOTS:02}"
-            with open(open_private(slot.with_suffix(".lock"), os.O_WRONLY | os.O_CREAT), "wb") as lock:
-                if _lock(lock, end):
-                    yield slot
-                    return
+            name = slot.with_suffix(".lock")
+            with open(open_private(name, os.O_WRONLY | os.O_CREAT), "wb") as held:
+                try:
+                    lock(held.fileno(), end - time.monotonic(), name)
+                except BlockingIOError:
+                    continue
+                yield slot
+                return
         raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
 
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
@@ -318,22 +319,14 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the copies that are being read leave too little space.
         """
-        size = slot.stat().st_size
-        path.parent.mkdir(exist_ok=True)
         for wait in (_ROOM_SECONDS, _ROOM_SECONDS, 0.0):
-            with locked_use(self.copies, _LOCK_SECONDS) as used:
-                if used.bytes + size > self.most_bytes:
-                    enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
-                    for oldest in _oldest_first(self.copies):
-                        if used.bytes > enough:
-                            used.add(-_evicted(oldest))
-                if used.bytes + size <= self.most_bytes:
-                    used.add(size - (path.stat().st_size if path.exists() else 0))
-                    slot.replace(path)
-                    return
+            if self._quota.add(slot, path, evicts=True):
+                return
             time.sleep(wait)
-        why = f"its {size} bytes do not fit beside the {used.bytes} bytes that are being read: raise --copies-gib"
-        raise VideoUnreadable(id, None, why)
+        why = (
+            f"its {slot.stat().st_size} bytes do not fit beside the {self._quota.used_bytes} bytes that are being read"
+        )
+        raise VideoUnreadable(id, None, f"{why}: raise --copies-gib")
 
 
 def open_source(name: str, options: SourceOptions) -> Copies | None:
@@ -355,34 +348,3 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
 def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:
     for file in held.values():
         file.close()
-
-
-def _lock(file: IO[bytes], end: float) -> bool:
-    """Try at least once, and until ``end`` (monotonic), to lock a file; return whether it is locked."""
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        except BlockingIOError:
-            if time.monotonic() >= end:
-                return False
-        time.sleep(_POLL_SECONDS)
-
-
-def _oldest_first(folder: Path) -> list[Path]:
-    found = []
-    for below in folder.iterdir():
-        if below.is_dir() and below.name != PARTIAL:
-            with os.scandir(below) as entries:
-                found += [(entry.stat().st_mtime_ns, entry.path) for entry in entries]
-    return [Path(path) for _, path in sorted(found)]
-
-
-def _evicted(path: Path) -> int:
-    """Delete a copy, and return the bytes that this freed; 0 if it has a reader."""
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        size = os.fstat(file.fileno()).st_size
-        path.unlink()
-        return size
-    return 0

@@ -28,7 +28,7 @@ from v2v_server.corpus.sources import copies as copies_module
 from v2v_server.corpus.sources.bucket import Bucket, is_url
 from v2v_server.corpus.sources.copies import Copies
 from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
-from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
+from v2v_server.store.quota import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
