@@ -157,7 +157,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Keep a few indexes open: to open the index of a day takes a tenth of a second, on the only thread."""
+        """Keep a few indexes open: opening that of a day of video blocks the server for a tenth of a second."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index

@@ -49,7 +49,7 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
-from v2v_server.worker.sidecars import sidecar_files
+from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,8 @@ def make_sample(
     arrays = new_arrays(sample_layout(lease)) if into is None else into
     context, irregular = _context(lease, decoded, arrays, sidecars)
     for name, array in context.into.items():
-        ARRAY_BUILDERS[name](context, array)
+        with errors_of_sidecar(lease.video, name, sidecars):
+            ARRAY_BUILDERS[name](context, array)
     saturated = dict(context.saturated or {})
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from importlib.resources.abc import Traversable
 
-from v2v_protocol.errors import ProtocolError, SidecarError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, V2VError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
+
+_LONGEST_REASON = 500
 
 
 def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:
@@ -45,3 +47,27 @@ def open_sidecars(lease: Lease, source: VideoSource) -> Iterator[dict[str, Trave
             except VideoError as error:
                 raise SidecarError(lease.video, ending, error.reason, here=True) from error
         yield opened
+
+
+@contextmanager
+def errors_of_sidecar(video: str, array: str, sidecars: Mapping[str, Traversable | None]) -> Iterator[None]:
+    """Turn any error while an array is made from a sidecar into a SidecarError: a malformed file must end no worker.
+
+    Args:
+        video: catalogue id.
+        array: name of the array.
+        sidecars: what :func:`open_sidecars` lends.
+
+    Raises:
+        SidecarError: the array cannot be made from its sidecar.
+    """
+    try:
+        yield
+    except V2VError:
+        raise
+    except Exception as error:
+        for ending in sidecar_endings((array,)):
+            if sidecars.get(ending) is not None:
+                reason = f"{type(error).__name__}: {error}"[:_LONGEST_REASON]
+                raise SidecarError(video, ending, reason) from error
+        raise

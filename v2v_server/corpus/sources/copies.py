@@ -19,7 +19,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import islice, takewhile
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import IO
 from zipfile import Path as ZipPath
@@ -168,9 +168,9 @@ class Copies(VideoSource):
 
     def _below(self, id: str) -> Iterator[str]:
         """Yield the names of the listed objects of a sidecar, sorted."""
-        start = bisect_left(self._names, id)
         if id.endswith("/"):
-            yield from takewhile(lambda name: name.startswith(id), islice(self._names, start, None))
+            following = (self._names[at] for at in range(bisect_left(self._names, id), len(self._names)))
+            yield from takewhile(lambda name: name.startswith(id), following)
         elif id in self._objects:
             yield id
 
