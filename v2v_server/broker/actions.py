@@ -51,7 +51,7 @@ class SendLease:
 
 
 @dataclass(frozen=True, slots=True)
-class CutOff:
+class Disconnect:
     """Disconnect a consumer that keeps sending malformed messages."""
 
     identity: bytes
@@ -111,7 +111,7 @@ class ReportRefusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Show:
+class SendStatus:
     """Send the next state of the service to this peer.
 
     Attributes:
@@ -124,7 +124,7 @@ class Show:
 
 
 Action: TypeAlias = (
-    ToConsumer | ToWorker | SendLease | CutOff | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | Show
+    ToConsumer | ToWorker | SendLease | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
 )
 
 

@@ -23,6 +23,7 @@ from v2v_protocol.messages import (
     Begun,
     Denied,
     ErrorCode,
+    GetStatus,
     Goodbye,
     Hello,
     LeaseFailed,
@@ -31,7 +32,6 @@ from v2v_protocol.messages import (
     Pong,
     Result,
     SampleHeader,
-    See,
     Stop,
     Want,
     WorkerHello,
@@ -43,10 +43,10 @@ from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
     CheckVideo,
-    CutOff,
+    Disconnect,
     GiveUp,
     SendLease,
-    Show,
+    SendStatus,
     ToConsumer,
     ToWorker,
     denial,
@@ -192,8 +192,8 @@ class Dispatcher:
                         identity, encode(Pong(self.blocked_reason or self.registry.trouble(self._expected_workers)))
                     )
                 ]
-            case See():
-                return [Show(identity)]
+            case GetStatus():
+                return [SendStatus(identity)]
             case Goodbye():
                 if session is not None:
                     self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
@@ -269,7 +269,7 @@ class Dispatcher:
         if len(self._faults) > MOST_SESSIONS:
             del self._faults[next(iter(self._faults))]
         answer = ToConsumer(identity, self._malformed(error))
-        return answer if faults <= MOST_FAULTS else CutOff(identity)
+        return answer if faults <= MOST_FAULTS else Disconnect(identity)
 
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1
@@ -293,8 +293,8 @@ class Dispatcher:
             return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now, user)
-        if isinstance(message, See):
-            return [Show(identity, is_worker_side=True)]
+        if isinstance(message, GetStatus):
+            return [SendStatus(identity, is_worker_side=True)]
         if isinstance(message, Hello):
             text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
@@ -463,7 +463,7 @@ class Dispatcher:
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
-                self.counters.work.add(result, header.cpu_seconds)
+                self.counters.add(result, header.cpu_seconds)
                 self.registry.worked(identity, result, header.cpu_seconds)
                 actions.append(ToConsumer(request.session, payload))
         self.registry.can_work(identity)
@@ -491,11 +491,10 @@ class Dispatcher:
             self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Count a sample; return False if no session waits for it."""
+        """Count what was sent of a sample; return False if no session waits for it."""
         if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
-        self.counters.samples += 1
         self.counters.decodes += header.decoded
         self.counters.count_cache(header.cache)
         self.counters.batches += 1 / session.batch_size

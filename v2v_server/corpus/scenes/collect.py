@@ -14,19 +14,18 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
 from v2v_server.corpus.scenes.runs import SplitVideos
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, Scene
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -58,7 +57,7 @@ class SceneCollection:
         return FigureKind("scene", f"{made}{self.rows}, look {ANALYSIS_VERSION}")
 
     def collect(
-        self, store: Store, root: Path | Copies, table: VideoTable, processes: int, progress: Progress | None
+        self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
     ) -> bool:
         """Put the scene of each usable video that has none into the index, if it can be had.
 
@@ -69,7 +68,7 @@ class SceneCollection:
             sqlite3.Error: the index cannot be written.
         """
         missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
-        with closing(self._found(store, root, table, missing, processes)) as found:
+        with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
                 store.put_figures(self.kind, (figures(*each) for each in batch))
         return bool(missing)
@@ -116,7 +115,7 @@ class SceneCollection:
     def _found(
         self,
         store: Store,
-        root: Path | Copies,
+        source: VideoSource,
         table: VideoTable,
         missing: list[int],
         processes: int,
@@ -139,10 +138,10 @@ class SceneCollection:
 
         isolated = partial(
             run_isolated,
-            partial(_analyse, root),
+            partial(_analyse, source),
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
-            writable=None if isinstance(root, Copies) else compile_cache(),
+            writable=compile_cache() if source.is_local else None,
         )
         suspects = []
         for job, found in isolated(jobs(), processes):
@@ -188,7 +187,7 @@ class _Job:
     window: Window | None
 
 
-def _analyse(root: Path | Copies, job: _Job) -> bytes:
+def _analyse(source: VideoSource, job: _Job) -> bytes:
     """Return the encoded scene of one video, from what decodes before the first error.
 
     It is empty where the system, not the decoder, reports an error.
@@ -199,7 +198,7 @@ def _analyse(root: Path | Copies, job: _Job) -> bytes:
     analysis = SceneAnalysis()
     if job.index and job.window is not None:
         try:
-            with open_local(root, job.id, job.fingerprint) as path:
+            with source.open_local(job.id, job.fingerprint) as path:
                 pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
                 for picture in islice(pictures, MOST_FRAMES):
                     analysis.add(picture)

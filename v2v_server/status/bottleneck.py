@@ -1,0 +1,182 @@
+"""Find the bottleneck of the service, in one sentence, and what to do about it. Pure: it follows from shares of time.
+
+    consumers wait     as they report: time in which they needed a batch and had none
+    workers wait       time in which they held no lease
+    workers queue      time in which they could have worked and got no core
+    workers work       decoding, simulating, delivering: each result says how long
+    the broker works   time in which its loop did not wait for a message
+
+If consumers hardly wait, they are the bottleneck themselves. If they do, it is the broker if that has no time left;
+the network if workers have time left; else what takes most of the workers' time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from v2v_server.status.history import TimeWindow
+from v2v_server.system.status_fields import gauge, states, text
+
+NOTICEABLE_SHARE = 0.1
+"""Share of its time that a consumer may wait without being called stalled."""
+_IDLE_SHARE = 0.3
+"""Workers that are idle for a larger share of their time are not the bottleneck."""
+_FULL_SHARE = 0.85
+"""A broker that is busy for a larger share of its time is the bottleneck."""
+_LEAST_SECONDS = 2.0
+"""Shortest window that allows a conclusion."""
+_QUEUED_SHARE = 0.4
+"""If workers wait for a core for a larger share of their time, their host has too few cores."""
+_SPARE_SHARE = 0.5
+"""If workers are idle for a larger share of their time, fewer of them would do."""
+
+
+def _share(help: str, part: str) -> Any:
+    return gauge(help, "time_ratio", unit="0 to 1", part=part, default=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """Shares of the last ten seconds in which there was a consumer."""
+
+    seconds: float = gauge("Seconds of the last ten in which there was a consumer.", unit="s", default=0.0)
+    consumers: float = _share("Share of the consumers' time in which they waited for batches.", "consumers")
+    idle: float = _share("Share of the workers' time in which they held no lease.", "idle")
+    broker: float = _share("Share of the time in which the server's loop did not wait for a message.", "broker")
+    decode: float = _share("Share of the workers' time that decoding took.", "decode")
+    simulate: float = _share("Share of the workers' time that simulating took.", "simulate")
+    handover: float = _share("Share of the workers' time that delivering took.", "handover")
+    queued: float = _share("Share of all workers' time in which those of this server waited for a core.", "queued")
+    cores: float = gauge("Processor time of the workers by their time.", unit="cores", default=0.0)
+
+    @classmethod
+    def of(cls, window: TimeWindow) -> Shares:
+        """Compute the shares of a window."""
+        parts = {
+            name: window.share(f"{total}_seconds", "worker")
+            for name, total in (
+                ("decode", "decode"),
+                ("simulate", "simulate"),
+                ("handover", "handover"),
+                ("queued", "queued"),
+                ("cores", "cpu"),
+            )
+        }
+        return cls(
+            seconds=window.change("attended"),
+            consumers=window.share("waited_seconds", "consumer"),
+            idle=window.share("idle", "worker"),
+            broker=window.share("broker", "attended"),
+            **parts,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Bottleneck:
+    """The bottleneck of the service."""
+
+    part: str = states(
+        "1 for the part that is the bottleneck.",
+        "slow_part",
+        "no_consumers",  # none is connected
+        "start",  # too early to say
+        "workers",  # none can make a sample
+        "consumers",
+        "cores",  # the workers' host has too few
+        "decode",
+        "simulate",
+        "handover",
+        "broker",
+        "transit",  # requests and samples take long to arrive
+        "even",  # no notable waiting
+    )
+    sentence: str = text("What waits for what.")
+    remedy: str = text("What to do about it; empty if nothing is needed.", default="")
+
+
+def find_bottleneck(
+    shares: Shares,
+    *,
+    is_attended: bool,
+    workers: int,
+    starting: int = 0,
+    trouble: str = "",
+    has_cache: bool = False,
+) -> Bottleneck:
+    """Find the bottleneck.
+
+    Args:
+        shares: shares of the last seconds.
+        is_attended: whether there are consumers.
+        workers: number of connected workers.
+        starting: number of the server's own worker processes that are not connected yet.
+        trouble: why no worker can make a sample; empty if one can.
+        has_cache: whether the server's workers cache decoded clips.
+    """
+    if not is_attended:
+        return Bottleneck("no_consumers", "No consumer is connected.")
+    if trouble:
+        if starting and not workers:
+            return Bottleneck("workers", f"Consumers wait for workers: {starting} are starting.")
+        return Bottleneck("workers", f"Consumers wait for workers: {trouble}.")
+    if shares.seconds < _LEAST_SECONDS:
+        return Bottleneck("start", "It is too early to say what is slow: samples have just begun to flow.")
+    wait = f"{shares.consumers:.0%}"
+    if shares.consumers < NOTICEABLE_SHARE:
+        if shares.idle < _IDLE_SHARE:
+            return Bottleneck(
+                "even", f"Hardly any waiting: consumers {wait} of their time, workers {shares.idle:.0%}.", ""
+            )
+        spare = "fewer workers would do" if shares.idle >= _SPARE_SHARE else ""
+        return Bottleneck(
+            "consumers",
+            f"Workers wait for consumers, which use samples as fast as they can (they wait {wait} of their time); "
+            f"workers are idle {shares.idle:.0%} of theirs.",
+            spare,
+        )
+    if shares.broker >= _FULL_SHARE:
+        return Bottleneck(
+            "broker",
+            f"Consumers wait {wait} of their time for the server's own loop, which is busy {shares.broker:.0%} of its "
+            "time.",
+            "give its host a free core, let consumers on this host use shared memory, or split the consumers between "
+            "two servers",
+        )
+    if shares.idle >= _IDLE_SHARE:
+        return Bottleneck(
+            "transit",
+            f"Consumers wait {wait} of their time although workers are idle {shares.idle:.0%} of theirs: samples take "
+            "long to arrive, or too few are requested ahead.",
+            "check the network between them; raise --max-credit-bytes or --expect-workers so that more samples are "
+            "requested ahead",
+        )
+    if shares.queued >= _QUEUED_SHARE:
+        return Bottleneck(
+            "cores",
+            f"The workers' host is overloaded: consumers wait {wait} of their time for workers, which wait "
+            f"{shares.queued:.0%} of theirs for a core and get {shares.cores:.2f} of a core each.",
+            "more workers on this host would not help: stop other programs there, or start v2v-worker on other hosts",
+        )
+    part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
+    activity, remedy = {
+        "decode": (
+            "decode",
+            "start more workers (--workers, v2v-worker on other hosts)"
+            + ("" if has_cache else ", cache decoded clips (--cache)")
+            + ", prepare the videos once (v2v-prepare), or take more samples of each clip (samples_per_decode)",
+        ),
+        "simulate": (
+            "simulate",
+            "start more workers (--workers, v2v-worker on other hosts), or ask for less: a smaller crop, fewer "
+            "voxels_per_clip, fewer effects, no flow",
+        ),
+        "handover": (
+            "deliver samples",
+            "run consumers on the workers' host, where samples are in shared memory, or use a faster network",
+        ),
+    }[part]
+    sentence = (
+        f"Consumers wait {wait} of their time for workers, which {activity} {getattr(shares, part):.0%} of theirs."
+    )
+    return Bottleneck(part, sentence, remedy)
