@@ -220,15 +220,15 @@ class Store:
         self._database.execute(_SUMMARIES)
         return _has_table(self._database, "scene")
 
-    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, encoded figures) of each video that has figures for its present fingerprint, sorted by id.
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
+        """Yield (id, summary, encoded figures) of each video that has figures for its present fingerprint, sorted by id.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
         query = (
-            "SELECT figures.id, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? AND version = ? "
-            "AND typeof(data) = 'blob' ORDER BY figures.id"
+            "SELECT figures.id, summary, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? "
+            "AND version = ? AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY figures.id"
         )
         with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
             yield from rows

@@ -107,7 +107,7 @@ class SceneCollection:
             return known.decode()
         sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
         nothing = Scene.unknown().to_bytes()
-        for id, data in joined(ids, store.all_figures(self.kind), [], (nothing,)):
+        for id, _, data in joined(ids, store.all_figures(self.kind), [], (b"", nothing)):
             sha.update(nothing if id in unknown else data)
         with suppress(sqlite3.Error):  # a locked index costs the next start this time again
             store.put_figures(kept, [Figures("", key, b"", sha.hexdigest()[:32].encode())])

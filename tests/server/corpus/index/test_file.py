@@ -113,7 +113,7 @@ def test_figures_count_for_their_kind_version_and_fingerprint_only(corpus: Corpu
         summaries = {row[0]: row[-1] for row in store.rows(kinds[0])}
         assert summaries == dict.fromkeys(corpus.names) | {"000.mp4": b"s", "001.mp4": b"0"}
         assert {row[-1] for row in store.rows(None)} == {None}
-        assert list(store.all_figures(kinds[3])) == [("001.mp4", b"data 3")]
+        assert list(store.all_figures(kinds[3])) == [("001.mp4", b"3", b"data 3")]
         assert store.figures("001.mp4", "0-001.mp4", kinds[2]) == b"data 2"
         assert store.figures("001.mp4", "other", kinds[2]) is None
         assert store.figures("003.mp4", "0-003.mp4", kinds[2]) is None
