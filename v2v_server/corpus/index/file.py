@@ -221,7 +221,7 @@ class Store:
         return _has_table(self._database, "scene")
 
     def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
-        """Yield (id, summary, encoded figures) of each video that has figures for its present fingerprint, sorted by id.
+        """Yield (id, summary, encoded figures) by id, of each video with figures for its present fingerprint.
 
         Raises:
             sqlite3.Error: the file is damaged.
