@@ -193,7 +193,7 @@ class Store:
             yield from rows
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
-        """The encoded frame index of a file; None if the index does not know that state of it.
+        """Return the encoded frame index of a file; None if the index does not know this state of it.
 
         Raises:
             sqlite3.Error: the file is damaged.

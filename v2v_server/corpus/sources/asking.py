@@ -26,7 +26,7 @@ _IN_TURN = 256
 
 
 def is_said(done: int) -> bool:
-    """Whether progress is told after so many: to tell it a million times takes seconds."""
+    """Whether progress is reported after this number of files: a million reports take seconds."""
     return done <= _TOGETHER or done % _TOGETHER == 0
 
 
@@ -43,7 +43,7 @@ def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q
 
 
 def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Generator[tuple[Sequence[Q], A], None, None]:
-    """(some of the files, answer) until all were asked about, in their order.
+    """Yield (some of the files, answer) until all were asked about, in their order.
 
     One part after the other while they are answered at once, for threads that take turns cost more than a local disk's
     answer. When one is waited for, many are asked at a time; whether that is still needed is tried again and again.
