@@ -1,4 +1,4 @@
-"""Product code uses plain words."""
+"""Product code uses plain words: the forbidden ones do not appear."""
 
 import re
 from pathlib import Path
@@ -25,7 +25,7 @@ def sources() -> list[Path]:
     return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
-def test_product_code_uses_no_forbidden_words() -> None:
+def test_packages_use_no_forbidden_words() -> None:
     checked = sources()
     assert checked
     assert [line for path in checked for line in found(path)] == []

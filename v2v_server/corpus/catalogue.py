@@ -44,8 +44,6 @@ _SMALL_INDEX_BYTES = 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
-_REPLACED = "another process has catalogued another file under this name since the start: start again to serve it"
-
 
 @dataclass(frozen=True, slots=True)
 class CorpusPart:
@@ -130,11 +128,10 @@ class Catalogue:
         return FrameIndex.from_bytes(self._stored_index(id))
 
     def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
-        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, and the pieces of the
-        cache that they lie in, encoded.
+        """Return, encoded, at least the part of :meth:`frame_index` that frames start .. start + count - 1 need.
 
-        A small index is passed on whole and unopened: the worker that opens it reports damage. The latest are kept,
-        because siblings ask for the same one after the other.
+        The part covers the pieces of the cache that these frames lie in. A small index is returned whole and undecoded:
+        its reader checks whether it is damaged. The latest parts are kept, because siblings ask for the same one.
 
         Raises:
             CorpusError, IndexUnreadable, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and
@@ -157,7 +154,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Keep a few indexes open: opening that of a day of video blocks the server for a tenth of a second."""
+        """Keep a few large indexes decoded: to decode that of a day takes a tenth of a second of the loop."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index
@@ -173,7 +170,9 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, _REPLACED)
+            raise VideoChanged(
+                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
+            )
         return data
 
     def scene(self, id: str) -> Scene:
@@ -194,7 +193,9 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, _REPLACED)
+            raise VideoChanged(
+                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
+            )
         return Scene.from_bytes(data)
 
     @property
@@ -211,17 +212,19 @@ class Catalogue:
         return self.facts.digest_under(scene)
 
     def fail_fast(self) -> None:
-        """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
+        """Report a locked index at once, not after half a minute: a server's loop must not wait."""
         self._store.fail_fast()
 
     def mark_stale(self, id: str) -> None:
-        """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
-        say. Does nothing where the index cannot be written now."""
+        """Let the next start probe a video again: it differs from the catalogue, whatever its size and times say.
+
+        Does nothing where the index cannot be written now.
+        """
         with suppress(sqlite3.Error):
             self._store.mark_stale(id)
 
     def close(self) -> None:
-        """Close the index; ``frame_index`` works no more."""
+        """Close the index; ``frame_index`` and ``scene`` fail afterwards."""
         self._store.close()
         self.source.release()
 
@@ -262,7 +265,7 @@ def open_catalogue(
     progress: Progress | None = None,
     notice: Notice | None = None,
 ) -> Catalogue:
-    """Take in a corpus: probe what is new or changed, forget what is gone.
+    """Open a corpus: probe what is new or changed, forget what is gone.
 
     Args:
         source: a folder (searched to all depths), one video, a list file whose paths are relative to its folder, or an
@@ -272,16 +275,17 @@ def open_catalogue(
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
             ``~/.cache/v2v``.
         copies: folder for copies of videos from object storage; None takes one where the index lies.
-        copies_gib: limit of that folder, GiB.
-        scene: also take in what the videos show, which decodes what was not looked at yet; see
+        copies_gib: largest size of that folder, GiB.
+        scene: also analyse what the videos show, which decodes those not analysed yet; see
             :mod:`v2v_server.corpus.scenes`.
-        processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
-        progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
-        notice: told what is looked at before that, file by file, and how far it is.
+        processes: number of processes that probe; 0 probes in this one, which a file that crashes the decoder ends.
+        progress: called after each probed file; starts again where the index turns out to be unusable.
+        notice: called with a line of text as the search for files advances.
 
     Raises:
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
             be used.
+        IndexUnreadable: the index cannot be read any more after the probes.
     """
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
     corpus = list_corpus(opened, rows, notice)
@@ -291,6 +295,9 @@ def open_catalogue(
     try:
         with without_collections():
             return _snapshot(corpus, table, notes, store, scenes, notice)
+    except sqlite3.Error as error:
+        store.close()
+        raise IndexUnreadable(f"the catalogue's index {path} cannot be read: {error}; start again") from error
     except BaseException:
         store.close()
         raise
@@ -379,7 +386,7 @@ def _snapshot(
 
 
 def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:
-    """Return what a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
+    """Return what a list states: thresholds by number of the video, and the videos that are shorter than it says."""
     thresholds: dict[int, Thresholds] = {}
     shorter = []
     for entry in sorted({entry.id: entry for entry in listed}.values(), key=lambda entry: entry.id):

@@ -44,7 +44,7 @@ def collect_sidecars(
     known = dict[str, str]()  # state and fingerprint
     with suppress(sqlite3.Error):  # an index that cannot be read or written costs time only
         store.make_figures()
-        known = {id: data.decode("ascii", "replace") for id, data in store.all_figures(kind)}
+        known = {id: data.decode("ascii", "replace") for id, _, data in store.all_figures(kind)}
     fingerprints, fresh, unreadable, done = dict[str, str](), list[Figures](), list[str](), 0
 
     def states(part: Sequence[str]) -> list[str]:

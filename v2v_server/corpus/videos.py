@@ -78,17 +78,19 @@ class Videos(Sequence[VideoEntry]):
         Fingerprints cover the track and its orientation.
         """
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        pos, neg = NO_THRESHOLDS
+        none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
         table = self._table
+        numbers = table.frames, table.width_px, table.height_px, table.frames_per_second
         for start in range(0, len(self), CHUNK):
             those = slice(start, start + CHUNK)
-            columns = (table.frames, table.width_px, table.height_px, table.frames_per_second)
-            values = zip(
-                table.ids[those], table.fingerprints[those], *(c[those].tolist() for c in columns), strict=True
-            )
-            lines = []
-            for number, (id, fingerprint, frames, width, height, rate) in enumerate(values, start):
-                pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-                lines.append(f"{id}\0{fingerprint}\0{frames}\0{width}\0{height}\0{rate}\0{pos}\0{neg}\n")
+            columns = table.ids[those], table.fingerprints[those], *(column[those].tolist() for column in numbers)
+            lines = [
+                f"{id}\0{fingerprint}\0{frames}\0{width}\0{height}\0{rate}\0{limits.get(number, none)}\n"
+                for number, (id, fingerprint, frames, width, height, rate) in enumerate(
+                    zip(*columns, strict=True), start
+                )
+            ]
             sha.update("".join(lines).encode())
         return sha.hexdigest()[:32]
 

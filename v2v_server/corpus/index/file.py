@@ -193,7 +193,7 @@ class Store:
             yield from rows
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
-        """Return the encoded frame index of a file; None if the index does not know that state of it.
+        """Return the encoded frame index of a file; None if the index does not know this state of it.
 
         Raises:
             sqlite3.Error: the file is damaged.
@@ -220,15 +220,15 @@ class Store:
         self._database.execute(_SUMMARIES)
         return _has_table(self._database, "scene")
 
-    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, encoded figures) of each video that has figures for its present fingerprint, sorted by id.
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
+        """Yield (id, summary, encoded figures) by id, of each video with figures for its present fingerprint.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
         query = (
-            "SELECT figures.id, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? AND version = ? "
-            "AND typeof(data) = 'blob' ORDER BY figures.id"
+            "SELECT figures.id, summary, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? "
+            "AND version = ? AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY figures.id"
         )
         with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
             yield from rows

@@ -87,17 +87,18 @@ class SceneCollection:
         lengths = table.summaries.lengths
         is_known = (lengths >= _PAIR_BYTES) & (lengths % _PAIR_BYTES == 0)
         is_known[[place for id in unknown if (place := table.ids.find(id)) is not None]] = False
-        places = np.flatnonzero(is_known)
         unknown.update(table.ids[place] for place in np.flatnonzero(~is_known).tolist())
         summaries = table.summaries.where(is_known)
-        pairs = summaries.utf8.view("<i4").reshape(-1, 2).astype(np.int32)
-        counts = summaries.lengths // _PAIR_BYTES
+        state = hashlib.sha256(is_known.data)
+        state.update(lengths.data)
+        state.update(summaries.utf8.data)
+        counts = (summaries.lengths // _PAIR_BYTES).astype(np.int32)
+        pairs = summaries.utf8.view("<i4").reshape(-1, 2)
         is_run = np.ones(len(pairs), bool)
         is_run[np.cumsum(counts) - counts] = False  # the hash at the beginning of each summary
-        split = SplitVideos.select(table.frames[places], pairs[is_run], counts - 1)
-        split = replace(split, numbers=places[split.numbers].astype(np.int32))
-        state = hashlib.sha256(b"".join(column.tobytes() for column in (is_known, counts, pairs))).hexdigest()
-        return split, self._digest(store, table.ids, unknown, digest, state)
+        split = SplitVideos.select(table.frames[is_known], pairs[is_run].astype(np.int32, copy=False), counts - 1)
+        split = replace(split, numbers=np.flatnonzero(is_known)[split.numbers].astype(np.int32))
+        return split, self._digest(store, table.ids, unknown, digest, state.hexdigest())
 
     def _digest(self, store: Store, ids: Sequence[str], unknown: set[str], digest: str, state: str) -> str:
         """Return the digest of all scenes. It takes reading them all, so the index keeps it for one state of them."""
@@ -106,7 +107,7 @@ class SceneCollection:
             return known.decode()
         sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
         nothing = Scene.unknown().to_bytes()
-        for id, data in joined(ids, store.all_figures(self.kind), [], (nothing,)):
+        for id, _, data in joined(ids, store.all_figures(self.kind), [], (b"", nothing)):
             sha.update(nothing if id in unknown else data)
         with suppress(sqlite3.Error):  # a locked index costs the next start this time again
             store.put_figures(kept, [Figures("", key, b"", sha.hexdigest()[:32].encode())])

@@ -90,7 +90,7 @@ def _space_columns(line: str) -> list[str]:
 
 
 def _words_from_the_right(line: str) -> Iterator[str]:
-    """Yield the numbers that end the line, last first, each with the space in front of it; never the whole line."""
+    """Yield the numbers that end a line, last first, each with the space in front of it; never the whole line."""
     for _ in range(_MOST_COLUMNS - 1):
         match = re.search(r"\s+(\S+)$", line)
         if match is None or not _NUMBER.fullmatch(match[1]):
