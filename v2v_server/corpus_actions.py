@@ -12,9 +12,10 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoCha
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, SendLease, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, write_entry
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.corpus.catalogue import Catalogue, complete_lease
+from v2v_server.quarantine.file import write_entry
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 
 _RECORD_SECONDS = 2.0
 """Longest time to retry writing a quarantine entry while another process writes to the file."""
@@ -109,9 +110,10 @@ class CorpusActions:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
         except (VideoChanged, VideoGone):
-            self._catalogue.mark_stale(missing.video)
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -120,8 +122,9 @@ class CorpusActions:
             self._warned = now
             name = clean_name(self._dispatcher.registry.name_of(missing.identity))
             is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
-                f"worker {name} failed on {missing.video}, which "
+                f"worker {name} failed on {file}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",

@@ -11,10 +11,10 @@ from typing import Any, TypeAlias
 
 from v2v_server.broker.candidates import RefusalPart
 from v2v_server.broker.counters import Counters, FaultTotal
-from v2v_server.broker.quarantine import QuarantinePart, VerdictPart
 from v2v_server.corpus.catalogue import CorpusPart
+from v2v_server.quarantine.snapshots import QuarantinePart, VerdictPart
 from v2v_server.status.bottleneck import Bottleneck, Shares
-from v2v_server.store.used import CachePart
+from v2v_server.store.quota import CachePart
 from v2v_server.system.status_fields import Meaning, counter, gauge, meanings, states, text
 
 STATUS_VERSION = 1

@@ -15,12 +15,12 @@ from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_protocol.wire import LARGEST_HEADER_BYTES
 from v2v_server.broker.counters import FaultTotal
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.bottleneck import NOTICEABLE_SHARE, Bottleneck, Shares, find_bottleneck
 from v2v_server.status.history import TimeWindow
 from v2v_server.status.parts import (
@@ -31,7 +31,7 @@ from v2v_server.status.parts import (
     Status,
     WorkerPart,
 )
-from v2v_server.store.used import cache_part
+from v2v_server.store.quota import cache_part
 from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, short, values
 

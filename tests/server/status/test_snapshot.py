@@ -18,8 +18,8 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
-from v2v_server.broker.quarantine import QuarantineEntry
 from v2v_server.broker.session import RETURN_SECONDS
+from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.status.parts import STATUS_VERSION
 from v2v_server.status.publisher import ANSWER_SECONDS, MOST_WAITING
 from v2v_server.status.snapshot import MOST_SHOWN, to_json
