@@ -14,7 +14,7 @@ from rich.text import Text
 
 from v2v_protocol.progress import format_duration
 from v2v_server.corpus.sources.names import printable
-from v2v_server.status.parts import Status
+from v2v_server.status.parts import Status, meanings_at
 from v2v_server.status.text import figures
 
 _MOST_ROWS = 30
@@ -26,15 +26,6 @@ _COLOURS = {
     "lost": "red",
     "gone": "red",
 }
-_SHARES = (
-    ("consumers wait", "consumers"),
-    ("workers idle", "idle"),
-    ("decode", "decode"),
-    ("simulate", "simulate"),
-    ("deliver", "handover"),
-    ("no core", "queued"),
-    ("server busy", "broker"),
-)
 
 
 def line(status: Status) -> str:
@@ -58,8 +49,11 @@ def draw(status: Status, note: str = "") -> RenderableType:
     if waiting["remedy"]:
         parts.append(_text(f"What helps: {waiting['remedy']}."))
     shares = Table.grid(padding=(0, 2))
-    shares.add_row(*(f"{name} {waiting['shares'][key]:.0%}" for name, key in _SHARES))
-    shares.add_row(*(ProgressBar(total=1.0, completed=waiting["shares"][key], width=16) for _, key in _SHARES))
+    named = {
+        meaning.words: waiting["shares"][key] for key, meaning in meanings_at("waiting.shares").items() if meaning.words
+    }
+    shares.add_row(*(f"{words} {share:.0%}" for words, share in named.items()))
+    shares.add_row(*(ProgressBar(total=1.0, completed=share, width=16) for share in named.values()))
     said = f"{figures(status)}  {status['bytes_per_second'] / 1e6:.1f} MB/s"
     parts += [shares, _text(said), consumers_table(status["consumer_count"], status["consumers"]), _workers(status)]
     if status["refusals"]:
