@@ -80,7 +80,7 @@ def consumers_table(count: int, consumers: Sequence[Status]) -> Table:
             _text(f"{each['name'] or each['id'][:8]} on {each['host']}"),
             Text(each["state"], style=_COLOURS.get(each["state"], "")),
             str(each["epoch"]),
-            ProgressBar(total=1.0, completed=each["epoch_share"], width=20),
+            ProgressBar(total=1.0, completed=each.get("epoch_share", 0.0), width=20),  # servers before 0.2.0 lack it
             f"{each['position']}/{each['sequences']}",
             "" if each["eta_seconds"] is None else format_duration(each["eta_seconds"]),
             f"{each['batches_per_second']:.2f}",
