@@ -44,6 +44,8 @@ _SMALL_INDEX_BYTES = 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
+_REPLACED = "another process has catalogued another file under this name since the start: start again to serve it"
+
 
 @dataclass(frozen=True, slots=True)
 class CorpusPart:
@@ -117,7 +119,7 @@ class Catalogue:
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
 
     def frame_index(self, id: str) -> FrameIndex:
-        """The frames of a video, read from the index on disk.
+        """Read the frames of a video from the index on disk.
 
         Raises:
             CorpusError: no such id in this catalogue.
@@ -131,8 +133,8 @@ class Catalogue:
         """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, and the pieces of the
         cache that they lie in, encoded.
 
-        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
-        kept, because siblings ask for the same one after the other.
+        A small index is passed on whole and unopened: the worker that opens it reports damage. The latest are kept,
+        because siblings ask for the same one after the other.
 
         Raises:
             CorpusError, IndexUnreadable, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and
@@ -155,7 +157,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Opening the index of a day takes a tenth of a second, in the broker's only thread: a few stay open."""
+        """Keep a few indexes open: to open the index of a day takes a tenth of a second, on the only thread."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index
@@ -171,11 +173,11 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+            raise VideoChanged(id, None, _REPLACED)
         return data
 
     def scene(self, id: str) -> Scene:
-        """The statistics of a video, read from the index on disk.
+        """Read the statistics of a video from the index on disk.
 
         Raises:
             CorpusError: no such id in this catalogue, or it was opened without ``scene``.
@@ -192,7 +194,7 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+            raise VideoChanged(id, None, _REPLACED)
         return Scene.from_bytes(data)
 
     @property
@@ -270,7 +272,7 @@ def open_catalogue(
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
             ``~/.cache/v2v``.
         copies: folder for copies of videos from object storage; None takes one where the index lies.
-        copies_gib: at most so much lies there.
+        copies_gib: limit of that folder, GiB.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
             :mod:`v2v_server.corpus.scenes`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
@@ -309,7 +311,8 @@ def _snapshot(
         records = [on_disk.row(at) for at in range(len(on_disk))]
         files = {record.id: record.fingerprint for record in records}
         absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        table, _ = VideoTable.read((manifest.as_source(record).columns for record in records), len(records))
+        rows = ((*manifest.as_source(record).columns, None) for record in records)
+        table = replace(VideoTable.read(rows, len(records))[0], summaries=on_disk.summaries)
     else:
         table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
     usable = table.problem == np.array(None)
@@ -348,7 +351,7 @@ def _snapshot(
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
-        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
@@ -376,7 +379,7 @@ def _snapshot(
 
 
 def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:
-    """What a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
+    """Return what a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
     thresholds: dict[int, Thresholds] = {}
     shorter = []
     for entry in sorted({entry.id: entry for entry in listed}.values(), key=lambda entry: entry.id):

@@ -154,7 +154,7 @@ class Manifest:
         return kept if self.lossless else Rows()
 
     def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
-        """The ids that a corpus of this folder has; files that the manifest does not know are none.
+        """Return the ids that a corpus of this folder has. Files that are not in the manifest do not count.
 
         Args:
             listed: the ids that a list file names; None takes all.
@@ -183,7 +183,7 @@ class Manifest:
         return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
 
     def as_source(self, record: IndexRow) -> IndexRow:
-        """The record of a prepared file, with what has to agree with its source even where there is no sound file:
+        """Return the record of a prepared file, with what must agree with its source even without a sound file:
         the sequences of all others keep their places only if the source's frames are counted."""
         video = self.videos[record.id]
         made = video.fingerprint or f"none-of-{video.source_fingerprint}"
@@ -199,7 +199,7 @@ class Manifest:
 
 
 def read_manifest(root: Path) -> Manifest:
-    """The manifest in that folder.
+    """Read the manifest in that folder.
 
     Raises:
         CorpusError: it cannot be read, or is no manifest of this version.
@@ -241,7 +241,7 @@ def _header(line: bytes) -> Header:
 
 
 def _video(line: bytes) -> tuple[PreparedVideo, bool]:
-    """The record, and whether it is set aside."""
+    """Parse a video's line; return the record, and whether it is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
     video = _record(PreparedVideo, data)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import overload
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import sidecar_endings
-from v2v_server.corpus.index.columns import CHUNK, VideoTable
+from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.runs import Runs, SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.video.rows import Rows
@@ -63,7 +63,8 @@ class Videos(Sequence[VideoEntry]):
     def __init__(
         self, table: VideoTable, thresholds: Mapping[int, Thresholds], split: SplitVideos | None = None
     ) -> None:
-        self._table, self._thresholds, self.split = table, thresholds, split
+        self._table = replace(table, summaries=NO_STRINGS)  # tens of MB that only ``split`` is made of
+        self._thresholds, self.split = thresholds, split
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
 

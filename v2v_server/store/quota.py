@@ -17,9 +17,8 @@ from pathlib import Path
 
 from v2v_server.system.locks import lock
 from v2v_server.system.private import open_private
-from v2v_server.system.status_fields import counter, gauge, text
+from v2v_server.system.status_fields import GIB, counter, gauge, text
 
-GIB = 1 << 30
 LEAST_FREE_BYTES = GIB
 """Always keep this much disk space free."""
 _USED, PARTIAL = "used", "partial"

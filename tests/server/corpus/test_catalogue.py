@@ -191,7 +191,7 @@ def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener)
     assert [video.frames for video in changed.videos] == [12, 30, 30]
     assert ids(moved) == ["a.mp4", "new.mp4", "sub/deep/c with space.MP4"]
     assert len({first.digest, changed.digest, moved.digest}) == 3
-    with pytest.raises(VideoChanged, match="catalogued anew"):
+    with pytest.raises(VideoChanged, match="has catalogued another file under this name"):
         first.frame_index("a.mp4")
     with pytest.raises(CorpusError, match="no video of this catalogue"):
         moved.frame_index("sub/b.mp4")

@@ -69,7 +69,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Receives a line whenever the rows of an index are read."""
     lines: list[str] = []
     rows = Store.rows
-    monkeypatch.setattr(Store, "rows", lambda store: lines.append(os.fspath(store.path)) or rows(store))
+    monkeypatch.setattr(Store, "rows", lambda store, kind: lines.append(os.fspath(store.path)) or rows(store, kind))
     return lines
 
 

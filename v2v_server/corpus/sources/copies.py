@@ -143,14 +143,15 @@ class Copies(VideoSource):
         return self.bucket.state(id)
 
     def verify(self, id: str, fingerprint: str, state: State | None) -> None:
-        """Check the object against its state, with one question. An answer that cannot be had is no error.
+        """Check an object, or a sidecar, against its state, with one question. If the store gives no answer, that is no
+        error.
 
         Raises:
             VideoGone, VideoChanged: the object is gone, or another one by now.
         """
         try:
             if is_sidecar(id):
-                found = self.bucket.find(id) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
+                found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != self.sidecar_states([id])[0]
             else:
                 changed = self.bucket.state(id, tries=1) != state and state is not None

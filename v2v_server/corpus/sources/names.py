@@ -27,9 +27,10 @@ _STEERING = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066
 
 
 def printable(name: str) -> str:
-    """The name as it may be shown: what is not UTF-8 text, and what would steer a terminal or turn the text around it
-    (control and bidirectional characters), escaped."""
-    if name.isascii() and name.isprintable():  # as nearly all are, and there may be a million of them
+    """Escape what is not UTF-8 text, and what would steer a terminal or turn the text around it (control and
+    bidirectional characters).
+    """
+    if name.isascii() and name.isprintable():  # nearly all are, and there may be a million of them
         return name
     text = os.fsencode(name).decode("utf-8", "backslashreplace")
     return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
