@@ -148,7 +148,7 @@ class Session:
 
     @property
     def display(self) -> tuple[object, ...]:
-        """What consumers are told apart by if their secrets differ: a trainer has a new one in each epoch."""
+        """What identifies a consumer in the status: a trainer has a new secret in each epoch."""
         return self.user, self.name, self.host, self.spec.digest, self.seed
 
 

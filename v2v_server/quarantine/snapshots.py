@@ -21,6 +21,7 @@ from v2v_protocol.errors import CorpusError
 from v2v_server.system.status_fields import gauge, short, text
 
 VERDICTS_PER_VIDEO = 2
+_MOST_VERDICTS = 20
 
 _MOST_VERDICTS = 20
 

@@ -159,7 +159,7 @@ def events(status: Status) -> list[str]:
     """Name the unusual events since the start, those that happened: "2 refused candidates"."""
     named = meanings_at("totals").items()
     return [
-        f"{status['totals'][name]} {name.replace('_', ' ')}"
+        f"{status['totals'][name]} {meaning.words or name.replace('_', ' ')}"
         for name, meaning in named
         if meaning.is_event and status["totals"].get(name)
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 
 @contextlib.contextmanager
@@ -38,14 +38,10 @@ def write_port_file(file: str, address: str) -> None:
     Raises:
         UsageError: the file cannot be written.
     """
-    path = Path(file)
-    partial = path.parent / f".{path.name}.{os.getpid()}"
     try:
-        partial.write_text(address + "\n", encoding="utf-8")
-        partial.replace(path)
+        with write_aside_and_rename(Path(file)) as partial:
+            partial.write_text(address + "\n", encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise UsageError(f"--port-file {file}: {error.strerror}; give a file in a folder that you can write") from error
 
 

@@ -26,6 +26,7 @@ class Meaning:
         unit: "s", "bytes", "GiB", "cores", "/s", "0 to 1"; empty: a number of what the name says.
         metric: name of the metric without prefix and suffix; empty: it is no metric, None: the field's name.
         part: value of the label "part", where fields share a metric.
+        words: what people read in place of the field's name; empty: the name.
         states: every value that the field can have.
         merge: makes one value of the values of peers with the same name.
         is_event: whether it counts unusual events, which one-line views name once there are any.
@@ -37,6 +38,7 @@ class Meaning:
     unit: str = ""
     metric: str | None = ""
     part: str = ""
+    words: str = ""
     states: tuple[str, ...] = ()
     merge: Callable[[Iterable[float]], float] = sum
     is_event: bool = False
@@ -64,11 +66,12 @@ def gauge(
     *,
     unit: str = "",
     part: str = "",
+    words: str = "",
     merge: Callable[[Iterable[float]], float] = sum,
     **options: Any,
 ) -> Any:
     """Declare a value that rises and falls; ``options`` are those of ``dataclasses.field``. See :class:`Meaning`."""
-    return _field(Meaning(help, "gauge", unit, metric, part, merge=merge), **options)
+    return _field(Meaning(help, "gauge", unit, metric, part, words, merge=merge), **options)
 
 
 def states(help: str, metric: str, *values: str) -> Any:
