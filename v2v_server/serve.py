@@ -39,13 +39,14 @@ from v2v_server.broker.actions import (
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.status.publisher import StatusPublisher
@@ -387,9 +388,10 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
         except (VideoChanged, VideoGone):
-            self._catalogue.mark_stale(missing.video)
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -398,8 +400,9 @@ class Server:
             self._missing_told = now
             name = clean_name(self._name(missing.identity).decode())
             is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
-                f"worker {name} failed on {missing.video}, which "
+                f"worker {name} failed on {file}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",

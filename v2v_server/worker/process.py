@@ -17,7 +17,7 @@ from pathlib import Path
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.errors import SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
@@ -53,7 +53,7 @@ from v2v_server.worker.conversation import (
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.produce import kernels_of, make_sample, open_sidecars, sample_layout, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
@@ -109,7 +109,7 @@ class Worker:
         if cache is not None:
             cache.on_wait = self._note_wait
         self._source = source
-        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
+        self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
         self._handover_seconds = 0.0  # not yet reported in a result
@@ -186,12 +186,12 @@ class Worker:
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
-                except VideoError as error:
+                    made: tuple[Frames, Timings] | VideoError | SidecarError = self._make_sample(lease)
+                except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
-                if isinstance(made, VideoError):
+                if isinstance(made, VideoError | SidecarError):
                     return conversation.on_failure(made, now)
                 frames, timings = made
                 return conversation.on_sample(frames, now, timings)
@@ -208,17 +208,18 @@ class Worker:
         """
         if self._clips.has(lease):
             return True
-        video = lease.video, lease.fingerprint
-        return (self._unfetched is not None and self._unfetched[0] == video) or self._source.has(*video)
+        files = _files(lease)
+        return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:
-        """Fetch the lease's video before the lease is begun, so that network time does not count against the sample."""
+        """Fetch the lease's files before the lease is begun, so that network time does not count against the sample."""
         if self._has_video(lease):
             return
+        files = _files(lease)
         try:
-            self._source.fetch(lease.video, lease.fingerprint)
+            self._source.fetch(files)
         except VideoError as error:
-            self._unfetched = (lease.video, lease.fingerprint), error
+            self._unfetched = files, error
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """Return the first frames of all available messages."""
@@ -234,11 +235,12 @@ class Worker:
         """Make a lease's sample and return its message with the timings.
 
         Raises:
-            VideoError: its video cannot be used.
+            VideoError, SidecarError: its video, or a file beside it, cannot be used.
         """
-        if self._unfetched is not None and self._unfetched[0] == (lease.video, lease.fingerprint):
+        if self._unfetched is not None and self._unfetched[0] == _files(lease):
             error, self._unfetched = self._unfetched[1], None
-            raise error
+            if error.video == lease.video:
+                raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
         buffer = open_output_buffer(lease, sample_layout(lease))
         has_room = time.monotonic()
@@ -250,7 +252,8 @@ class Worker:
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sample = make_sample(lease, clip, buffer.arrays)
+        with open_sidecars(lease, self._source) as sidecars:
+            sample = make_sample(lease, clip, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -297,6 +300,11 @@ def _size_bytes(lease: Lease) -> int:
     """Return the size of the lease's video, which starts the fingerprint."""
     size = lease.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
+
+
+def _files(lease: Lease) -> dict[str, str]:
+    """Return the fingerprints of the files that a lease's sample is made from, by id."""
+    return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
 
 
 def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:
