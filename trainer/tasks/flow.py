@@ -23,6 +23,8 @@ from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.models.sequence import VoxelNetwork
 from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
 from v2v_client import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +93,15 @@ class Flow(Task):
             origin = WHERE_TO_GET_WEIGHTS[settings.raft_size]
             weights = required_file(settings, "raft_weights", "loss.flow = raft (or take loss.flow = stream)", origin)
             self._raft = RaftFlow(settings.raft_size, weights, device, bfloat16=bfloat16)
+
+    @classmethod
+    def check(cls, _settings: FlowTaskSettings, recipe: Recipe) -> None:
+        """See :meth:`Task.check`."""
+        if recipe.grids_per_frame > 1:
+            raise UsageError(
+                f"stream.recipe.grids_per_frame = {recipe.grids_per_frame}: a flow network needs the flow of every "
+                "voxel grid, and frames give that of a whole step; set grids_per_frame to 1 or 0"
+            )
 
     @property
     def asked(self) -> Asked:
