@@ -166,8 +166,8 @@ class Provenance:
         decoder: codec name, and whether its decoding is bit-exact on every host.
         quarantine: number of the quarantine snapshot it was made under.
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
-        saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
+        saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
     """
 
     id: SampleId
@@ -182,8 +182,8 @@ class Provenance:
     decoder: str
     quarantine: int = 0
     scene: str = ""
-    saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -196,16 +196,17 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; ``scene``, ``saturated`` and ``sidecars`` are
-        left out if they are empty.
+        """Return plain values, as they travel in the sample's header. Empty ``scene``, ``sidecars`` and ``saturated``
+        are left out.
         """
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars")
-        return {name: value for name, value in values.items() if value or name not in optional}
+        return {
+            name: value for name, value in values.items() if value or name not in ("scene", "sidecars", "saturated")
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:

@@ -14,7 +14,7 @@ from v2v_protocol.errors import IndexUnreadable, ProtocolError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
@@ -53,6 +53,9 @@ class NamedCorpus:
     def facts(self) -> CorpusFacts:
         """What is known in memory; these videos have no statistics."""
         return CorpusFacts(self.videos, self.rows, self.digest, None, self.sidecars)
+
+    def part(self) -> CorpusPart:
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
     def digest_under(self, scene: str) -> str:
         return self.facts.digest_under(scene)

@@ -221,6 +221,7 @@ class ConnectionGuard:
             _peer(descriptor), time.monotonic(), delivered=self._handshake_bytes
         )
         self._silent[descriptor] = None
+        self._to_check.add(descriptor)  # what it sent before it is registered below is not reported
         if self._most_queued_bytes is not None:
             with contextlib.suppress(OSError):  # it has ended, or ended late and is still registered
                 # Edge-triggered: reports a connection once after each arrival of data, although ZeroMQ reads the data.

@@ -33,6 +33,7 @@ from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Vid
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
+from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -44,6 +45,15 @@ _SMALL_INDEX_BYTES = 4096
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
 _REPLACED = "another process has catalogued another file under this name since the start: start again to serve it"
+
+
+@dataclass(frozen=True, slots=True)
+class CorpusPart:
+    """The corpus in the status."""
+
+    videos: str = text("Where the videos are.")
+    video_count: int = gauge("Videos of the catalogue.", "videos")
+    unusable_count: int = gauge("Files that cannot be used.", "unusable_videos")
 
 
 @dataclass(frozen=True)
@@ -147,7 +157,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Keep a few indexes open: opening that of a day of video blocks the server for a tenth of a second."""
+        """Keep a few indexes open: to open the index of a day takes a tenth of a second, on the only thread."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index
@@ -191,6 +201,10 @@ class Catalogue:
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
+
+    def part(self) -> CorpusPart:
+        """Return what the status says of it."""
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
     def digest_under(self, scene: str) -> str:
         """See :meth:`CorpusFacts.digest_under`."""

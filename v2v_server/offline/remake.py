@@ -225,7 +225,7 @@ def simulate_to_file(
     try:
         np.savez_compressed(out, **content)
         if picture is not None:
-            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe.frames_per_bin)
+            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
         if events is not None:
             made = list_sample_events(remade.lease, remade.decoded)

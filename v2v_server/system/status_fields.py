@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 GIB = 1 << 30
+_LONGEST_TEXT = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,11 @@ def values(item: Any) -> dict[str, Any]:
     """Return the values of an instance's status fields, by name."""
     kind: Any = type(item)
     return {name: getattr(item, name) for name in meanings(kind)}
+
+
+def short(text: str) -> str:
+    """Cut a text, for instance the name of a file, to the length that a status holds of it."""
+    return text[:_LONGEST_TEXT]
 
 
 def _field(meaning: Meaning, **options: Any) -> Any:

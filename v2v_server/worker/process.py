@@ -40,10 +40,11 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
-    Callbacks,
+    Inspect,
     Listen,
     Load,
     Make,
+    Readiness,
     Reconnect,
     Say,
     Send,
@@ -118,14 +119,6 @@ class Worker:
         self._conversation = WorkerConversation(
             WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname(), secrets.token_bytes(32)),
             address,
-            Callbacks(
-                is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
-                is_compiled=lambda lease: (
-                    all(map(is_compiled, kernels_of(lease) - self._kernels))
-                    and (self._has_video(lease) or _size_bytes(lease) <= _SOON_FETCHED_BYTES)
-                ),
-                is_decoded=self._clips.has,
-            ),
             is_watched=logbook is not None,
         )
         try:
@@ -174,6 +167,8 @@ class Worker:
             case Listen(seconds):
                 messages = self._messages(seconds)
                 return conversation.on_messages(messages, time.monotonic())
+            case Inspect(lease):
+                return conversation.on_inspected(self._inspect(lease), time.monotonic())
             case Load(lease):
                 for variant in kernels_of(lease) - self._kernels:
                     load_in_turn(variant)
@@ -198,6 +193,13 @@ class Worker:
                 return conversation.on_sample(frames, now, timings)
             case _:
                 return []  # Leave
+
+    def _inspect(self, lease: Lease) -> Readiness:
+        """Return what the work on a lease needs."""
+        missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
+        is_ready = not missing and has_video
+        is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
+        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
 
     def _note_wait(self, waits: bool) -> None:
         """Note that a wait for other processes, inside of decoding, is no decoding."""

@@ -211,7 +211,7 @@ def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
     Raises:
         VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
     """
-    context, _ = _context(lease, decoded, {})
+    context, _ = _context(lease, decoded, {}, {})
     made, (seconds, _) = simulate(context, {}), _step_seconds(lease, decoded)
     return list_events(made.given, made.real, 1e6 * seconds)
 

@@ -12,10 +12,10 @@ from v2v_protocol import sample
 from v2v_protocol.errors import ProtocolError, SidecarError, VideoError
 from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello
 from v2v_protocol.sample import FromSidecar
-from v2v_protocol.wire import decode
+from v2v_protocol.wire import decode, encode
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.sidecar import fingerprint_of
-from v2v_server.worker.conversation import Callbacks, Send, WorkerConversation
+from v2v_server.worker.conversation import Readiness, Send, WorkerConversation
 from v2v_server.worker.sidecars import errors_of_sidecar, open_sidecars, sidecar_files
 
 ENDING = ".label.json"
@@ -69,11 +69,10 @@ def test_any_error_over_a_sidecar_is_the_sidecars(tmp_path: Path) -> None:
 
 
 def test_the_worker_reports_the_sidecar_and_not_the_video() -> None:
-    callbacks = Callbacks(lambda lease: True, lambda lease: True, lambda lease: False)
-    talk = WorkerConversation(WorkerHello("w", 1, 2), "ipc://x", callbacks, is_watched=True)
+    talk = WorkerConversation(WorkerHello("w", 1, 2), "ipc://x", is_watched=True)
     talk.start(0.0)
-    talk._leases.append(lease(lease=5))
-    talk.on_messages([], 0.0)
+    talk.on_messages([*encode(lease(lease=5))], 0.0)
+    talk.on_inspected(Readiness(is_ready=True, is_soon_ready=True, is_decoded=False), 0.0)
     (said, *_) = talk.on_failure(SidecarError("a.mp4", ENDING, "has no frame 3", here=True), 1.0)
     assert isinstance(said, Send)
     assert decode(said.frames[0]) == LeaseFailed(5, None, "has no frame 3", True, ENDING)
