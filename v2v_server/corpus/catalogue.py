@@ -33,6 +33,7 @@ from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Vid
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
+from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -42,6 +43,15 @@ _KEPT_LONG_FRAMES = 1 << 22
 _SMALL_INDEX_BYTES = 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+
+
+@dataclass(frozen=True, slots=True)
+class CorpusPart:
+    """The corpus in the status."""
+
+    videos: str = text("Where the videos are.")
+    video_count: int = gauge("Videos of the catalogue.", "videos")
+    unusable_count: int = gauge("Files that cannot be used.", "unusable_videos")
 
 
 @dataclass(frozen=True)
@@ -192,6 +202,10 @@ class Catalogue:
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
+
+    def part(self) -> CorpusPart:
+        """Return what the status says of it."""
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
     def digest_under(self, scene: str) -> str:
         """See :meth:`CorpusFacts.digest_under`."""

@@ -127,7 +127,7 @@ def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64],
         changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
         done += len(part)
         if notice is not None:
-            notice(f"looking at files: {done} of {len(ids)}, {len(changed)} of them new or changed")
+            notice(f"looking at files in {source}: {done} of {len(ids)}, {len(changed)} of them new or changed")
     return changed
 
 
@@ -138,7 +138,7 @@ def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> lis
         done += len(part)
         gone += [id for id, size in zip(part, states[::3], strict=True) if size == GONE[0]]
         if notice is not None:
-            notice(f"looking for files that are gone: {done} of {len(ids)} that this corpus does not name")
+            notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
 
 
