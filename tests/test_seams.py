@@ -58,7 +58,7 @@ def after(tables, own, block, at):
         pixel, step = folds_of(block.key, PIXEL), word(folds_of(block.key, STEP), at.step)
         for i in range(BLOCK_PX):
             if word((word(pixel, at.first + i), step), 0) < tables.chance:
-                block.signed[i] = block.tolerance - block.tolerance
+                block.rises[i] = block.falls[i] = block.tolerance - block.tolerance
 '''
 EFFECT_LINES = (
     ("v2v_protocol/recipe.py", "    dead_pixel_share: Range =",
@@ -92,7 +92,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.simulation.effects import event_loss
-from v2v_server.simulation.effects.kernel import simulate_pixels_with_effects
+from v2v_server.simulation.effects.kernel import simulate_general
 
 folder = Path(sys.argv[1])
 catalogue = open_catalogue(folder, processes=0, cache_dir=folder)
@@ -103,7 +103,7 @@ for name, recipe in (("off", Recipe(**small)), ("on", Recipe(**small, event_loss
     made[name] = remake(
         catalogue, StreamSpec(recipe=recipe), seed=1, epoch=0, index=0, arrays=("voxels", "frames", "depth")
     )
-    kernels = len(simulate_pixels_with_effects.signatures)
+    kernels = len(simulate_general.signatures)
     assert kernels == (name == "on"), "an effect that is off runs the code that ran without it"
 off, on = made["off"], made["on"]
 params = on.provenance.params

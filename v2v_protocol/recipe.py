@@ -56,6 +56,8 @@ SMALLEST_THRESHOLD_SHARE = 0.25
 """No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
+LATER_FIELDS = ("grids_per_frame",)
+"""Fields that the plain form leaves out at their defaults, so that older digests hold."""
 LARGEST_EVENTS = 2.0**49
 """Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
@@ -68,9 +70,14 @@ class Recipe:
         RecipeError: a value is outside its limits; the message names the field, the value and the limit.
     """
 
-    voxels_per_clip: int = whole(40, 1, 1_000_000, "T, voxel grids of a clip", group="Clip")
+    voxels_per_clip: int = whole(
+        40, 1, 1_000_000, "T, frames of a clip, each with the voxel grids that end at it", group="Clip"
+    )
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
     frames_per_bin: int = whole(1, 1, 1024, "steps between video frames in one bin")
+    grids_per_frame: int = whole(
+        0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps"
+    )
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
@@ -141,6 +148,11 @@ class Recipe:
 
     def __post_init__(self) -> None:
         check_settings(self, "recipe {}".format, RecipeError)
+        if self.grids_per_frame and self.frames_per_bin != 1:
+            raise RecipeError(
+                f"recipe frames_per_bin = {self.frames_per_bin}: bins are parts of a step if grids_per_frame is set "
+                f"({self.grids_per_frame}): set frames_per_bin to 1, or grids_per_frame to 0"
+            )
         if self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
@@ -177,9 +189,30 @@ class Recipe:
         return self.crop_height_px, self.crop_width_px
 
     @property
+    def steps_per_frame(self) -> int:
+        """Steps between consecutive video frames from one delivered frame to the next."""
+        return 1 if self.grids_per_frame else self.bins * self.frames_per_bin
+
+    @property
+    def voxel_grids(self) -> int:
+        """Voxel grids of a sample: T + lead_voxels, times ``grids_per_frame`` if that is set."""
+        return (self.voxels_per_clip + self.lead_voxels) * max(1, self.grids_per_frame)
+
+    @property
+    def frame_grids(self) -> tuple[int, ...]:
+        """Number of the voxel grid that ends at each delivered frame; -1 for a lead frame before the first grid."""
+        grids = max(1, self.grids_per_frame)
+        return tuple(step // self.steps_per_frame * grids - 1 for step in self.target_steps)
+
+    @property
     def steps(self) -> int:
         """Differences between consecutive frames in a sample, lead voxel included."""
-        return (self.voxels_per_clip + self.lead_voxels) * self.bins * self.frames_per_bin
+        return (self.voxels_per_clip + self.lead_voxels) * self.steps_per_frame
+
+    @property
+    def most_segments(self) -> int:
+        """Largest number of segments that the pixels of a sample are simulated in (``Timeline``)."""
+        return self.steps * max(1, self.grids_per_frame * self.bins)
 
     @property
     def frames_needed(self) -> int:
@@ -194,7 +227,7 @@ class Recipe:
     @property
     def target_steps(self) -> tuple[int, ...]:
         """Frame positions (0 .. steps) of the delivered frames: the end of each voxel, and the lead frame."""
-        span = self.bins * self.frames_per_bin
+        span = self.steps_per_frame
         first = (self.lead_voxels + 1 - self.lead_frames) * span
         return tuple(range(first, self.steps + 1, span))
 
@@ -230,7 +263,7 @@ class Recipe:
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
         return most_events(
-            self.steps, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
+            self.most_segments, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -241,7 +274,9 @@ class Recipe:
         }
         # A fixed value is written as a number: older digests depend on this form.
         low, high = self.log_eps
-        return values | {"log_eps": low} if low == high else values
+        if low == high:
+            values["log_eps"] = low
+        return {name: value for name, value in values.items() if value or name not in LATER_FIELDS}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
@@ -286,7 +321,7 @@ def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[flo
     the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
 
     Args:
-        steps: differences between frames.
+        steps: differences between frames, or segments of them.
         log_ends: smallest and largest log intensity L.
         thresholds: smallest and largest contrast threshold, log units.
         noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.

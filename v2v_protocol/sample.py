@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_protocol.events import EventList, to_events
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.settings import require_whole
@@ -22,8 +21,12 @@ LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
 ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
-    "voxels": lambda recipe, voxel_dtype: (
-        voxel_dtype, (recipe.voxels_per_clip + recipe.lead_voxels, recipe.bins, *recipe.crop_px)
+    "voxels": lambda recipe, voxel_dtype: (voxel_dtype, (recipe.voxel_grids, recipe.bins, *recipe.crop_px)),
+    "event_counts": lambda recipe, voxel_dtype: (
+        voxel_dtype, (recipe.voxel_grids, 2, recipe.bins, *recipe.crop_px)
+    ),
+    "voxels_bilinear": lambda recipe, voxel_dtype: (
+        "float32" if voxel_dtype == "float32" else "float16", (recipe.voxel_grids, recipe.bins, *recipe.crop_px)
     ),
     "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
@@ -31,7 +34,12 @@ ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
 }  # fmt: skip
 """Arrays a consumer may request: dtype and shape for one sample (no batch dimension), by the recipe and the spec's
 ``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
-1 where forward and backward flow agree."""
+1 where forward and backward flow agree.
+
+event_counts are the negative (0) and positive (1) events of each bin: one array with an axis of polarity, because
+RVT's stacked histogram and the input of a spiking network are then views of it, with one name and one buffer. Its dtype
+is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. voxels_bilinear shares each event between
+the two bins next to its time (Zhu et al. 2019)."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""
@@ -138,6 +146,7 @@ class Provenance:
         decoder: codec name, and whether its decoding is bit-exact on every host.
         quarantine: number of the quarantine snapshot it was made under.
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
+        saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
     """
 
     id: SampleId
@@ -152,6 +161,7 @@ class Provenance:
     decoder: str
     quarantine: int = 0
     scene: str = ""
+    saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -164,15 +174,15 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; ``scene`` is left out if it is empty."""
+        """Return plain values, as they travel in the sample's header; ``scene`` and ``saturated`` are left out if they
+        are empty.
+        """
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        if not self.scene:
-            del values["scene"]
-        return values
+        return {name: value for name, value in values.items() if value or name not in ("scene", "saturated")}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
@@ -271,17 +281,6 @@ class Sample:
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name}: {array.dtype}{list(array.shape)}" for name, array in self.arrays.items())
         return f"Sample({shapes}, {self.provenance.video}@{self.provenance.start_frame})"
-
-    def to_events(self, bin_us: float) -> EventList:
-        """Convert the voxels, lead voxels included, to events (x, y, t, p) for bins of ``bin_us`` microseconds. Their
-        times within a bin are invented, by the rule of :mod:`v2v_protocol.events`.
-
-        Raises:
-            UsageError: the sample has no voxels, or the duration is out of range.
-        """
-        if "voxels" not in self.arrays:
-            raise UsageError("the sample has no voxels, which events are made from: request that array")
-        return to_events(self.arrays["voxels"], bin_us)
 
     def _repr_html_(self) -> str:
         rows = {name: f"{array.dtype} {list(array.shape)}" for name, array in self.arrays.items()}

@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
+from v2v_protocol.recipe import LARGEST_SIDE_PX, LATER_FIELDS, Recipe, preset
 from v2v_protocol.settings import check_settings, format_value, nearest, require_known, settings_of, switch, whole, word
 
 VoxelDtype = Literal["int8", "int16", "float32"]
@@ -212,5 +212,6 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         return value
     if isinstance(value, Mapping):
         named = {str(key): item for key, item in value.items()}
-        return Recipe.from_dict(named) if "preset" in named else base.replace(**named)
+        is_complete = settings_of(Recipe).keys() - set(LATER_FIELDS) <= named.keys()
+        return Recipe.from_dict(named) if "preset" in named or is_complete else base.replace(**named)
     return preset(value)

@@ -25,6 +25,8 @@ _COUNTED = ("threshold", "threshold_ratio", "noise_sigma", "hot_pixel_sigma", "l
 def _recipe(milder: Sequence[str], **values: object) -> Recipe:
     """Values that are fine each by itself may make more events together than can be counted: then the fields that count
     most take their defaults, one after another in the order ``milder``. Nothing is drawn in vain."""
+    if values["grids_per_frame"]:
+        values["frames_per_bin"] = 1
     for name in milder:
         try:
             return Recipe(**values)  # type: ignore[arg-type]
@@ -41,6 +43,7 @@ recipes = st.builds(
     voxels_per_clip=st.integers(1, 500),
     bins=st.integers(1, 20),
     frames_per_bin=st.integers(1, 20),
+    grids_per_frame=st.just(0) | st.integers(1, 20),
     lead_frames=st.integers(0, 1),
     lead_voxels=st.integers(0, 1),
     frame_stride=st.integers(1, 3),

@@ -1,65 +1,39 @@
-"""Events made of voxel grids: accumulated again they are the grids, exactly, and their times follow the stated rule."""
+"""Events with times: their sums in bins, and the whole microseconds at which bins begin."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.events import to_events
-
-GRIDS = st.one_of(
-    arrays.arrays(np.int8, st.tuples(*[st.integers(1, 4)] * 4), elements=st.integers(-128, 127)),
-    arrays.arrays(np.int16, st.tuples(*[st.integers(1, 3)] * 4), elements=st.integers(-2000, 2000)),
-    arrays.arrays(np.float32, st.tuples(*[st.integers(1, 3)] * 4), elements=st.integers(-300, 300).map(float)),
-)
+from v2v_protocol.events import EventList, check_duration, whole_edges
 
 
-@given(GRIDS, st.floats(1.0, 1e7))
-def test_accumulated_again_they_are_the_voxel_grids(voxels: npt.NDArray[Any], bin_us: float) -> None:
-    events = to_events(voxels, bin_us)
-    again = events.voxels(*voxels.shape[:2], bin_us, dtype=voxels.dtype.name)
-    assert again.dtype == voxels.dtype
-    np.testing.assert_array_equal(again, voxels)
-    assert len(events) == np.abs(voxels.astype(np.int64)).sum()
-    assert (np.diff(events.t) >= 0).all()
-    assert (events.width_px, events.height_px) == (voxels.shape[3], voxels.shape[2])
+def _events(*columns: tuple[int, int, int, bool]) -> EventList:
+    x, y, t, p = (np.array(column) for column in zip(*columns, strict=True))
+    return EventList(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p, 3, 2)
 
 
-def test_times_are_spread_over_their_bin() -> None:
-    voxels = np.zeros((1, 2, 2, 3), np.int8)
-    voxels[0, 0, 1, 2], voxels[0, 1, 0, 0] = -2, 1
-    events = to_events(voxels, 1000.5)
-    assert events.t.tolist() == [250, 750, 1000 + 500]
-    assert events.x.tolist() == [2, 2, 0]
-    assert events.y.tolist() == [1, 1, 0]
-    assert events.p.tolist() == [False, False, True]
+def test_events_are_summed_in_the_bin_that_holds_their_time() -> None:
+    """A bin of 1000.5 microseconds ends at 1000.5, so 1000 is in the first and 1001 in the second."""
+    events = _events((2, 1, 0, False), (2, 1, 1000, False), (0, 0, 1001, True), (1, 0, 2000, True), (1, 1, 2001, True))
+    voxels = events.voxels(1, 2, 1000.5, "int8")
+    assert voxels.dtype == np.int8
+    expected = np.zeros((1, 2, 2, 3), np.int8)
+    expected[0, 0, 1, 2], expected[0, 1, 0, 0], expected[0, 1, 0, 1] = -2, 1, 1
+    np.testing.assert_array_equal(voxels, expected)
+    assert len(events) == 5
 
 
-def test_no_events_are_events_too() -> None:
-    events = to_events(np.zeros((2, 5, 4, 4), np.int8), 100)
-    assert len(events) == 0
-    assert not events.voxels(2, 5, 100).any()
+def test_an_edge_that_is_whole_but_for_a_rounding_is_whole() -> None:
+    assert whole_edges(np.array([0.0, 3000.0000000004, 2999.9999999996, 0.1, 33333.33])).tolist() == [
+        0, 3000, 3000, 1, 33334,
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("voxels", "bin_us", "message"),
-    [
-        (np.zeros((2, 4, 4), np.int8), 100, "T, bins, H, W"),
-        (np.zeros((1, 1, 4, 4), np.uint8), 100, "signed"),
-        (np.full((1, 1, 4, 4), 0.5, np.float32), 100, "not whole"),
-        (np.full((1, 1, 4, 4), np.nan, np.float32), 100, "not whole"),
-        (np.zeros((1, 1, 4, 4), np.int8), 0.5, "bin_us"),
-        (np.zeros((1, 1, 4, 4), np.int8), float("nan"), "bin_us"),
-        (np.zeros((1, 1, 4, 4), np.int8), float("inf"), "bin_us"),
-    ],
-)
-def test_what_no_events_are_made_of(voxels: npt.NDArray[Any], bin_us: float, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        to_events(voxels, bin_us)
+@pytest.mark.parametrize("total_us", [0.5, 0.0, -1.0, 2.0**62, float("nan"), float("inf")])
+def test_a_duration_without_whole_microseconds_is_refused(total_us: float) -> None:
+    with pytest.raises(UsageError, match="microseconds: give a clip of at least 1"):
+        check_duration(total_us)
+    with pytest.raises(UsageError, match="microseconds"):
+        _events((0, 0, 0, True)).voxels(1, 1, total_us)

@@ -21,6 +21,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "voxels_per_clip": 41,
     "bins": 6,
     "frames_per_bin": 2,
+    "grids_per_frame": 4,
     "lead_frames": 1,
     "lead_voxels": 1,
     "crop_height_px": 129,
@@ -69,6 +70,13 @@ def test_digests_are_stable() -> None:
     """A saved position names this digest: if it changes, so must NUMERICS_VERSION or the digest's own version."""
     assert StreamSpec().digest == "6d725a96e7160804493b3a2115ec52ec"
     assert StreamSpec(recipe=preset("paper-eraft"), voxel_dtype="float32").digest == "e6e6b36a65a66bf109874c82831fb500"
+
+
+def test_a_complete_recipe_takes_nothing_from_the_server() -> None:
+    """Also where a field is left out because it has its default."""
+    server = StreamSpec(Recipe(grids_per_frame=4))
+    assert StreamSpec.from_dict({"recipe": Recipe().to_dict()}, server).recipe == Recipe()
+    assert StreamSpec.from_dict({"recipe": {"bins": 2}}, server).recipe == Recipe(grids_per_frame=4, bins=2)
 
 
 def test_canonical_form_of_the_default() -> None:

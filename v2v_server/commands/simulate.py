@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--picture", metavar="FILE.png", help="also write a picture of frames and voxels")
     out.add_argument(
         "--events", metavar="FILE",
-        help=f"also write events, their times within a bin invented: {', '.join(FORMS)}",
+        help=f"also write the events with their times: {', '.join(FORMS)}",
     )  # fmt: skip
     out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",

@@ -131,7 +131,7 @@ def flow_for(
     estimators: dict[str, Estimator] = {}
     with one_thread():
         for voxel in range(settings.first_voxel, count):
-            span = recipe.bins * recipe.frames_per_bin
+            span = recipe.steps_per_frame
             start = (recipe.lead_voxels + voxel) * span
             ends = int(source[start]), int(source[start + span])
             planned = plan[voxel] if plan else settings.method

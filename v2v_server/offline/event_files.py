@@ -1,4 +1,4 @@
-"""Files of events in common formats. Formats with room for a note say that times within a bin are invented."""
+"""Files of events in common formats. Formats with room for a note say where the times come from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 
-_NOTE = "simulated from voxel grids: times within a bin are invented"
+_NOTE = "simulated from video frames: log intensity is linear in time between frames"
 
 
 def write_events(path: Path, events: EventList) -> None:

@@ -29,7 +29,7 @@ from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -195,8 +195,7 @@ def simulate_to_file(
         arrays, seed, epoch, index: see :func:`remake`.
         snapshot: number of the quarantine snapshot to make it under.
         cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
-        events: a file for events made of the voxels (``event_files.py``), or None. Their clock is the video's average
-            rate.
+        events: a file for the sample's events (``event_files.py``), or None. Their clock is that of the video's frames.
 
     Raises:
         UsageError, CorpusError, SampleUnavailable, VideoUnreadable: see :func:`remake`; or a file cannot be written, or
@@ -207,24 +206,14 @@ def simulate_to_file(
         check_drawable(arrays)
     if events is not None:
         check_event_file(events)
-        if "voxels" not in arrays:
-            raise UsageError("--events needs the array voxels: add it to --arrays")
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
         print(f"cannot be used: {refusal}")
-    sample = remake(
-        catalogue,
-        stream,
-        seed=seed,
-        epoch=epoch,
-        index=index,
-        arrays=arrays,
-        quarantine=quarantine,
-        snapshot=snapshot,
-    )
+    remade = Remaker(catalogue, stream, arrays, quarantine, snapshot).made(seed, epoch, index)
+    sample = remade.sample
     if not out.name.endswith(".npz"):
         out = Path(f"{out}.npz")  # as numpy would, without saying so
     provenance = sample.provenance.to_dict()
@@ -235,9 +224,9 @@ def simulate_to_file(
             camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe.frames_per_bin)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
         if events is not None:
-            made = sample.to_events(_bin_us(catalogue, sample, stream))
+            made = list_sample_events(remade.lease, remade.decoded)
             write_events(events, made)
-            print(f"{len(made)} events written to {events}; their times within a bin are invented")
+            print(f"{len(made)} events written to {events}")
     except OSError as error:
         raise UsageError(f"{error.filename or out}: {error.strerror}") from error
     params = sample.provenance.params
@@ -247,10 +236,3 @@ def simulate_to_file(
         + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
         f"{params.hot_pixel_count} hot pixels, {sample.provenance.saturated_bins} bins saturated; written to {out}"
     )
-
-
-def _bin_us(catalogue: Catalogue, sample: Sample, spec: StreamSpec) -> float:
-    (video,) = (video for video in catalogue.videos if video.id == sample.provenance.video)
-    if not video.frames_per_second > 0:
-        raise UsageError(f"{video.id}: its frame rate is unknown, and events need times; leave --events out")
-    return 1e6 * spec.recipe.frames_per_bin * spec.recipe.frame_stride / video.frames_per_second

@@ -223,7 +223,7 @@ def _longest_clip(frames: int, recipe: Recipe) -> int:
     """Return the largest ``voxels_per_clip`` that this number of frames is enough for; 0 if it is not enough for
     any.
     """
-    return max(0, (frames - 1) // (recipe.bins * recipe.frames_per_bin * recipe.frame_stride) - recipe.lead_voxels)
+    return max(0, (frames - 1) // (recipe.steps_per_frame * recipe.frame_stride) - recipe.lead_voxels)
 
 
 def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:

@@ -7,12 +7,13 @@ scenes); the server worker calls :func:`simulate_clip`. The pixel model is in ``
     view.py       the camera's view of the picture: resize, crop, flip, contrast
     grey.py       frames of any usual kind to grey levels
     intensity.py  from grey level to log intensity and to light
-    clip.py       simulate a clip: check arguments, prepare noise, call the kernel
+    clip.py       simulate a clip: check arguments, choose the arithmetic
+    kernels.py    call the kernel that a clip needs
     result.py     the result of a simulation
-    pixel.py      the kernel: all pixels, all steps, one pass
+    pixel.py      the paper's kernel: all pixels, all steps, one pass
     noise.py      its random numbers: the definition
-    voxel.py      steps, bins and dtypes: the definition
-    effects/      effects beyond the paper's pixel, one file per effect
+    voxel.py      steps, segments, bins and dtypes: the definition
+    effects/      effects beyond the paper's pixel, one file per effect, and the general kernel
     precision.py  float32, float64 or a refusal
     variants.py   the compiled forms of the kernels, and when they are loaded
     vectors.py    functions that the compiler's language lacks

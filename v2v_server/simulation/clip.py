@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Mapping
@@ -15,16 +16,13 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import nearest, require_known
-from v2v_server.simulation import noise
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.effects import prepare
-from v2v_server.simulation.effects.kernel import simulate_pixels_with_effects
 from v2v_server.simulation.grey import grey_levels
-from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.pixel import simulate_pixels, words
+from v2v_server.simulation.intensity import log_table_float64
+from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.result import Voxels
-from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance, voxel_array
+from v2v_server.simulation.voxel import Levels, bin_edges
 
 
 def simulate(
@@ -38,6 +36,7 @@ def simulate(
     start_residual: float | None = None,
     bins: int = 5,
     frames_per_bin: int = 1,
+    grids_per_frame: int = 0,
     gamma: float = 2.2,
     log_eps: float = 1e-3,
     seed: int = 0,
@@ -50,7 +49,8 @@ def simulate(
 
     Args:
         frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or a form that ``grey.py`` converts:
-            colour (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``.
+            colour (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``, without
+            ``grids_per_frame``.
         threshold_pos: contrast threshold of brighter events, log-intensity units.
         threshold_neg: contrast threshold of darker events; None: the same.
         noise_sigma: standard deviation of the noise, log units per frame.
@@ -60,6 +60,7 @@ def simulate(
             -threshold_neg and threshold_pos, as the paper does.
         bins: bins of a voxel grid.
         frames_per_bin: steps between frames in one bin.
+        grids_per_frame: voxel grids in one step between frames; 0: a grid spans ``bins * frames_per_bin`` steps.
         gamma: exponent of the reverse gamma correction (``intensity.py``).
         log_eps: epsilon inside the logarithm, as a share of white.
         seed: 0 .. 2**64 - 1; the same seed gives the same bytes.
@@ -70,8 +71,10 @@ def simulate(
         effects: values of effects beyond the paper's model, by the recipe's names (``leak_hz=0.1``); zero is off.
 
     Returns:
-        voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], and the number of saturated bins. A numpy
-        array, whatever the frames are; ``torch.from_numpy`` shares its memory.
+        voxels [(n - 1) / (bins * frames_per_bin), bins, H, W], or [(n - 1) * grids_per_frame, bins, H, W], and the
+        number of saturated bins. A numpy array, whatever the frames are; ``torch.from_numpy`` shares its memory. The
+        other arrays, and events with times, are simulated when they are asked for (:class:`Voxels`), so do not change
+        the frames before.
 
     Raises:
         UsageError: an argument of the wrong type, shape or range, or more events than the precision can count.
@@ -92,7 +95,8 @@ def simulate(
         raise UsageError("frames_per_second is missing: effects in Hz or seconds need the time between frames")
     return _simulate_array(
         frames, (gamma, log_eps), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
-        start_residual, bins, frames_per_bin, seed, dtype, precision, effects, 1.0 / (frames_per_second or 1.0),
+        start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame, effects,
+        1.0 / (frames_per_second or 1.0),
     )  # fmt: skip
 
 
@@ -107,6 +111,7 @@ def simulate_log(
     start_residual: float | None = None,
     bins: int = 5,
     frames_per_bin: int = 1,
+    grids_per_frame: int = 0,
     seed: int = 0,
     dtype: str = "int8",
     precision: str = AUTO,
@@ -126,7 +131,7 @@ def simulate_log(
         raise UsageError("log_frames: a value is NaN or infinite; give the logarithm of positive intensities")
     return _simulate_array(
         log_frames, None, threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
-        start_residual, bins, frames_per_bin, seed, dtype, precision,
+        start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame,
     )  # fmt: skip
 
 
@@ -136,7 +141,8 @@ def simulate_clip(
     recipe: Recipe,
     voxel_dtype: str,
     step_seconds: npt.NDArray[np.float64] | None = None,
-    out: npt.NDArray[Any] | None = None,
+    out: Mapping[str, npt.NDArray[Any]] | None = None,
+    levels: Levels | None = None,
 ) -> Voxels:
     """Simulate one drawn sample.
 
@@ -146,7 +152,8 @@ def simulate_clip(
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
         step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
-        out: C-contiguous array for the voxels, of their shape and dtype; None makes one.
+        out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
+        levels: log intensity between frames, by the gamma and log_eps of the draw; None: linear in time.
 
     Returns:
         voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
@@ -171,17 +178,15 @@ def simulate_clip(
         raise UsageError(
             f"step_seconds {list(step_seconds.shape)}: give {recipe.steps} positive finite durations, one per step"
         )
-    noise_durations = step_seconds if recipe.noise_unit == "second" else np.ones(recipe.steps)
     check_thresholds(params.threshold_pos, params.threshold_neg)
     intensity = recipe.gamma, recipe.log_eps[0] if params.log_eps is None else params.log_eps
-    real = choose(AUTO, _most_events(params, _log_ends(*intensity), noise_durations, step_seconds))
-    prepared = None
-    if params.effects:
-        prepared = _prepared(params, intensity, step_seconds, frames[0].size, real)
-    return _run(
-        frames, _table(*intensity, real), source_index, params, noise_durations,
-        recipe.bins, recipe.frames_per_bin, voxel_dtype, prepared=prepared, out=out,
+    given = KernelInput(
+        frames, intensity, source_index, params,
+        step_seconds if recipe.noise_unit == "second" else np.ones(recipe.steps), step_seconds, recipe.bins,
+        bin_edges(recipe.steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1), voxel_dtype,
+        levels=levels,
     )  # fmt: skip
+    return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(*intensity))), out)
 
 
 def _simulate_array(
@@ -198,6 +203,7 @@ def _simulate_array(
     seed: int,
     dtype: str,
     precision: str,
+    grids_per_frame: int,
     effects: Mapping[str, float] = MappingProxyType({}),
     frame_seconds: float = 1.0,
 ) -> Voxels:
@@ -217,125 +223,50 @@ def _simulate_array(
         )
     _check_whole("bins", bins, 1, 2**31)
     _check_whole("frames_per_bin", frames_per_bin, 1, 2**31)
+    _check_whole("grids_per_frame", grids_per_frame, 0, 2**31)
+    if grids_per_frame and frames_per_bin != 1:
+        raise UsageError(
+            f"frames_per_bin = {frames_per_bin}: with grids_per_frame, bins are parts of a step; set it to 1"
+        )
     _check_whole("seed", seed, 0, 2**64 - 1)
     count, height, width = frames.shape
     _check_whole("hot_pixel_count", hot_pixel_count, 0, height * width)
-    if height * width == 0 or count < 2 or (count - 1) % (bins * frames_per_bin):
+    steps, span = count - 1, 1 if grids_per_frame else bins * frames_per_bin
+    if height * width == 0 or count < 2 or steps % span:
         raise UsageError(
             f"{count} frames of {width}x{height} pixels: give k x bins x frames_per_bin + 1 frames, "
-            f"k > 0 (k x {bins * frames_per_bin} + 1), of at least one pixel"
+            f"k > 0 (k x {span} + 1), of at least one pixel"
         )
-    steps = count - 1
     params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed, effects)
-    step_seconds = np.full(steps, frame_seconds)
     ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(*intensity)
-    real = choose(precision, _most_events(params, ends, np.ones(steps), step_seconds))
-    prepared = None
+    edges = bin_edges(steps, frames_per_bin, grids_per_frame * bins or 1)
+    durations = np.ones(steps)
+    given = KernelInput(
+        frames, intensity, np.arange(count), params, durations, durations * frame_seconds, bins, edges, dtype,
+        start_residual,
+    )  # fmt: skip
+    real = choose(precision, _most_events(given, ends))
     if intensity is None:
-        frames, table = frames.astype(real), np.empty(0, real)
-    else:
-        table = _table(*intensity, real)
-        if effects:
-            prepared = _prepared(params, intensity, step_seconds, height * width, real)
-    return _run(
-        frames, table, np.arange(count), params, np.ones(steps), bins, frames_per_bin, dtype, start_residual, prepared
-    )
+        given = dataclasses.replace(given, frames=frames.astype(real))
+    return Voxels.of(given, real)
 
 
-def _most_events(
-    params: SampleParams,
-    log_ends: tuple[float, float],
-    noise_durations: npt.NDArray[np.float64],
-    step_seconds: npt.NDArray[np.float64],
-) -> float:
+def _most_events(given: KernelInput, log_ends: tuple[float, float]) -> float:
+    params, segments = given.params, given.segments
     thresholds = params.threshold_pos, params.threshold_neg
     hot_sigma = params.hot_pixel_sigma if params.hot_pixel_count else 0.0
-    noise_total = noise_sum(params.noise_sigma, hot_sigma, noise_durations)
+    noise_total = noise_sum(params.noise_sigma, hot_sigma, given.noise_durations)
     if not params.effects:
-        return most_events(len(noise_durations), log_ends, thresholds, noise_total)
+        return most_events(segments, log_ends, thresholds, noise_total)
     thresholds = pixel_thresholds(min(thresholds), max(thresholds), params.effects.get("threshold_mismatch_sigma", 0.0))
-    noise_total += params.effects.get("leak_hz", 0.0) * thresholds[1] * math.fsum(step_seconds)
-    return EFFECTS_MARGIN * most_events(len(noise_durations), log_ends, thresholds, noise_total)
+    noise_total += params.effects.get("leak_hz", 0.0) * thresholds[1] * math.fsum(given.step_seconds)
+    return EFFECTS_MARGIN * most_events(segments, log_ends, thresholds, noise_total)
 
 
 def _log_ends(gamma: float, log_eps: float) -> tuple[float, float]:
     # From the table, not from a maths library: the choice of arithmetic must not depend on the host.
     table = log_table_float64(gamma, log_eps)
     return float(table[0]), float(table[-1])
-
-
-def _run(
-    frames: npt.NDArray[Any],
-    table: npt.NDArray[Any],
-    source_index: npt.NDArray[np.int64],
-    params: SampleParams,
-    noise_durations: npt.NDArray[np.float64],
-    bins: int,
-    frames_per_bin: int,
-    dtype: str,
-    start_residual: float | None = None,
-    prepared: tuple[Any, ...] | None = None,
-    out: npt.NDArray[Any] | None = None,
-) -> Voxels:
-    """Call the kernel. ``noise_durations``: of the steps, in the unit of noise and drift; ``prepared``: tables of the
-    effects, None without effects.
-    """
-    _, height, width = frames.shape
-    steps, pixels, real = len(noise_durations), height * width, table.dtype.type
-    voxels = voxel_array(steps // (bins * frames_per_bin), bins, height, width, dtype, out)
-    # Noise of independent increments: its variance, not its deviation, grows with time.
-    noise_scale = params.noise_sigma * np.sqrt(noise_durations) if params.noise_sigma > 0.0 else np.empty(0)
-    hot_count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
-    key = np.array(params.noise_key, np.uint32)
-    position, normal = noise.hot_pixels(params.noise_key, hot_count, pixels, _compiled_words)
-    shared = (
-        np.ascontiguousarray(frames).reshape(len(frames), pixels),
-        table,
-        source_index,
-        key,
-        noise_scale.astype(real),
-        position,
-        normal.astype(real) * real(params.hot_pixel_sigma),
-        noise_durations.astype(real),
-    )
-    limit, stored = real(LARGEST_COUNT[dtype]), voxels.reshape(steps // frames_per_bin, pixels)
-    threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
-    if prepared is not None:
-        sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
-        smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
-        saturated = simulate_pixels_with_effects(
-            *shared,
-            threshold_pos,
-            threshold_neg,
-            real(rounding_tolerance(smallest, smallest)),
-            start_residual is None,
-            real(start_residual or 0.0),
-            frames_per_bin,
-            limit,
-            stored,
-            prepared,
-        )
-        return Voxels(voxels, int(saturated))
-    if start_residual is None:
-        start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
-    else:
-        start_low, start_span = real(start_residual), real(0)
-    saturated = simulate_pixels(
-        *shared,
-        threshold_pos,
-        threshold_neg,
-        real(rounding_tolerance(params.threshold_pos, params.threshold_neg)),
-        start_low,
-        start_span,
-        frames_per_bin,
-        limit,
-        stored,
-    )
-    return Voxels(voxels, int(saturated))
-
-
-def _compiled_words(key: noise.NoiseKey, purpose: int, counters: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
-    return words(np.array(key, np.uint32), np.uint32(purpose), counters.astype(np.uint32))  # type: ignore[no-any-return]
 
 
 def _params(
@@ -363,20 +294,6 @@ def _params(
         noise_key=noise_key_of_seed(seed),
         effects=dict(effects),
     )
-
-
-def _prepared(
-    params: SampleParams,
-    intensity: tuple[float, float],
-    step_seconds: npt.NDArray[np.float64],
-    pixels: int,
-    real: type[np.floating[Any]],
-) -> tuple[Any, ...]:
-    return prepare(params.effects, params.noise_key, intensity, step_seconds, pixels, real, _compiled_words)
-
-
-def _table(gamma: float, log_eps: float, real: type[np.floating[Any]]) -> npt.NDArray[Any]:
-    return log_table(gamma, log_eps) if real is np.float32 else log_table_float64(gamma, log_eps)
 
 
 def _check_number(name: str, value: float, *, positive: bool = False) -> None:

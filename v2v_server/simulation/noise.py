@@ -45,7 +45,7 @@ Reals = npt.NDArray[np.float32]
 NoiseKey = tuple[int, int, int, int]
 WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
-PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(1, 9)
+TIME, PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(9)
 """Purposes of words. Numbers are never reused; 9 to 15 belong to effects."""
 
 GOLDEN = np.uint32(0x9E3779B9)

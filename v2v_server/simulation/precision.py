@@ -19,6 +19,9 @@ at most, where the 8 has room for the terms of second order. Float32 is used up 
 then the error stays below half the smaller threshold in either, over the whole clip and not only over a step, and the
 count of a bin is exact, being below 2**24 or 2**53.
 
+Where a step is divided (``voxel.Timeline``), n counts its segments. Levels between two known ones are rounded too, but
+each ends one change and begins the next, so that these errors cancel as those of the frames do.
+
 Effects (``effects/``) round more: 4 u (range) for the low-pass, whose own error a step can only pass on, 3 u D for
 the leak, and up to 12 u D for a refractory period in place of the 2 u D of potential and product: no more than 24 u D
 in all. The most events of such a clip are counted EFFECTS_MARGIN times, which has room for that.

@@ -6,6 +6,7 @@ compiled when a stream needs them, before the work on its first sample begins.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -20,19 +21,23 @@ class Variant(NamedTuple):
     """One compiled form of a kernel."""
 
     voxel_dtype: str
-    effects: bool
+    is_general: bool
     precision: str
 
     def __str__(self) -> str:
-        return f"{self.voxel_dtype} voxels{' with effects' if self.effects else ''} in {self.precision}"
+        return f"{self.voxel_dtype} voxels{' by the general kernel' if self.is_general else ''} in {self.precision}"
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
-"""Variants that :func:`warm_up` loads: every dtype without effects, only int8 with effects."""
+"""Variants that :func:`warm_up` loads: every dtype of the paper's kernel, int8 of the general one."""
 
 
 def variants(
-    recipe: Recipe, voxel_dtype: str, step_seconds: float = 1.0, thresholds: tuple[float, float] | None = None
+    recipe: Recipe,
+    voxel_dtype: str,
+    step_seconds: float = 1.0,
+    thresholds: tuple[float, float] | None = None,
+    arrays: Collection[str] = ("voxels",),
 ) -> frozenset[Variant]:
     """Return the variants that the draws of a recipe may need, as far as the recipe determines them.
 
@@ -44,10 +49,12 @@ def variants(
         voxel_dtype: "int8", "int16" or "float32".
         step_seconds: time from one frame to the next; used only if something is stated per second.
         thresholds: thresholds that a list file states for the video; None if it states none.
+        arrays: those that the kernel makes (``kernels.ARRAYS``), at least one.
     """
     events = recipe.worst_events(step_seconds, thresholds) * (EFFECTS_MARGIN if recipe.has_effects else 1.0)
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
-    return frozenset(Variant(voxel_dtype, recipe.has_effects, precision) for precision in precisions)
+    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or {"voxels"} != set(arrays)
+    return frozenset(Variant(voxel_dtype, is_general, precision) for precision in precisions)
 
 
 def load(variant: Variant) -> None:
@@ -59,7 +66,7 @@ def load(variant: Variant) -> None:
         dtype=variant.voxel_dtype,
         precision=variant.precision,
         frames_per_second=1.0,
-        shot_noise_hz=1.0 if variant.effects else 0.0,
+        shot_noise_hz=1.0 if variant.is_general else 0.0,
     )
 
 

@@ -2,10 +2,17 @@
 
 Steps. Step s (0 .. steps-1) is the change from frame s to frame s+1 of the clip. Bin b of voxel t sums the signed event
 counts of the ``frames_per_bin`` consecutive steps that start at ``(t * bins + b) * frames_per_bin``; so voxel t spans
-frames ``t * bins * frames_per_bin`` to ``(t + 1) * bins * frames_per_bin``, its ends included.
+frames ``t * bins * frames_per_bin`` to ``(t + 1) * bins * frames_per_bin``, its ends included. With ``grids_per_frame``
+n, each step has n grids, and its n x bins bins are equal parts of its time.
 
-Counting. One threshold crossing is decided per step, with d = (residual + hot drift) + (change of log intensity +
-noise), in this order:
+Time. Within a step the log intensity is linear in time, between the frames or between intermediate levels if there are
+any. Noise, hot drift and leak of the step are spread evenly over it. So a step is a row of segments (:class:`Timeline`)
+in which everything is linear and which lie in one bin, and the rule below holds for every segment. Where a step lies in
+one bin it is one segment. In a segment of change D that starts at the residual r, event k (1, 2 ...) happens at the
+share (k c - r) / D of its time for rising D, and (k c + r) / -D for falling D.
+
+Counting. The threshold crossings of a segment are decided together, with d = (residual + hot drift) + (change of log
+intensity + noise), in this order:
 
     count    = floor((|d| + tolerance) / c)        c = threshold_pos where d >= 0, else threshold_neg
     residual = d - sign(d) * c * count
@@ -24,16 +31,116 @@ to -32767 .. 32767, or in float32 as it is. Clipped bins are counted, never wrap
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.spec import VOXEL_DTYPES
 
+Doubles = npt.NDArray[np.float64]
+Longs = npt.NDArray[np.int64]
 LARGEST_COUNT = {"int8": 127.0, "int16": 32767.0, "float32": np.inf}
 """Largest magnitude of a bin that the dtype stores."""
+
+
+class Moments(NamedTuple):
+    """Ascending moments of a clip.
+
+    Attributes:
+        step: [n] int64, the step from frame to frame that each lies in.
+        share: [n] float64, the part of the step's time that has passed then, 0 to below 1.
+    """
+
+    step: Longs
+    share: Doubles
+
+
+class Levels(NamedTuple):
+    """Log intensity between frames, for instance along the motion.
+
+    Attributes:
+        at: their K moments, ascending, none at a frame (share 0) and none in a step that shows the same frame twice.
+        log_intensity: [K, H, W] float32, natural logarithm: what ``log_table`` gives for a grey level. Between two
+            neighbouring levels, and between a level and a frame, log intensity is linear in time.
+    """
+
+    at: Moments
+    log_intensity: npt.NDArray[np.float32]
+
+
+class Timeline(NamedTuple):
+    """A clip's G segments, in order of time.
+
+    Attributes:
+        step: [G] int64, the step that holds the segment.
+        start, share: [G] float64, the part of the step's time that has passed before it, and its own part, above 0.
+        level: [G] int64, the known log intensity at or after its end: a position of the clip (1 .. steps), or -1 - k
+            for intermediate level k.
+        reached: [G] float64, its end between the known level before and that one, above 0; 1 is that level.
+        bin: [G] int64, ascending from 0.
+        place: [2, G] float64, where in its voxel grid it starts and how much of it it takes, in bins.
+    """
+
+    step: Longs
+    start: Doubles
+    share: Doubles
+    level: Longs
+    reached: Doubles
+    bin: Longs
+    place: Doubles
+
+
+def bin_edges(steps: int, frames_per_bin: int, bins_per_step: int = 1) -> Moments:
+    """Return the ends of equal bins, the clip's start included: of ``frames_per_bin`` steps, or of a part of a step."""
+    parts = np.arange(0, steps * bins_per_step + 1, frames_per_bin)
+    return Moments(parts // bins_per_step, parts % bins_per_step / bins_per_step)
+
+
+def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None) -> Timeline:
+    """Divide a clip into segments at its frames, at the edges of its bins and at intermediate levels.
+
+    Args:
+        edges: [M + 1] ends of the bins, from the clip's start to its end.
+        bins: bins of a voxel grid.
+        durations: [steps] of each step, in any unit.
+        levels: moments of intermediate levels.
+    """
+    steps = len(durations)
+    frames, none = Moments(np.arange(steps + 1), np.zeros(steps + 1)), Moments(np.empty(0, np.int64), np.empty(0))
+    parts = frames, edges, levels or none
+    step, share = (np.concatenate([np.asarray(part[axis]) for part in parts]) for axis in (0, 1))
+    kind = np.repeat(np.arange(3), [len(part.step) for part in parts])
+    number = np.concatenate([np.arange(len(part.step)) for part in parts])
+    order = np.lexsort((kind, share, step))
+    step, share, kind, number = step[order], share[order], kind[order], number[order]
+    first = np.r_[True, (np.diff(step) > 0) | (np.diff(share) > 0)]
+    moment = np.cumsum(first) - 1  # of each entry
+    step, share = step[first], share[first]
+    is_known = np.zeros(len(step), np.bool_)
+    is_known[moment[kind != 1]] = True
+    level = np.zeros(len(step), np.int64)
+    level[moment[kind == 2]] = -1 - number[kind == 2]
+    level[moment[kind == 0]] = number[kind == 0]
+    known = np.flatnonzero(is_known)
+    piece = np.cumsum(is_known)[:-1] - 1
+    before, after = known[piece], known[piece + 1]
+
+    def passed(later: Longs, earlier: Longs) -> Doubles:
+        length: Doubles = np.where(step[later] > step[earlier], 1.0, share[later]) - share[earlier]
+        return length
+
+    start = np.arange(len(step) - 1)
+    length = passed(start + 1, start)
+    bin_of = np.cumsum(np.bincount(moment[kind == 1], minlength=len(step)))[:-1] - 1
+    lasts = durations[step[:-1]] * length
+    since = np.r_[0.0, np.cumsum(lasts)]
+    grid = bin_of // bins
+    begin = np.searchsorted(grid, np.arange(grid[-1] + 2))
+    total = since[begin[1:]] - since[begin[:-1]]
+    place = np.stack([since[:-1] - since[begin[grid]], lasts]) * bins / total[grid]
+    reached = np.where(after == start + 1, 1.0, passed(start + 1, before) / passed(after, before))
+    return Timeline(step[:-1], share[:-1], length, level[after], reached, bin_of, place)
 
 
 def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
@@ -45,17 +152,12 @@ def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
     return min(max(2.0**-21, smaller * 2.0**-19), smaller * 2.0**-4)
 
 
-def voxel_array(
-    voxels: int, bins: int, height: int, width: int, dtype: str, out: npt.NDArray[Any] | None = None
-) -> npt.NDArray[Any]:
-    """Return an uninitialised voxel array [voxels, bins, height, width], or ``out`` if it is given.
+def new_array(dtype: str, shape: tuple[int, ...], out: npt.NDArray[Any] | None = None) -> npt.NDArray[Any]:
+    """Return an uninitialised array, or ``out`` if it is given.
 
     Raises:
-        UsageError: the dtype is not one of int8, int16, float32, or ``out`` is not such an array.
+        UsageError: ``out`` is not such an array.
     """
-    if dtype not in LARGEST_COUNT:
-        raise UsageError(f"voxel dtype {dtype!r}: choose one of {', '.join(VOXEL_DTYPES)}")
-    shape = voxels, bins, height, width
     if out is None:
         return np.empty(shape, np.dtype(dtype))
     if out.shape != shape or out.dtype.name != dtype or not out.flags.c_contiguous:
@@ -63,9 +165,7 @@ def voxel_array(
     return out
 
 
-def step_seconds(
-    seconds: npt.NDArray[np.float64], source_index: npt.NDArray[np.int64], average_fps: float
-) -> tuple[npt.NDArray[np.float64], int]:
+def step_seconds(seconds: Doubles, source_index: Longs, average_fps: float) -> tuple[Doubles, int]:
     """Return the durations of the steps of a clip.
 
     Args:

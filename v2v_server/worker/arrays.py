@@ -11,7 +11,7 @@ that fills it:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.kernels import ARRAYS
+from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.view import Frames
 
 
@@ -38,7 +40,8 @@ class SampleContext:
         view: [n, H, W] uint8, the decoded frames as the camera sees them.
         step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
         flow: flow of the clip; None if it was not requested.
-        saturated_bins: number of voxel bins that were clipped, set by :func:`voxels`.
+        into: the arrays to fill, by name.
+        saturated: number of bins that were clipped, by array; None until the clip is simulated.
     """
 
     video: str
@@ -48,7 +51,8 @@ class SampleContext:
     view: Frames
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
-    saturated_bins: int = 0
+    into: Mapping[str, npt.NDArray[Any]]
+    saturated: Mapping[str, int] | None = None
 
     @property
     def recipe(self) -> Recipe:
@@ -71,20 +75,29 @@ def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     return register
 
 
-@makes("voxels")
-def voxels(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in signed event counts.
+def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:
+    """Simulate the sample into ``out``.
 
     Raises:
         VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated.
     """
-    recipe, dtype = context.recipe, context.spec.voxel_dtype
     try:
-        made = simulate_clip(context.view, context.params, recipe, dtype, context.step_seconds, out)
+        return simulate_clip(
+            context.view, context.params, context.recipe, context.spec.voxel_dtype, context.step_seconds, out
+        )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.
         raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
-    context.saturated_bins = made.saturated_bins
+
+
+@makes("voxels")
+@makes("event_counts")
+@makes("voxels_bilinear")
+def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in all arrays of the kernel together, the first time."""
+    if context.saturated is None:
+        asked = {name: context.into[name] for name in ARRAYS if name in context.into}
+        context.saturated = simulate(context, asked).saturated
 
 
 @makes("frames")

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
@@ -25,6 +26,7 @@ from v2v_server.catalogue.scene import Scene
 from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window
 from v2v_server.simulation.voxel import step_seconds
@@ -35,7 +37,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, simulate
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
@@ -157,25 +159,13 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
         ProtocolError: the lease is malformed.
     """
     plan, index = decoded.plan, lease.indices[0]
-    params, recipe, source = plan.params, plan.spec.recipe, plan.source
-    frames, flow = decoded.clip.frames, None
-    if plan.flow is not None:
-        methods = () if plan.flow_plan is None else plan.flow_plan.methods
-        flow = flow_for(frames, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
-        frames = view_part(frames, params, recipe, plan.flow.margin_px)
-    view = apply_view(frames, params, recipe)
-    seconds, irregular = None, 0
-    if recipe.needs_seconds:
-        if not lease.frames_per_second:
-            raise VideoError(lease.video, None, "its frame rate is unknown, and the recipe needs seconds")
-        seconds, irregular = step_seconds(decoded.clip.seconds, source, lease.frames_per_second / recipe.frame_stride)
-    if into is None:
-        into = new_arrays(sample_layout(lease))
-    context = SampleContext(lease.video, plan.spec, params, source, view, seconds, flow)
-    for name, array in into.items():
+    context, irregular = _context(lease, decoded, new_arrays(sample_layout(lease)) if into is None else into)
+    for name, array in context.into.items():
         ARRAY_BUILDERS[name](context, array)
+    saturated = dict(context.saturated or {})
+    saturated_bins = saturated.pop("voxels", 0)
     return Sample(
-        arrays=into,
+        arrays=context.into,
         provenance=Provenance(
             id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
             video=lease.video,
@@ -183,14 +173,49 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             start_frame=lease.start_frame,
             candidate=lease.candidate,
             refusals=_refusals(lease),
-            params=params,
-            saturated_bins=context.saturated_bins,
+            params=plan.params,
+            saturated_bins=saturated_bins,
             irregular_timestamps=irregular,
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
+            saturated={name: count for name, count in saturated.items() if count},
         ),
     )
+
+
+def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
+    """List the events of a lease's sample with their times, which are those of the video's frames.
+
+    Raises:
+        VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
+    """
+    context, _ = _context(lease, decoded, {})
+    made, (seconds, _) = simulate(context, {}), _step_seconds(lease, decoded)
+    return list_events(made.given, made.real, 1e6 * seconds)
+
+
+def _context(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]]) -> tuple[SampleContext, int]:
+    """Return what the arrays are made from, and the number of irregular time stamps."""
+    plan = decoded.plan
+    params, recipe = plan.params, plan.spec.recipe
+    frames, flow = decoded.clip.frames, None
+    if plan.flow is not None:
+        methods = () if plan.flow_plan is None else plan.flow_plan.methods
+        flow = flow_for(frames, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        frames = view_part(frames, params, recipe, plan.flow.margin_px)
+    seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
+    view = apply_view(frames, params, recipe)
+    return SampleContext(lease.video, plan.spec, params, plan.source, view, seconds, flow, into), irregular
+
+
+def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
+    """Call :func:`step_seconds` for a clip."""
+    plan = decoded.plan
+    if not lease.frames_per_second:
+        why = "the recipe needs seconds" if plan.spec.recipe.needs_seconds else "events need times"
+        raise VideoError(lease.video, None, f"its frame rate is unknown, and {why}")
+    return step_seconds(decoded.clip.seconds, plan.source, lease.frames_per_second / plan.spec.recipe.frame_stride)
 
 
 def _decoder(clip: DecodedClip) -> str:
@@ -201,16 +226,17 @@ def _decoder(clip: DecodedClip) -> str:
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
     """Return the compiled kernels that a lease's sample may need."""
-    if "voxels" not in lease.arrays:
-        return frozenset()
-    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds)
+    made = tuple(name for name in ARRAYS if name in lease.arrays)
+    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made) if made else frozenset()
 
 
 @lru_cache(maxsize=64)
-def _variants(canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...]) -> frozenset[Variant]:
+def _variants(
+    canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...], arrays: tuple[str, ...]
+) -> frozenset[Variant]:
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds))
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays)
 
 
 @lru_cache(maxsize=16)

@@ -50,7 +50,7 @@ def load_in_turn(variant: Variant) -> None:
     with one_compiles(*_place(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
-            _compile_apart(*map(str, (variant.voxel_dtype, int(variant.effects), variant.precision)))
+            _compile_apart(*map(str, (variant.voxel_dtype, int(variant.is_general), variant.precision)))
         load(variant)
 
 

@@ -11,23 +11,26 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
-from v2v_protocol.events import EventList, to_events
+from v2v_protocol.events import EventList
 from v2v_server.commands import simulate as command
 from v2v_server.offline.event_files import FORMS, write_events
+from v2v_server.simulation import simulate
 
-VOXELS = np.random.default_rng(1).integers(-2, 3, (3, 5, 12, 16)).astype(np.int8)
 BIN_US = 7000.0
+SIMULATED = simulate(np.random.default_rng(1).integers(0, 256, (16, 12, 16), np.uint8), threshold_pos=1.0)
+EVENTS = SIMULATED.to_events(BIN_US)
+NO_EVENTS = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
 
 
 def read(path: Path) -> EventList:
     """By the readers of others."""
     if path.suffix == ".npz":
         with np.load(path) as file:
-            assert "invented" in str(file["note"])
+            assert "linear in time" in str(file["note"])
             return EventList(file["x"], file["y"], file["t"], file["p"], int(file["width"]), int(file["height"]))
     if path.suffix in (".h5", ".hdf5"):
         with h5py.File(path) as file:
-            assert "invented" in file.attrs["note"]
+            assert "linear in time" in file.attrs["note"]
             x, y, t, p = (file[f"events/{name}"][:] for name in "xytp")
             return EventList(x, y, t + file["t_offset"][()], p > 0, int(file.attrs["width"]), int(file.attrs["height"]))
     stream = faery.events_stream_from_file(path)
@@ -37,17 +40,17 @@ def read(path: Path) -> EventList:
 
 @pytest.mark.parametrize("ending", FORMS)
 def test_what_is_read_is_what_was_written(ending: str, tmp_path: Path) -> None:
-    path, events = tmp_path / f"events{ending}", to_events(VOXELS, BIN_US)
+    path, events = tmp_path / f"events{ending}", EVENTS
     write_events(path, events)
     back = read(path)
     for column in "xytp":
         np.testing.assert_array_equal(getattr(back, column), getattr(events, column))
     assert (back.width_px, back.height_px) == (16, 12)
-    np.testing.assert_array_equal(back.voxels(3, 5, BIN_US, "int8"), VOXELS)
+    np.testing.assert_array_equal(back.voxels(3, 5, BIN_US, "int8"), SIMULATED.voxels)
 
 
 def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
-    write_events(tmp_path / "e.h5", to_events(VOXELS, BIN_US))
+    write_events(tmp_path / "e.h5", EVENTS)
     with h5py.File(tmp_path / "e.h5") as file:
         t, first = file["events/t"][:], file["ms_to_idx"][:]
     assert len(first) == t[-1] // 1000 + 2
@@ -58,15 +61,15 @@ def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", FORMS)
 def test_no_events_make_a_file_too(ending: str, tmp_path: Path) -> None:
-    write_events(tmp_path / f"none{ending}", to_events(np.zeros((1, 5, 4, 4), np.int8), 100))
+    write_events(tmp_path / f"none{ending}", NO_EVENTS)
     assert (tmp_path / f"none{ending}").stat().st_size > 0
 
 
 def test_a_name_that_says_no_form_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"ends in \.h5"):
-        write_events(tmp_path / "events.bin", to_events(VOXELS, BIN_US))
+        write_events(tmp_path / "events.bin", EVENTS)
     with pytest.raises(UsageError, match="No such file"):
-        write_events(tmp_path / "nowhere" / "events.npz", to_events(VOXELS, BIN_US))
+        write_events(tmp_path / "nowhere" / "events.npz", EVENTS)
 
 
 def test_the_program_writes_the_events_of_its_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,7 +78,7 @@ def test_the_program_writes_the_events_of_its_sample(tmp_path: Path, capsys: pyt
     small = ["--set", "voxels_per_clip=3", "--set", "crop_height_px=32", "--set", "crop_width_px=40"]
     line = [str(clip), "--out", str(sample), "--cache-dir", str(tmp_path), *small, "--events"]
     assert command.main([*line, str(events)]) == 0
-    assert "invented" in capsys.readouterr().out
+    assert " events written to " in capsys.readouterr().out
     with np.load(sample) as arrays:
         voxels = arrays["voxels"]
     assert voxels.any()

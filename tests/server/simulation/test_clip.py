@@ -17,7 +17,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import simulate, simulate_clip, simulate_log
 from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.voxel import voxel_array
+from v2v_server.simulation.voxel import new_array
 
 FRAMES = (np.arange(11 * 6 * 7) * 37 % 256).astype(np.uint8).reshape(11, 6, 7)
 
@@ -150,10 +150,12 @@ def test_log_table() -> None:
     assert math.isclose(log_table(2.2, 1e-3)[255] - log_table(2.2, 1e-3)[0], 6.909, abs_tol=1e-3)
 
 
-def test_voxel_array() -> None:
-    assert voxel_array(2, 5, 3, 4, "int16").shape == (2, 5, 3, 4)
-    with pytest.raises(UsageError, match="uint8"):
-        voxel_array(1, 1, 1, 1, "uint8")
+def test_an_array_of_another_form_is_refused() -> None:
+    given = np.empty((2, 5), np.int16)
+    assert new_array("int16", (2, 5), given) is given
+    for dtype, shape in (("int8", (2, 5)), ("int16", (5, 2))):
+        with pytest.raises(UsageError, match=r"out int16\[2, 5\]"):
+            new_array(dtype, shape, given)
 
 
 def test_a_drawn_log_eps_is_that_log_eps() -> None:
@@ -168,11 +170,12 @@ import json
 from dataclasses import replace
 import numpy as np
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
-from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects, words
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.kernels import simulate_general, simulate_pixels, words
 from v2v_server.simulation.variants import warm_up
 
 def count():
-    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects, words)]
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general, words)]
 
 warm_up()
 seen = [count()]

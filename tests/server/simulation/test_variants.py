@@ -12,19 +12,22 @@ import pytest
 from v2v_protocol.recipe import Recipe, preset
 from v2v_server.simulation.clip import _log_ends, _most_events
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, choose
 from v2v_server.simulation.variants import USUAL, Variant, variants
+from v2v_server.simulation.voxel import bin_edges
 
 LOAD_AND_COUNT = """
 import json
 from dataclasses import replace
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
-from v2v_server.simulation.clip import simulate_clip, simulate_pixels, simulate_pixels_with_effects
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.kernels import simulate_general, simulate_pixels
 from v2v_server.simulation.variants import warm_up
 from v2v_server.simulation.variants import USUAL, Variant, load
 
 def count():
-    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_pixels_with_effects)]
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general)]
 
 warm_up()
 seen = [count()]
@@ -56,6 +59,7 @@ def test_effects_and_dtypes() -> None:
     "recipe",
     [
         Recipe(threshold=(1e-3, 2e-2)),
+        Recipe(threshold=(1e-3, 2e-2), grids_per_frame=3),
         Recipe(threshold=(1e-3, 2e-2), threshold_source="video", threshold_mismatch_sigma=(0.0, 0.1)),
         Recipe(threshold=(1e-3, 2e-2), threshold_source="video", noise_scales_with_threshold=True),
         preset("davis346"),
@@ -73,10 +77,14 @@ def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> Non
                 recipe, seed=1, epoch=0, index=index, picture_height_px=128, picture_width_px=128, video_id="a.mp4",
                 video_thresholds=stated,
             )  # fmt: skip
-            real = choose(
-                AUTO, _most_events(params, _log_ends(recipe.gamma, params.log_eps or recipe.log_eps[0]), units, seconds)
-            )
-            assert Variant("int8", bool(params.effects), real.__name__) in known
+            intensity = recipe.gamma, params.log_eps or recipe.log_eps[0]
+            edges = bin_edges(recipe.steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1)
+            given = KernelInput(
+                np.empty((1, 1, 1), np.uint8), intensity, np.zeros(recipe.steps + 1, np.int64), params, units, seconds,
+                recipe.bins, edges, "int8",
+            )  # fmt: skip
+            real = choose(AUTO, _most_events(given, _log_ends(*intensity)))
+            assert Variant("int8", given.needs_general, real.__name__) in known
 
 
 @pytest.mark.slow

@@ -151,11 +151,11 @@ def test_once_all_is_there_it_is_only_loaded(monkeypatch: pytest.MonkeyPatch) ->
 def test_workers_neither_compile_nor_grow(tmp_path: Path) -> None:
     code = (
         "import psutil\n"
-        "from v2v_server.simulation.clip import simulate_pixels, simulate_pixels_with_effects, words\n"
+        "from v2v_server.simulation.kernels import simulate_pixels, simulate_general, words\n"
         "from v2v_server.worker.warm_up import warm_up_in_turn\n"
         "warm_up_in_turn()\n"
         "from v2v_server.video.full_range import to_full_range\n"
-        "kernels = simulate_pixels, simulate_pixels_with_effects, words, to_full_range\n"
+        "kernels = simulate_pixels, simulate_general, words, to_full_range\n"
         "print(*(sum(kernel.stats.cache_hits.values()) for kernel in kernels))\n"
         "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
         "print(psutil.Process().memory_info().rss)\n"

@@ -7,7 +7,7 @@
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
     state.py          inputs of an effect
-    kernel.py         the pixel kernel with all effects
+    kernel.py         the general kernel: all effects, and events with times
 
 An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws) and one file
 here, named in :data:`EFFECTS`. The file states the equation, its source, and
@@ -22,8 +22,8 @@ and, compiled, any of these functions. Each does nothing if the tables say off:
     see(tables, own, block, at)       may replace ``block.change``, the change of log intensity in this step
     change(tables, own, block, at)    may add to ``block.change``
     cross(tables, own, block, at)     may decide ``block.signed`` and ``block.residual`` itself; then it returns True
-    after(tables, own, block, at)     may change ``block.signed``, the events of this step, and ``block.residual``
-    close(tables, own, block, at)     may change ``block.count``, the sum of a bin, before it is stored
+    after(tables, own, block, at)     may change ``block.rises`` and ``block.falls``, the events of this step, and
+                                      ``block.residual``
 
 Within a step: see, noise, change, hot drift, cross, after. Effects run in the order of :data:`EFFECTS`. The names of
 ``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`. ``docs/effects.md`` gives sources, differences
@@ -73,7 +73,7 @@ def prepare(
         values: the draw, by field; missing fields are off.
         key: key of the sample's noise.
         intensity: gamma and log_eps.
-        step_seconds: [steps] duration of each step.
+        step_seconds: [steps] duration of each step, which is a segment (``voxel.Timeline``).
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
         words_of: a faster ``noise.words``, if the caller has one.

@@ -49,8 +49,9 @@ def start(tables, own, block, at):
 
 
 @hook
-def close(tables, own, block, at):
-    """Set their counts to 0."""
+def after(tables, own, block, at):
+    """Drop their events."""
     if len(tables.position) > 0:
         for each in range(tables.of_block[0], tables.of_block[1]):
-            block.count[tables.position[each] - at.first] = block.tolerance - block.tolerance
+            place = tables.position[each] - at.first
+            block.rises[place] = block.falls[place] = block.tolerance - block.tolerance

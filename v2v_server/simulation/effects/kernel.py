@@ -1,14 +1,14 @@
-"""The pixel kernel with effects: ``pixel.py`` with the additions of each effect.
+"""The general kernel: ``pixel.py`` with effects, segments of a step, both polarities and the times of events.
 
-It is a separate kernel, so that a camera without effects runs the simpler code. Loops, order of operations and promises
-are those of ``pixel.py``, whose inner functions it calls. The effects' functions are compiled into it: an effect that
-is off costs one comparison per block and step.
+It is a separate kernel, so that a clip without these runs the simpler code. Loops, order of operations and promises
+are those of ``pixel.py``, whose inner functions it calls: where both can simulate a clip, they count the same events.
+The effects' functions are compiled into it: an effect that is off costs one comparison per block and segment.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -32,7 +32,56 @@ from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 _PIXEL_RADIUS, _PIXEL_ANGLE = np.uint32(noise.PIXEL_RADIUS), np.uint32(noise.PIXEL_ANGLE)
 _PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_ANGLE)
 _START = np.uint32(noise.START)
+_TIME = np.uint32(noise.TIME)
 _UNIT = np.float32(2.0**-24)
+
+
+class Segments(NamedTuple):
+    """The clip's segments (``voxel.Timeline``) and what each adds; all [G].
+
+    Attributes:
+        step: int64, the step that holds it.
+        level: int64, row of the frames that the known level at or after its end comes from, or -1 - k for row k of the
+            intermediate levels.
+        shown: int64, row of the frame at the end of its step.
+        reached: real, its end between the known levels; 1 is the later one.
+        bin: int64.
+        noise_scale: real, standard deviation of the noise; empty for no noise at all.
+        hot_scale: real, its part of a hot pixel's drift.
+        start, length: real, where in its voxel grid it starts and how much of it it takes, 0 .. bins - 1.
+    """
+
+    step: Any
+    level: Any
+    shown: Any
+    reached: Any
+    bin: Any
+    noise_scale: Any
+    hot_scale: Any
+    start: Any
+    length: Any
+
+
+class Outputs(NamedTuple):
+    """What the kernel writes; an array of no rows is not wanted.
+
+    Attributes:
+        voxels: [grids * bins, pixels], signed counts.
+        counts: [grids, 2, bins, pixels] of the same dtype, negative and positive counts.
+        bilinear: [grids * bins, pixels] float32, zeros before.
+        event: [3, capacity] int64, for each event: pixel, segment, sign; the first ``capacity`` events.
+        passed: [capacity] float64, share of the segment that has passed at the event.
+        tally: [3] int64: clipped bins of voxels, those of counts, number of events (counted if ``is_listing``).
+        is_listing: whether to list events.
+    """
+
+    voxels: Any
+    counts: Any
+    bilinear: Any
+    event: Any
+    passed: Any
+    tally: Any
+    is_listing: Any
 
 
 def _linked(name: str, link: Any) -> Any:
@@ -68,38 +117,44 @@ def _until_true(number: int, first: int, last: int, function: Any, rest: Any) ->
     return chain
 
 
-_start, _see, _change, _after, _close = (_linked(name, _each) for name in ("start", "see", "change", "after", "close"))
+_start, _see, _change, _after = (_linked(name, _each) for name in ("start", "see", "change", "after"))
 _cross = _linked("cross", _until_true)
 _OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
 
 
 @compiled
 def _simulate(
-    frames, table, source_index, key, noise_scale, hot_position, hot_drift, hot_scale, threshold_pos, threshold_neg,
-    tolerance, drawn_start, start_residual, steps_per_bin, limit, voxels, tables, state, words, floats,
+    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+    tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
 ):  # fmt: skip
     """Run the kernel without reference counting, which every view of an array would cost; the caller provides all
     memory.
     """
     use_widest_vectors()  # type: ignore[call-arg]
-    steps, pixels = len(source_index) - 1, frames.shape[1]
-    noisy = len(noise_scale) > 0
-    residual, count, change, signed, positive, negative = state[0], state[1], state[2], state[3], state[4], state[5]
-    levels, own = state[6:8], state[8:]
+    count, pixels = len(segments.step), frames.shape[1]
+    noisy = len(segments.noise_scale) > 0
+    timed = out.is_listing or len(out.bilinear) > 0
+    residual, change, signed, positive, negative, rises, falls, waited, blind = state[:9]
+    on, off, old, levels, own = state[9], state[10], state[11], state[12:16], state[16:]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
-    block = Block(residual, count, change, signed, positive, negative, levels, words[:4], floats[:4], tolerance, key)
-    start_folds = folds_of(key, _START)
+    block = Block(
+        residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
+        floats[:4], tolerance, key,
+    )  # fmt: skip
+    zero = tolerance - tolerance
+    start_folds, time_folds = folds_of(key, _START), folds_of(key, _TIME)
     pixel_radius, pixel_angle = folds_of(key, _PIXEL_RADIUS), folds_of(key, _PIXEL_ANGLE)
     pair_radius, pair_angle = folds_of(key, _PAIR_RADIUS), folds_of(key, _PAIR_ANGLE)
-    saturated, next_hot = 0, 0
+    next_hot = 0
 
     for first in range(0, pixels, BLOCK_PX):
         last = min(first + BLOCK_PX, pixels)
         hot = next_hot
         while next_hot < len(hot_position) and hot_position[next_hot] < last:
             next_hot += 1
-        now, row = 0, 0
-        shown = frames[source_index[0], first:last]
+        # Rows of ``levels``: 0 and 1 are known levels, the later one being ``known``; 2 and 3 lie between them.
+        now, known, known_before, row, pair_done = 0, 0, 0, 0, -1
+        shown = frames[0, first:last]
         look_up(table, shown, shown, levels[now])
         for i in range(BLOCK_PX):
             positive[i], negative[i] = threshold_pos, threshold_neg
@@ -112,68 +167,150 @@ def _simulate(
                 radius_words[i] = word(pixel_radius, first + i)
                 angle_words[i] = word(pixel_angle, first + i)
 
-        for step in range(steps):
-            before, moved = now, source_index[step + 1] != source_index[step]
-            shown = frames[source_index[step + 1], first:last]
+        for each in range(count):
+            before, step, level = now, segments.step[each], segments.level[each]
+            if each == 0 or segments.reached[each - 1] >= 1:
+                moved, known_before = level != row, known
+            else:
+                moved = False
             if moved:
-                now = 1 - now
-                coming = frames[source_index[min(step + 1 + ROWS_AHEAD, steps)], first:last]
-                look_up(table, shown, coming, levels[now])
-            at = At(first, step, moved, before, now, shown)
+                known, row = 1 - known, level
+                if level >= 0:
+                    coming = frames[segments.shown[min(each + ROWS_AHEAD, count - 1)], first:last]
+                    look_up(table, frames[level, first:last], coming, levels[known])
+                else:
+                    for i in range(last - first):
+                        levels[known, i] = between_frames[-1 - level, first + i]
+            if segments.reached[each] >= 1:
+                now = known
+            elif known_before != known:
+                now, reached = 2 + (each & 1), segments.reached[each]
+                for i in range(BLOCK_PX):
+                    levels[now, i] = levels[known_before, i] + (levels[known, i] - levels[known_before, i]) * reached
+            shown = frames[segments.shown[each], first:last]
+            at = At(first, each, moved, before, now, shown)
             for i in range(BLOCK_PX):
                 change[i] = levels[now, i] - levels[before, i]
             _see(tables, own, block, at)
             if noisy:
                 pair, odd = step >> 1, step & 1
-                if not odd:
-                    of_pair = word(pair_radius, pair), word(pair_angle, pair)
+                if pair != pair_done:
+                    of_pair, pair_done = (word(pair_radius, pair), word(pair_angle, pair)), pair
                     two_normals(
                         radius_words, angle_words, of_pair[0], of_pair[1], words[2], words[3], floats[2], normal
                     )
-                scale = noise_scale[step]
+                scale = segments.noise_scale[each]
                 for i in range(BLOCK_PX):
                     change[i] += normal[odd, i] * scale
             _change(tables, own, block, at)
-            for each in range(hot, next_hot):
-                change[hot_position[each] - first] += hot_drift[each] * hot_scale[step]
+            if timed:
+                for i in range(BLOCK_PX):
+                    old[i], waited[i], blind[i] = residual[i], zero, zero
+            drifting = residual if drifts_first else change
+            for spot in range(hot, next_hot):
+                drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
             if not _cross(tables, own, block, at):
                 for i in range(BLOCK_PX):
                     signed[i], residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
+            for i in range(BLOCK_PX):
+                rises[i] = signed[i] if signed[i] > zero else zero
+                falls[i] = zero if signed[i] > zero else zero - signed[i]
             _after(tables, own, block, at)
-            of_bin = step - row * steps_per_bin
-            if of_bin == 0:
+            of_bin = segments.bin[each]
+            if each == 0 or segments.bin[each - 1] != of_bin:
                 for i in range(BLOCK_PX):
-                    count[i] = signed[i]
+                    on[i], off[i] = rises[i], falls[i]
             else:
                 for i in range(BLOCK_PX):
-                    count[i] += signed[i]
-            if of_bin == steps_per_bin - 1:
-                _close(tables, own, block, at)
-                saturated += store(count, limit, voxels[row, first:last])
-                row += 1
-    return saturated
+                    on[i] += rises[i]
+                    off[i] += falls[i]
+            if timed:
+                if drifts_first:
+                    for spot in range(hot, next_hot):
+                        change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                _time(segments, each, block, old, first, last, bins, time_folds, out)
+            if each == count - 1 or segments.bin[each + 1] != of_bin:
+                if len(out.counts) > 0:
+                    grid, of_grid = of_bin // bins, of_bin % bins
+                    out.tally[1] += store(off, limit, out.counts[grid, 0, of_grid, first:last])
+                    out.tally[1] += store(on, limit, out.counts[grid, 1, of_grid, first:last])
+                if len(out.voxels) > 0:
+                    for i in range(BLOCK_PX):
+                        on[i] -= off[i]
+                    out.tally[0] += store(on, limit, out.voxels[of_bin, first:last])
+
+
+@compiled
+def _time(segments, each, block, old, first, last, bins, folds, out):
+    """Give every event of a segment its time: list it, and share it between the two bins next to it.
+
+    Events that no change of intensity caused (shot noise) come at random times.
+
+    Args:
+        old: [block] real, the residual at the start of the segment.
+        folds: of the noise's words for these times.
+    """
+    zero = block.tolerance - block.tolerance
+    one = zero + np.float32(1)
+    row = segments.bin[each] // bins * bins
+    for i in range(last - first):
+        for is_rising in range(2):
+            events = int(block.rises[i] if is_rising else block.falls[i])
+            if events == 0:
+                continue
+            signed = block.signed[i] if is_rising else zero - block.signed[i]
+            threshold = block.positive[i] if is_rising else block.negative[i]
+            begun = old[i] if is_rising else zero - old[i]
+            speed = abs(block.change[i])
+            for k in range(events):
+                if k >= signed:
+                    drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
+                    passed = zero + np.float32(np.int32(drawn >> np.uint32(8))) * _UNIT
+                elif speed > zero:
+                    passed = block.waited[i] + k * block.blind[i] + ((k + 1) * threshold - begun) / speed
+                    # An event may be due a rounding before or after the segment.
+                    passed = min(max(passed, zero), one)
+                else:
+                    passed = zero
+                sign = 2 * is_rising - 1
+                if len(out.bilinear) > 0:
+                    place = segments.start[each] + segments.length[each] * passed
+                    lower = min(int(place), bins - 1)
+                    upper = np.float32(place - lower)
+                    out.bilinear[row + lower, first + i] += sign * (np.float32(1) - upper)
+                    if lower + 1 < bins:
+                        out.bilinear[row + lower + 1, first + i] += sign * upper
+                if out.is_listing:
+                    listed = out.tally[2]
+                    if listed < len(out.passed):
+                        out.event[0, listed], out.event[1, listed], out.event[2, listed] = first + i, each, sign
+                        out.passed[listed] = passed
+                    out.tally[2] += 1
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def simulate_pixels_with_effects(
-    frames, table, source_index, key, noise_scale, hot_position, hot_drift, hot_scale,
-    threshold_pos, threshold_neg, tolerance, drawn_start, start_residual, steps_per_bin, limit, voxels, tables,
+def simulate_general(
+    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg, tolerance,
+    drawn_start, start_residual, drifts_first, bins, limit, out, tables,
 ):  # fmt: skip
-    """Simulate every pixel of a clip, effects included.
+    """Simulate every pixel of a clip.
 
     Args:
-        frames: [n, pixels] uint8 grey levels, C-contiguous.
-        table .. tolerance, steps_per_bin, limit, voxels: as in ``pixel.simulate_pixels``.
+        frames: [n, pixels] uint8 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's first frame.
+        between_frames: [K, pixels] float32, intermediate levels of log intensity.
+        table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.
+        segments: what is simulated, and when.
+        threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
         drawn_start: True starts every residual uniformly between its own thresholds, False at ``start_residual``, real.
+        drifts_first: True adds a hot pixel's drift in the order of ``pixel.simulate_pixels``, for the same roundings.
+        bins: of a voxel grid.
+        out: written.
         tables: of all effects, ``effects.prepare``.
-
-    Returns:
-        number of bins clipped to the limit.
     """
-    state = aligned_rows(8 + _OWN_ROWS, PITCH, table.dtype)
+    state = aligned_rows(16 + _OWN_ROWS, PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
-    return _simulate(
-        frames, table, source_index, key, noise_scale, hot_position, hot_drift, hot_scale, threshold_pos, threshold_neg,
-        tolerance, drawn_start, start_residual, steps_per_bin, limit, voxels, tables, state, words, floats,
+    _simulate(
+        frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+        tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
     )  # fmt: skip

@@ -72,6 +72,9 @@ def cross(tables, own, block, at):
     """Fire events one after another in time."""
     if tables.refractory > 0:
         duration, blind = tables.seconds[at.step], own[0]
+        if block.timed:
+            for i in range(BLOCK_PX):
+                block.waited[i], block.blind[i] = blind[i] / duration, tables.refractory / duration
         for i in range(BLOCK_PX):
             block.signed[i], block.residual[i], blind[i] = crossed(
                 block.residual[i], blind[i], block.change[i], duration, tables.refractory, block.positive[i],

@@ -123,8 +123,8 @@ def after(tables, own, block, at):
         of_step, drawn = tables.table_of_step[at.step], tables.drawn
         _draw(drawn, tables.of_steps[0, at.step], tables.of_steps[1, at.step])
         _fire(
-            tables.shot[of_step], tables.largest[of_step], at.shown, drawn, block.floats[3], block.signed,
-            block.residual,
+            tables.shot[of_step], tables.largest[of_step], at.shown, drawn, block.floats[3], block.rises,
+            block.falls, block.residual,
         )  # fmt: skip
 
 
@@ -143,8 +143,8 @@ def _draw(drawn, step_pos, step_neg):
 
 
 @compiled
-def _fire(chances, largest, shown, drawn, chance, signed, residual):
-    """Add shot events to ``signed`` and clear the residual of the pixels that had any.
+def _fire(chances, largest, shown, drawn, chance, rises, falls, residual):
+    """Add shot events to ``rises`` and ``falls`` and clear the residual of the pixels that had any.
 
     The function is compiled separately: inside the kernel its loops would not become vector instructions.
 
@@ -153,7 +153,7 @@ def _fire(chances, largest, shown, drawn, chance, signed, residual):
         shown: [width] uint8, the new frame.
         drawn: [4, block] uint32, see ``_draw``.
         chance: [block] float32, working space.
-        signed, residual: [block] real, changed.
+        rises, falls, residual: [block] real, changed.
     """
     use_widest_vectors()  # type: ignore[call-arg]
     none, one = np.float32(0), np.float32(1)
@@ -166,7 +166,8 @@ def _fire(chances, largest, shown, drawn, chance, signed, residual):
             positive = one if drawn[2, i] < bound else none
             negative = one if drawn[3, i] < bound else none
             any_more |= (drawn[2, i] < following) | (drawn[3, i] < following)
-            signed[i] += positive - negative
+            rises[i] += positive
+            falls[i] += negative
             residual[i] *= (one - positive) * (one - negative)
         if not any_more:
             return

@@ -24,7 +24,7 @@ class Clip(NamedTuple):
 
     Attributes:
         light: [256] float64, i(F) of every grey level, 0 (black) to 1 (white).
-        step_seconds: [steps] float64, duration of each step.
+        step_seconds: [steps] float64, duration of each step; for an effect, a step is a segment (``voxel.Timeline``).
         durations: [different] float64, the distinct durations, ascending.
         table_of_step: [steps] int64, index into ``durations`` of each step.
         pixels: number of pixels of the picture.
@@ -48,20 +48,26 @@ class Block(NamedTuple):
 
     Attributes:
         residual: remaining change since the last event, log units.
-        count: signed events of the bin so far.
         change: change that this step adds to the residual, log units.
-        signed: signed events of this step.
+        signed: signed crossings of a threshold in this step.
+        rises, falls: positive and negative events of this step.
+        waited, blind: shares of the step in which the pixel is blind at its start and after each event.
+        timed: whether events need times, and so ``waited`` and ``blind``.
         positive, negative: the thresholds of each pixel, log units.
-        levels: two rows of log intensity, see :class:`At`.
+        levels: rows of log intensity, see :class:`At`.
         words: [4] uint32 rows, and ``floats``: [4] float32 rows, free for use within one call.
         tolerance: real, see ``voxel.py``.
         key: [4] uint32, the noise key.
     """
 
     residual: Any
-    count: Any
     change: Any
     signed: Any
+    rises: Any
+    falls: Any
+    waited: Any
+    blind: Any
+    timed: Any
     positive: Any
     negative: Any
     levels: Any
@@ -76,10 +82,11 @@ class At(NamedTuple):
 
     Attributes:
         first: the block's first pixel.
-        step: number of the step.
-        moved: whether this step shows another frame than the one before (the camera does not pause).
+        step: number of the step: a segment, the whole time from frame to frame or a part of it.
+        moved: whether it leads to another frame or intermediate level than the one before.
         before, now: rows of ``Block.levels``: log intensity before and after the step.
-        shown: [width] uint8, grey levels after the step; narrower than the block at the end of the picture.
+        shown: [width] uint8, grey levels of the frame at or after its end; narrower than the block at the end of the
+            picture.
     """
 
     first: Any
