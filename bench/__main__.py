@@ -33,6 +33,7 @@ BENCHES = {
     "store": "speed.store",
     "link": "speed.link",
     "watched": "speed.watched",
+    "sessions": "speed.sessions",
     "physics": "accuracy.physics",
     "extremes": "accuracy.extremes",
     "sensor": "accuracy.sensor",

@@ -5,8 +5,8 @@ send which message when.
     server -> consumer     Welcome, SampleHeader (+ one raw frame per array), Unavailable, Denied, Pong
     worker -> server       WorkerHello, Begun, Result (+ a whole SampleHeader message), LeaseFailed, Ping, Goodbye
     server -> worker       Lease, Stop, Denied, Pong
-    any peer -> server     See
-    server -> any peer     Seen
+    any peer -> server     GetStatus
+    server -> any peer     Status
 
 Field types are those that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
 float or str, and Mapping (plain values, checked by the code that uses them).
@@ -103,7 +103,7 @@ class Goodbye:
 
 
 @dataclass(frozen=True, slots=True)
-class See:
+class GetStatus:
     """Ask for the state of the service. It needs no session, and workers' ports accept it too. The answer is the next
     state that is built, a few times a second; several requests before it get one answer.
     """
@@ -199,11 +199,11 @@ class Pong:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """Answer to See.
+class Status:
+    """Answer to GetStatus.
 
     Attributes:
-        json: ``v2v_server.console.state.ServiceState.to_dict()`` as JSON, UTF-8.
+        json: ``v2v_server.status.state.ServiceState.to_dict()`` as JSON, UTF-8.
     """
 
     json: bytes
@@ -339,6 +339,6 @@ class Stop:
 
 
 Message = (
-    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Denied | Pong | See | Seen
+    Hello | Want | Ping | Goodbye | Welcome | SampleHeader | Unavailable | Denied | Pong | GetStatus | Status
     | WorkerHello | Begun | Result | LeaseFailed | Lease | Stop
 )  # fmt: skip

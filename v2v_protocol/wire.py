@@ -25,6 +25,7 @@ from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
 from v2v_protocol.messages import (
     Begun,
     Denied,
+    GetStatus,
     Goodbye,
     Hello,
     Lease,
@@ -34,8 +35,7 @@ from v2v_protocol.messages import (
     Pong,
     Result,
     SampleHeader,
-    See,
-    Seen,
+    Status,
     Stop,
     Unavailable,
     Want,
@@ -79,8 +79,8 @@ _TYPES: dict[str, type[Any]] = {
     "lease-failed": LeaseFailed,
     "lease": Lease,
     "stop": Stop,
-    "see": See,
-    "seen": Seen,
+    "see": GetStatus,
+    "seen": Status,
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 

@@ -4,12 +4,12 @@
     commands/     the command lines
     prepare/      `v2v-prepare`
     offline/      samples without a server
-    console/      what the operator sees
+    status/       what the operator sees
     supervise/    start and restart workers
     broker/       which worker makes which sample for which consumer
     worker/       from a lease to its sample
     schedule/     which sequence each index is made from
-    catalogue/    which videos exist
+    corpus/       which videos exist
     store/        prepared clips, lossless
     flow/         optical flow
     simulation/   the virtual camera

@@ -19,15 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError
+from v2v_protocol.wire import encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
     CheckVideo,
-    CutOff,
+    Disconnect,
     GiveUp,
     ReportRefusal,
-    Show,
+    SendLease,
+    SendStatus,
     ToConsumer,
     ToWorker,
 )
@@ -38,18 +40,18 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
-from v2v_server.console.progress import catalogue_progress
-from v2v_server.console.shutdown_summary import format_shutdown_summary
-from v2v_server.console.status import summary
-from v2v_server.console.terminal import make_status
-from v2v_server.console.watch import make_watch
+from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.status.line import summary
+from v2v_server.status.progress import catalogue_progress
+from v2v_server.status.publisher import make_publisher
+from v2v_server.status.shutdown_summary import format_shutdown_summary
+from v2v_server.status.terminal import make_status
 from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_supervisor
 from v2v_server.supervise.protocol import Supervisor
@@ -132,7 +134,7 @@ def serve(config: ServeConfig) -> None:
     for entry in quarantine.entries(quarantine.latest):
         log.say(f"in quarantine: {entry}")
     dispatcher = Dispatcher(
-        catalogue,
+        catalogue.facts,
         config.spec,
         quarantine=quarantine,
         wall_clock=_utc_now,
@@ -219,7 +221,7 @@ class Server:
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._status = make_status(self._log, sys.stderr)
-        self._watch = make_watch(
+        self._publisher = make_publisher(
             config, catalogue, dispatcher, supervisor, quarantine, transport, self._clock(), _utc_now
         )
         self._announced = False
@@ -269,14 +271,14 @@ class Server:
                 self._say(line)
             self._warn_if_blocked(now)
             self._scale(now)
-            self._carry_out([*self._watch.tick(now)])
+            self._carry_out([*self._publisher.tick(now)])
             self._show(now)
 
     def close(self) -> None:
         """Stop and end the workers, and close all connections."""
         self._status.close()
         if self._announced:
-            state = self._watch.state(self._clock())
+            state = self._publisher.state(self._clock())
             for line in format_shutdown_summary(state):
                 self._log.say(line)
             if self._log.is_json:
@@ -303,7 +305,9 @@ class Server:
                 case ToWorker() as message:
                     if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
-                case CutOff(identity):
+                case SendLease() as grant:
+                    todo.extendleft(reversed(self._complete(grant, todo)))
+                case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
@@ -314,8 +318,27 @@ class Server:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
-                case Show() as show:
-                    todo.extend(self._watch.ask(show))
+                case SendStatus() as show:
+                    todo.extend(self._publisher.ask(show))
+
+    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
+        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
+
+        Args:
+            grant: the lease.
+            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
+        """
+        try:
+            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
+        except IndexUnreadable as error:
+            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
+            later = [each for each in todo if not isinstance(each, SendLease)]
+            todo.clear()
+            todo.extend(later)
+            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
+            return []
+        except V2VError as error:
+            return self._dispatcher.lease_refused(grant, str(error), self._clock())
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""
@@ -422,9 +445,9 @@ class Server:
             if self._config.port_file:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
-            self._watch.is_ready = True
+            self._publisher.is_ready = True
         if self._announced and self._status.is_due(now):
-            self._status.show(now, self._watch.state(now))
+            self._status.show(now, self._publisher.state(now))
 
     def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
         """Write a log line.

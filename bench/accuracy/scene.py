@@ -30,10 +30,10 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.flow import FlowSettings, flow_for, view_part
 from v2v_server.flow.methods import one_thread
+from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.variants import warm_up

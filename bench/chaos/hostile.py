@@ -43,7 +43,7 @@ import zmq
 
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import key_for, read_key
-from v2v_protocol.messages import Goodbye, Hello, See, Seen, Want
+from v2v_protocol.messages import GetStatus, Goodbye, Hello, Status, Want
 from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
 
@@ -95,11 +95,11 @@ def leave(address: str, number: int) -> None:
 def thief(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
-        peer.send_multipart(encode(See()))
+        peer.send_multipart(encode(GetStatus()))
         if not peer.poll(_REFUSAL_MS):
             return
         seen = decode(peer.recv_multipart()[0])
-    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Seen) else []
+    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Status) else []
     for each in shown:
         for name in (each["id"].encode(), bytes.fromhex(each["id"])):
             with _dealer(address, name) as peer:
@@ -112,7 +112,7 @@ def look(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
         while True:
-            peer.send_multipart(encode(See()))
+            peer.send_multipart(encode(GetStatus()))
 
 
 def idle(address: str, number: int) -> None:

@@ -4,11 +4,9 @@
 
 The corpus is synthetic: one clip under many names (hard links to a few copies), a thousand names a folder, and a
 complete index, as a second start finds it. Files and index are below --folder and are removed at the end. A fresh
-process opens the catalogue, twice: the first finds no column cache and writes one. Then a server with two workers
-starts on it.
+process opens the catalogue. Then a server with two workers starts on it.
 
-    open           seconds to open the catalogue, and processor time of all its processes
-    first          the same without the column cache
+    open           seconds to open the catalogue, and processor time
     table          seconds to build the sequence table of the paper's recipe
     resident       memory that both added to the process, and the peak
     first batch    seconds from the start of v2v-serve to the first batch of 12
@@ -38,12 +36,12 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.refresh import index_path
-from v2v_server.catalogue.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
-from v2v_server.catalogue.scenes import Looking
-from v2v_server.catalogue.survey import examine
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index.file import Figures, IndexRow, Store
+from v2v_server.corpus.probe import probe_file
+from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.scenes.collect import SceneCollection, figures
+from v2v_server.corpus.scenes.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
 from v2v_server.video.rows import Rows
@@ -54,8 +52,6 @@ _COLUMNS: tuple[Column, ...] = (
     ("videos", "videos", "{}", 1),
     ("open_seconds", "open s", "{:.2f}", 1.0),
     ("open_cpu_seconds", "CPU s", "{:.2f}", 1.0),
-    ("open_seconds_without_cache", "first s", "{:.2f}", 1.0),
-    ("open_cpu_seconds_without_cache", "CPU s", "{:.2f}", 1.0),
     ("table_seconds", "table s", "{:.2f}", 1.0),
     ("resident_bytes", "resident MiB", "{:.0f}", 2.0**-20),
     ("peak_bytes", "peak MiB", "{:.0f}", 2.0**-20),
@@ -84,7 +80,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = examine(folder, ids[0])
+    known = probe_file(folder, ids[0])
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))
@@ -95,18 +91,18 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
                 status = (folder / id).stat()
             yield dataclasses.replace(known, id=id, mtime_ns=status.st_mtime_ns, ctime_ns=status.st_ctime_ns)
 
-    def scenes() -> Iterator[tuple[str, str, str, bytes]]:
+    def scenes() -> Iterator[Figures]:
         end = min(known.frames, MOST_FRAMES)
         values = np.random.default_rng(0).uniform(1.0, 10.0, (-(-end // SEGMENT_FRAMES), COLUMNS))
-        whole, cut = (Scene.of(end, cuts, values).to_bytes() for cuts in ((), (end // 2,)))
+        whole, split = (figures(known, Scene.of(end, shot_boundaries, values)) for shot_boundaries in ((), (end // 2,)))
         for number, id in enumerate(ids):
-            yield id, known.fingerprint, Looking(Rows(), None).key, whole if number % 3 else cut
+            yield dataclasses.replace(whole if number % 3 else split, id=id)
 
     try:
         store.put(rows())
         if scene:
-            store.not_looked_at("")  # makes the table
-            store.put_scenes(scenes())
+            store.make_figures()
+            store.put_figures(SceneCollection(Rows(), None).kind, scenes())
     finally:
         store.close()
 
@@ -114,11 +110,11 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
 def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     """Open the catalogue in this process, which must be a fresh one; return the record."""
     before = resident_bytes()
-    began, cpu = time.perf_counter(), sum(os.times()[:4])  # with ended children
+    began, cpu = time.perf_counter(), sum(os.times()[:2])
     catalogue = open_catalogue(folder, cache_dir=cache, processes=usable_cores(), scene=scene)
     record: dict[str, Any] = {
         "open_seconds": time.perf_counter() - began,
-        "open_cpu_seconds": sum(os.times()[:4]) - cpu,
+        "open_cpu_seconds": sum(os.times()[:2]) - cpu,
     }
     began = time.perf_counter()
     table = SequenceTable(catalogue.videos, catalogue.rows, StreamSpec())
@@ -163,7 +159,5 @@ def measure(asked: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory(prefix="v2v-catalogue-", dir=asked.folder) as place:
         folder, cache = Path(place, "videos"), Path(place, "cache")
         make_up(asked.clip, folder, cache, asked.videos, asked.scene)
-        without_cache, record = (_in_a_fresh_process(folder, cache, asked.scene) for _ in range(2))
-        record |= {f"{name}_without_cache": without_cache[name] for name in ("open_seconds", "open_cpu_seconds")}
-        record |= first_batch(folder, cache, asked.scene)
+        record = _in_a_fresh_process(folder, cache, asked.scene) | first_batch(folder, cache, asked.scene)
     return Report([record], [([record], _COLUMNS)])

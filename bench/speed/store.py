@@ -25,7 +25,7 @@ import numpy.typing as npt
 from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.store.format import Head, group_frames_for
 from v2v_server.store.packing import DENSE, FAST, QUICK, Packing
 from v2v_server.store.reader import StoreFile

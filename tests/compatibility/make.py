@@ -28,8 +28,8 @@ from trainer.run.checkpoint import load_checkpoint
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.refresh import index_path
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.refresh import index_path
 from v2v_server.video.rows import Rows
 
 FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"

@@ -23,9 +23,9 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import StateMismatch
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue import refresh
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.index.file import SCHEMA_VERSION
+from v2v_server.corpus import refresh
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.video.rows import Rows
 
 FIXTURES = sorted(Path(__file__).parent.glob("numerics-*"))
@@ -127,8 +127,8 @@ def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypat
                 (state.st_size, state.st_mtime_ns, state.st_ctime_ns, path.name),
             )
     probed: list[str] = []
-    survey = refresh.survey
-    monkeypatch.setattr(refresh, "survey", lambda root, ids, *rest: probed.extend(ids) or survey(root, ids, *rest))
+    probe = refresh.probe_files
+    monkeypatch.setattr(refresh, "probe_files", lambda root, ids, *rest: probed.extend(ids) or probe(root, ids, *rest))
     with closing(open_catalogue(videos, rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
         assert [video.id for video in catalogue.videos] == ["a.mp4", "b.webm"]
         if version == SCHEMA_VERSION:

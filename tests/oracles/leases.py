@@ -12,8 +12,8 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows

@@ -21,8 +21,8 @@ from tests.oracles.stream_log import BatchLine, Line, OrderVerdict, Sighting, Si
 from v2v_protocol.errors import VideoError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence

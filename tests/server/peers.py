@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -29,11 +30,20 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    GiveUp,
+    ReportRefusal,
+    SendLease,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue, complete_lease
 
 DEADLINE = 60.0
 IDLE = 600.0
@@ -89,6 +99,7 @@ class Peers:
 
     Attributes:
         dispatcher: the one under test.
+        catalogue: the videos that it serves.
         now: the time everybody agrees on.
         frames: what each consumer was sent, in raw frames.
         heard: the same, decoded.
@@ -107,6 +118,7 @@ class Peers:
     """
 
     dispatcher: Dispatcher
+    catalogue: Catalogue
     quarantine: Quarantine
     now: float = 0.0
     frames: dict[bytes, list[Sequence[Buffer]]] = field(default_factory=dict)
@@ -144,6 +156,8 @@ class Peers:
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
+                case SendLease() as grant:
+                    self._complete(grant, todo)
                 case GiveUp(identity, reason):
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
@@ -158,6 +172,18 @@ class Peers:
                 case CheckVideo() as missing:
                     found = missing.video not in self.gone
                     todo.extend(self.dispatcher.video_checked(missing, found, self.now))
+
+    def _complete(self, grant: SendLease, todo: deque[Action]) -> None:
+        try:
+            frames = encode(complete_lease(grant.lease, self.catalogue, grant.spec))
+            todo.appendleft(ToWorker(grant.worker, frames))
+        except IndexUnreadable as error:
+            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
+            for each in unsent[1:]:
+                todo.remove(each)
+            self.dispatcher.index_unreadable(unsent, str(error), self.now)
+        except V2VError as error:
+            todo.extendleft(reversed(self.dispatcher.lease_refused(grant, str(error), self.now)))
 
     def _write(self, verdict: QuarantineEntry) -> list[QuarantineEntry]:
         if not self.writable:
@@ -270,10 +296,10 @@ def peers(
     expected_workers: int = 0,
 ) -> Peers:
     """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
-    videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
+    videos = catalogue or corpus(*(video(f"v{number}.mp4") for number in range(5)))
     held = Quarantine() if quarantine is None else quarantine
     dispatcher = Dispatcher(
-        videos if catalogue is None else catalogue,
+        videos.facts,
         spec,
         lease_deadline_seconds=DEADLINE,
         session_idle_seconds=IDLE,
@@ -282,4 +308,4 @@ def peers(
         wall_clock=lambda: "2024-02-29T12:00:00+00:00",
         expected_workers=expected_workers,
     )
-    return Peers(dispatcher, held)
+    return Peers(dispatcher, videos, held)

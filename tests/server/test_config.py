@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.server.corpus import corpus, video
+from tests.server.named_corpus import corpus, video
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec

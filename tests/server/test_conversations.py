@@ -17,7 +17,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, answer_to
 from tests.server.queues import Queues, ToySupervisor
 from v2v_protocol import NUMERICS_VERSION
@@ -165,7 +165,7 @@ class World:
         file = self.folder / "quarantine.jsonl"
         quarantine = read_quarantine(file)
         self.dispatcher = Dispatcher(
-            videos,
+            videos.facts,
             SMALL_SPEC,
             lease_deadline_seconds=DEADLINE,
             session_idle_seconds=600.0,

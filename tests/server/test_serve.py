@@ -26,8 +26,8 @@ from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 

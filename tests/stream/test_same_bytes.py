@@ -17,9 +17,9 @@ from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.console.asking import Looker
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
+from v2v_server.status.client import StatusClient
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +73,8 @@ def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None
     """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
     with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
         # Before its hello nobody would miss a worker.
-        with Looker(server.address) as looker:
-            until(lambda: len(looker.look()["workers"]) == 2)
+        with StatusClient(server.address) as client:
+            until(lambda: len(client.get_status()["workers"]) == 2)
         stopped = server_workers(server.pid)[0]
         stopped.suspend()
         got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]

@@ -7,7 +7,7 @@ door              limits on consumer connections, and which connections have end
 admission         turns a consumer's Hello into a session
 session           what each consumer has asked for, its credit, and the order of service
 leases            requests, and which worker holds which of them
-terms             the content of a lease, and the checks on its result
+grants            gives waiting requests to free workers: the content of a lease, and the checks on its result
 worker_registry   which workers are connected, have free credit, or are silent
 candidates        which sequence a request is made from, and when the next one is tried
 blame             what the loss of a worker says about the sample in work

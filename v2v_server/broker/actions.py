@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from v2v_protocol.messages import Denied, ErrorCode
+from v2v_protocol.messages import Denied, ErrorCode, Lease
 from v2v_protocol.refusal import Refusal
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import QuarantineEntry
@@ -35,7 +36,22 @@ class ToWorker:
 
 
 @dataclass(frozen=True, slots=True)
-class CutOff:
+class SendLease:
+    """Complete a lease with what the index on disk holds of its video, send it, and report a failure.
+
+    Attributes:
+        worker: routing id.
+        lease: without ``frame_index`` and ``scene``.
+        spec: the spec that the lease names.
+    """
+
+    worker: bytes
+    lease: Lease
+    spec: StreamSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Disconnect:
     """Disconnect a consumer that keeps sending malformed messages."""
 
     identity: bytes
@@ -95,7 +111,7 @@ class ReportRefusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Show:
+class SendStatus:
     """Send the next state of the service to this peer.
 
     Attributes:
@@ -107,7 +123,9 @@ class Show:
     is_worker_side: bool = False
 
 
-Action: TypeAlias = ToConsumer | ToWorker | CutOff | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | Show
+Action: TypeAlias = (
+    ToConsumer | ToWorker | SendLease | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
+)
 
 
 def denial(code: ErrorCode, text: str) -> Frames:

@@ -14,7 +14,7 @@ from v2v_protocol.wire import LARGEST_ARRAY_BYTES
 from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import clean_name
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import Columns, SequenceTable
 
@@ -22,7 +22,7 @@ MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
 """Less than ``transport.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
-"""Sequence tables cached for later consumers; a session keeps its own."""
+"""Sequence tables cached for later consumers. A session keeps its own, which is small."""
 
 
 def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
@@ -44,6 +44,7 @@ class Admission:
     """Turn what consumers ask for into sessions.
 
     Args:
+        facts: what is known of the videos, in memory.
         default_spec: the spec of a consumer that sends none.
         max_credit_bytes: bound on the bytes in flight to one consumer.
         session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
@@ -53,18 +54,18 @@ class Admission:
 
     def __init__(
         self,
-        catalogue: Catalogue,
+        facts: CorpusFacts,
         default_spec: StreamSpec,
         max_credit_bytes: int,
         session_idle_seconds: float,
         quarantine: Quarantine,
     ) -> None:
-        self._catalogue = catalogue
+        self._facts = facts
         self._default_spec = default_spec
         self._max_credit_bytes = max_credit_bytes
         self._session_idle_seconds = session_idle_seconds
         self._quarantine = quarantine
-        self._columns = Columns(catalogue.videos)
+        self._columns = Columns(facts.videos)
         self._tables: dict[tuple[object, ...], SequenceTable] = {}
 
     def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
@@ -121,7 +122,7 @@ class Admission:
         return session, Welcome(
             spec=spec.to_dict(),
             spec_digest=spec.digest,
-            catalogue_digest=self._catalogue.digest_under(spec.scene),
+            catalogue_digest=self._facts.digest_under(spec.scene),
             numerics_version=NUMERICS_VERSION,
             sequences=schedule.count,
             credit=session.credit,
@@ -159,7 +160,7 @@ class Admission:
         )
         table = self._tables.get(geometry)
         if table is None:
-            table = SequenceTable(self._catalogue.videos, self._catalogue.rows, spec, self._columns)
+            table = SequenceTable(self._facts.videos, self._facts.rows, spec, self._columns)
             if not table.count:
                 raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
             while len(self._tables) >= MOST_TABLES:

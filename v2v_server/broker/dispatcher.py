@@ -7,26 +7,23 @@ message from a peer leads to an action or a counted fault, never to an exception
 from __future__ import annotations
 
 import hashlib
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.errors import (
     CorpusError,
-    IndexUnreadable,
     LimitExceeded,
     ProtocolError,
     UsageError,
-    V2VError,
     VersionMismatch,
 )
 from v2v_protocol.messages import (
     Begun,
     Denied,
     ErrorCode,
+    GetStatus,
     Goodbye,
     Hello,
     LeaseFailed,
@@ -35,12 +32,10 @@ from v2v_protocol.messages import (
     Pong,
     Result,
     SampleHeader,
-    See,
     Stop,
     Want,
     WorkerHello,
 )
-from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
@@ -48,23 +43,24 @@ from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
     CheckVideo,
-    CutOff,
+    Disconnect,
     GiveUp,
-    Show,
+    SendLease,
+    SendStatus,
     ToConsumer,
     ToWorker,
     denial,
 )
 from v2v_server.broker.admission import Admission
-from v2v_server.broker.blame import Cause, Loss, judge, runs_alone
+from v2v_server.broker.blame import Cause, Loss, judge
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
+from v2v_server.broker.grants import Grants, check_result
 from v2v_server.broker.leases import LeaseBook, Request, Stall
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
-from v2v_server.broker.terms import check_result, lease_for, work_seconds
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.videos import CorpusFacts
 
 MOST_SESSIONS = 4096
 _LONGEST_SECRET_BYTES = 64
@@ -77,6 +73,7 @@ class Dispatcher:
     """Assign requests of consumers to workers.
 
     Args:
+        facts: what is known of the videos, in memory.
         default_spec: the spec of a consumer that sends none.
         lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
             that the sample may take, is treated as hung.
@@ -90,7 +87,6 @@ class Dispatcher:
     Attributes:
         counters: totals since the start.
         sessions: the consumers.
-        blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         registry: the workers.
         leases: which worker makes what.
         candidates: which sequences were refused.
@@ -98,7 +94,7 @@ class Dispatcher:
 
     def __init__(
         self,
-        catalogue: Catalogue,
+        facts: CorpusFacts,
         default_spec: StreamSpec,
         *,
         lease_deadline_seconds: float,
@@ -110,16 +106,20 @@ class Dispatcher:
     ) -> None:
         self.counters = Counters()
         self.leases = LeaseBook(lease_deadline_seconds)
-        self.sessions = Sessions(self.leases.abandoned)
+        self.sessions = Sessions(self.leases)
         self._expected_workers = expected_workers
-        self._catalogue = catalogue
+        self._facts = facts
         self._quarantine = quarantine
         self.candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
-        self._admission = Admission(catalogue, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
+        self._admission = Admission(facts, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self.registry = Workers(self.leases)
-        self._lone: deque[Request] = deque()
-        self.blocked_reason = ""
+        self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates)
         self._faults: dict[bytes, int] = {}  # malformed messages of connected consumers
+
+    @property
+    def blocked_reason(self) -> str:
+        """Why no lease can be granted at the moment; empty if leases can be granted."""
+        return self._grants.blocked_reason
 
     @property
     def workers(self) -> int:
@@ -129,7 +129,7 @@ class Dispatcher:
     @property
     def waiting(self) -> int:
         """Number of requested samples that are not leased to a worker yet."""
-        return len(self._lone) + sum(len(session.waiting) for session in self.sessions)
+        return len(self._grants.lone) + sum(len(session.waiting) for session in self.sessions)
 
     @property
     def waiting_share(self) -> float:
@@ -147,7 +147,7 @@ class Dispatcher:
         session = self.sessions.get(request.session)
         if session is None:
             return None
-        catalogue = self._catalogue.digest_under(session.spec.scene)
+        catalogue = self._facts.digest_under(session.spec.scene)
         return SampleId(session.spec.digest, catalogue, NUMERICS_VERSION, session.seed, request.epoch, request.index)
 
     def clip_of(self, request: Request) -> tuple[str, int] | None:
@@ -192,8 +192,8 @@ class Dispatcher:
                         identity, encode(Pong(self.blocked_reason or self.registry.trouble(self._expected_workers)))
                     )
                 ]
-            case See():
-                return [Show(identity)]
+            case GetStatus():
+                return [SendStatus(identity)]
             case Goodbye():
                 if session is not None:
                     self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
@@ -203,7 +203,7 @@ class Dispatcher:
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
-                return self._want(session, message) or self._assign(now)
+                return self._want(session, message) or self._grants.assign(now)
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, stray)]
@@ -221,8 +221,7 @@ class Dispatcher:
     def consumer_lost(self, identity: bytes) -> None:
         """Forget a consumer that left or cannot be reached any more."""
         self.sessions.forget(identity)
-        self.leases.forget_session(identity)
-        self._lone = deque(request for request in self._lone if request.session != identity)
+        self._grants.forget_session(identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float, user: str) -> Action:
         try:
@@ -245,8 +244,7 @@ class Dispatcher:
         except (UsageError, CorpusError) as error:
             return _deny(identity, ErrorCode.SPEC, str(error))
         for before in {identity, *self.sessions.owned_by(owner)}:
-            self.leases.forget_session(before)
-            self._lone = deque(request for request in self._lone if request.session != before)
+            self._grants.forget_session(before)
         self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
 
@@ -257,7 +255,7 @@ class Dispatcher:
             return [self._fault(session.identity, error)]
         try:
             for index in want.indices[:1]:
-                SampleId(session.spec.digest, self._catalogue.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
+                SampleId(session.spec.digest, self._facts.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
             self.sessions.want(session, want.epoch, want.indices, slots)
         except LimitExceeded as error:
             return [_deny(session.identity, ErrorCode.CREDIT, str(error))]
@@ -271,7 +269,7 @@ class Dispatcher:
         if len(self._faults) > MOST_SESSIONS:
             del self._faults[next(iter(self._faults))]
         answer = ToConsumer(identity, self._malformed(error))
-        return answer if faults <= MOST_FAULTS else CutOff(identity)
+        return answer if faults <= MOST_FAULTS else Disconnect(identity)
 
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1
@@ -295,8 +293,8 @@ class Dispatcher:
             return [ToWorker(identity, self._malformed(error))]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now, user)
-        if isinstance(message, See):
-            return [Show(identity, is_worker_side=True)]
+        if isinstance(message, GetStatus):
+            return [SendStatus(identity, is_worker_side=True)]
         if isinstance(message, Hello):
             text = "this is the workers' port: connect to the address of --bind"
             return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
@@ -352,7 +350,26 @@ class Dispatcher:
         for each in self.sessions:
             if each.quarantine == before:
                 each.quarantine = self._quarantine.latest
-        return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._assign(now)]
+        return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._grants.assign(now)]
+
+    def index_unreadable(self, unsent: Sequence[SendLease], reason: str, now: float) -> None:
+        """Continue after leases that cannot be completed, because the index cannot be read at the moment.
+
+        No lease is granted until the next :meth:`tick`.
+
+        Args:
+            unsent: the actions, oldest first.
+            reason: why it cannot be read.
+            now: monotonic time, seconds.
+        """
+        self._grants.blocked_reason = f"{reason}; retried ten times a second"
+        self._grants.take_back(unsent, now)
+
+    def lease_refused(self, unsent: SendLease, reason: str, now: float) -> list[Action]:
+        """Continue after a lease that can never be sent: the index of its video is damaged, belongs to another file, or
+        is too large.
+        """
+        return [*self._grants.refuse(unsent, reason, now), *self._grants.assign(now)]
 
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.
@@ -363,11 +380,11 @@ class Dispatcher:
             now: monotonic time, seconds.
         """
         if not found:
-            return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._assign(now)]
+            return [*self.candidates.refuse(missing.request, missing.frame, missing.reason), *self._grants.assign(now)]
         self.counters.missing_videos += 1
         self.registry.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)
-        return self._assign(now)
+        return self._grants.assign(now)
 
     def tick(self, now: float) -> list[Action]:
         """Apply deadlines, lease slow samples to a second worker, and forget silent peers. Call a few times a
@@ -376,19 +393,17 @@ class Dispatcher:
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
-        self.blocked_reason = ""  # cleared so that the next lease is tried
+        self._grants.blocked_reason = ""  # cleared so that the next lease is tried
         self.registry.wake(now)
         for identity in self.registry.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
-        for request, worker in self.leases.slow(now):
-            second = self.registry.for_request(keep_one_empty=bool(self._lone), other_than=worker)
-            if second is not None and not runs_alone(request):
-                self.counters.second_leases += 1
-                actions += self._grant(replace(request, slot=None), second, now)
+        second = self._grants.assign_slow(now)
+        self.counters.second_leases += len(second)
+        actions += second
         # A consumer that left may have freed a worker that was reserved for its requests.
-        return actions + self._assign(now)
+        return actions + self._grants.assign(now)
 
     def stop_workers(self) -> list[ToWorker]:
         """Tell every worker to finish and leave."""
@@ -409,7 +424,7 @@ class Dispatcher:
             text = f"this server has {MOST_WORKERS} workers, its limit"
             return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
         self.registry.add(identity, hello, now, user, owner)
-        return actions + self._assign(now)
+        return actions + self._grants.assign(now)
 
     def _replaced_by(self, identity: bytes, name: str, owner: bytes, user: str) -> list[bytes]:
         """Return the connections that a worker's hello replaces: its own ones.
@@ -454,17 +469,17 @@ class Dispatcher:
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
         self.leases.mark_begun(result.begins, identity, now)
-        return actions + self._assign(now)
+        return actions + self._grants.assign(now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
         self._charge(failed.lease, identity, now)
         request = self.leases.finished(failed.lease, identity, now)
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
-            return self._assign(now)
+            return self._grants.assign(now)
         if not failed.here:
             self.registry.can_work(identity)
-            return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._assign(now)]
+            return [*self.candidates.refuse(request, failed.frame, failed.reason), *self._grants.assign(now)]
         # The catalogue lists this host's files: if the video is here, other workers can probably read it.
         video = self.candidates.sequence(session, request).video
         return [CheckVideo(video.id, video.fingerprint, identity, failed.frame, failed.reason, request)]
@@ -499,77 +514,7 @@ class Dispatcher:
                 self.sessions.put_back(verdict)
             else:
                 actions += self.candidates.quarantine_candidate(request, verdict, for_all=loss.for_all)
-        return actions + self._assign(now)
-
-    # --- requests ----------------------------------------------------------------------------------------------------
-
-    def _assign(self, now: float) -> list[Action]:
-        """Give waiting requests to workers until there are no requests or no free workers."""
-        actions: list[Action] = []
-        while not self.blocked_reason:
-            if self._lone:
-                empty = self.registry.for_lone_request()
-                if empty is not None:
-                    actions += self._give([self._lone.popleft()], empty, now)
-                    continue
-            worker = self.registry.for_request(keep_one_empty=bool(self._lone))
-            request = self.sessions.next_request() if worker is not None else None
-            if worker is None or request is None:
-                return actions
-            if runs_alone(request):
-                self._lone.append(request)
-            else:
-                actions += self._give([request, *self.sessions.take_siblings(request)], worker, now)
-        return actions
-
-    def _give(self, requests: list[Request], worker: bytes, now: float) -> list[Action]:
-        """Give a worker the requests of one clip, except those whose candidate is in quarantine."""
-        session = self.sessions.get(requests[0].session)
-        if session is None:
-            return []
-        actions: list[Action] = []
-        good: list[Request] = []
-        for request in requests:
-            current = self.candidates.current(request, session)
-            quarantined = self.candidates.quarantined(session, current, session.quarantine)
-            if quarantined is None:
-                good.append(current)
-            else:
-                actions += self.candidates.refuse(current, None, quarantined, RefusalKind.QUARANTINED)
-        for place, request in enumerate(good):
-            actions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
-        return actions
-
-    def _grant(self, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()) -> list[Action]:
-        session = self.sessions.get(request.session)
-        if session is None:
-            return []
-        sequence = self.candidates.sequence(session, request)
-        seconds = work_seconds(session.spec, session.arrays, sequence.video)
-        number = self.leases.grant(request, worker, now, seconds)
-        try:
-            lease = lease_for(
-                request,
-                number=number,
-                sequence=sequence,
-                catalogue=self._catalogue,
-                spec=session.spec,
-                seed=session.seed,
-                arrays=session.arrays,
-                siblings=siblings,
-                packed=session.packed,
-            )
-            return [ToWorker(worker, encode(lease))]
-        except IndexUnreadable as error:
-            self.blocked_reason = f"{error}; retried ten times a second"
-            returned = self.leases.finished(number, worker, now)
-            if returned is not None:
-                self.sessions.put_back(returned)
-            return []
-        except V2VError as error:
-            # The index of this video cannot be read, or is too large to send; other videos are not affected.
-            returned = self.leases.finished(number, worker, now)
-            return [] if returned is None else self.candidates.refuse(returned, None, str(error))
+        return actions + self._grants.assign(now)
 
 
 def _only(frames: Sequence[Buffer]) -> Message:

@@ -102,6 +102,7 @@ class LeaseBook:
         self._out: dict[tuple[bytes, int, int], list[int]] = {}
         self._durations: dict[bytes, deque[float]] = {}
         self._abandoned: dict[bytes, int] = {}
+        self._released: set[bytes] = set()
         self._next = 1
         self._changed: set[bytes] = set()
 
@@ -214,6 +215,11 @@ class LeaseBook:
         """Return the number of leases out for samples that this consumer asked for and then abandoned."""
         return self._abandoned.get(session, 0)
 
+    def take_released(self) -> set[bytes]:
+        """Return and clear the consumers that have fewer abandoned leases than at the last call."""
+        released, self._released = self._released, set()
+        return released
+
     def debt(self, number: int, worker: bytes, now: float) -> tuple[bytes, float] | None:
         """Return which consumer abandoned the sample of this lease, and how long it took, seconds; None if it is
         still wanted.
@@ -318,6 +324,7 @@ class LeaseBook:
     def _drop(self, number: int) -> None:
         lease = self._leases.pop(number)
         if lease.debtor is not None:
+            self._released.add(lease.debtor)
             self._abandoned[lease.debtor] -= 1
             if not self._abandoned[lease.debtor]:
                 del self._abandoned[lease.debtor]

@@ -29,7 +29,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.safe_json import parse_json
-from v2v_server.catalogue.refresh import index_path
+from v2v_server.corpus.refresh import index_path
 from v2v_server.system.private import open_private
 
 VERDICTS_PER_VIDEO = 2

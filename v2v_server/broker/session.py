@@ -3,22 +3,21 @@
 The server keeps no position: a consumer asks for indices, each of which is one unit of its credit until it is answered,
 and an index that was answered is forgotten. So a session can be dropped and opened again at any time.
 
-Worker time is shared by deficit round robin (Shreedhar and Varghese, "Efficient fair queuing using deficit round
-robin", SIGCOMM 1995). The cost of a sample is known only once it is made, so a session pays afterwards: it is served
-while its balance is not negative. If all waiting sessions have negative balances, each earns one quantum at a time. A
-consumer whose samples take ten times the work therefore gets a tenth of the samples, not ten times the time.
-
-A repeated Hello changes none of this. The new session takes over the debt of the old one, and its abandoned requests
-count against its credit until the workers have finished them.
+Worker time is shared by deficit round robin (:class:`FairQueue`). A repeated Hello changes none of this: the new
+session takes over the debt of the old one, and its abandoned requests count against its credit until the workers have
+finished them.
 
 Memory: the server queues at most credit x sample bytes for a session, whatever the consumer does.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import count
+from typing import TypeAlias
 
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import LimitExceeded
@@ -26,15 +25,20 @@ from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import runs_alone
-from v2v_server.broker.leases import Request
+from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.schedule.epoch import Schedule
 
-_QUANTUM_SECONDS = 0.05
+_Place: TypeAlias = tuple[bool, int]  # (whether in debt, key in the heap of such consumers)
+
+_SECOND_NS = 1_000_000_000
+_QUANTUM_NS = _SECOND_NS // 20
+_MOST_DEBTS = 4096
+"""Number of debts remembered for absent consumers; the oldest is dropped first."""
+_MOST_STALE = 64
+"""Entries that a heap may hold, besides two for each consumer, before it is rebuilt."""
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0
-_MOST_DEBTS = 4096
-"""Number of debts remembered for absent consumers; the oldest is dropped first."""
 
 
 @dataclass(slots=True)
@@ -49,7 +53,6 @@ class Session:
         liveness: when it was last heard.
         waiting: requests without a worker, in the order of the request.
         unanswered: every requested (epoch, index) that is not yet answered.
-        balance_seconds: worker time that it has earned and not used.
         served: samples sent.
         quarantine: number of the quarantine snapshot that its samples are made under.
         left_at: when its connection ended; None while it is connected, as far as is known.
@@ -74,7 +77,6 @@ class Session:
     liveness: Liveness
     waiting: deque[Request] = field(default_factory=deque)
     unanswered: set[tuple[int, int]] = field(default_factory=set)
-    balance_seconds: float = 0.0
     served: int = 0
     quarantine: int = 0
     left_at: float | None = None
@@ -117,14 +119,14 @@ class Sessions:
     """All consumers, and the order in which they are served.
 
     Args:
-        abandoned: returns how many samples workers still make that this consumer abandoned in an earlier session.
+        leases: the leases that are out. They say how many samples workers still make that a consumer abandoned in an
+            earlier session.
     """
 
-    def __init__(self, abandoned: Callable[[bytes], int] = lambda identity: 0) -> None:
-        self._abandoned = abandoned
-        self._debts: dict[bytes, float] = {}
+    def __init__(self, leases: LeaseBook) -> None:
+        self._leases = leases
         self._sessions: dict[bytes, Session] = {}
-        self._turns: deque[bytes] = deque()
+        self._queue = FairQueue()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -140,11 +142,11 @@ class Sessions:
         """Add a session. It replaces a session with the same routing id or owner: old requests are dropped, the debt
         stays.
         """
-        for before in {session.identity, *self.owned_by(session.owner)}:
+        replaced = {session.identity, *self.owned_by(session.owner)}
+        for before in replaced:
             self.forget(before)
-            session.balance_seconds -= self._debts.pop(before, 0.0)
         self._sessions[session.identity] = session
-        self._turns.append(session.identity)
+        self._queue.add(session.identity, replaced)
 
     def owned_by(self, owner: bytes) -> list[bytes]:
         """Return the routing ids of an owner's sessions; an empty list for an empty owner."""
@@ -152,21 +154,16 @@ class Sessions:
 
     def forget(self, identity: bytes) -> None:
         """Drop a session, if there is one; its debt is remembered."""
-        session = self._sessions.pop(identity, None)
-        if session is not None:
-            self._turns.remove(identity)
-            if session.balance_seconds < 0.0:
-                self.charge(identity, -session.balance_seconds)
+        if self._sessions.pop(identity, None) is not None:
+            self._queue.remove(identity)
 
     def charge(self, identity: bytes, seconds: float) -> None:
         """Charge worker time to a consumer, whether it is connected or not."""
-        session = self._sessions.get(identity)
-        if session is not None:
-            session.balance_seconds -= seconds
-            return
-        self._debts[identity] = self._debts.pop(identity, 0.0) + seconds
-        if len(self._debts) > _MOST_DEBTS:
-            del self._debts[next(iter(self._debts))]
+        self._queue.charge(identity, seconds)
+
+    def balance_seconds(self, identity: bytes) -> float:
+        """Return the worker time that a consumer has earned and not used; negative: its debt."""
+        return self._queue.balance_seconds(identity)
 
     def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
         """Queue requests of a consumer. Samples that it already waits for are not made twice, and keep their slots.
@@ -196,29 +193,24 @@ class Sessions:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
             session.waiting.append(Request(session.identity, epoch, index, place=place, slot=places[index]))
+        self._requeue(session)
 
     def next_request(self) -> Request | None:
-        """Take the next request to give to a worker, by deficit round robin; None if no session waits."""
-        waiting = [identity for identity in self._turns if self._may_go_on(self._sessions[identity])]
-        if not waiting:
+        """Take the next request to give to a worker; None if no session waits."""
+        for identity in self._leases.take_released():
+            if (session := self._sessions.get(identity)) is not None:
+                self._requeue(session)
+        if (first := self._queue.next()) is None:
             return None
-        while True:
-            for identity in waiting:
-                session = self._sessions[identity]
-                if session.balance_seconds >= 0.0:
-                    self._turns.remove(identity)
-                    self._turns.append(identity)
-                    return session.waiting.popleft()
-            # All waiting sessions are in debt: add quanta until the smallest debt is paid.
-            debt = -max(self._sessions[identity].balance_seconds for identity in waiting)
-            quanta = int(debt / _QUANTUM_SECONDS) + 1
-            for identity in waiting:
-                self._sessions[identity].balance_seconds += quanta * _QUANTUM_SECONDS
+        session = self._sessions[first]
+        request = session.waiting.popleft()
+        self._requeue(session)
+        return request
 
-    def _may_go_on(self, session: Session) -> bool:
-        """Return whether a session has waiting requests and credit that its abandoned requests do not use up."""
-        at_work = len(session.unanswered) - len(session.waiting)
-        return bool(session.waiting) and self._abandoned(session.identity) + at_work < session.credit
+    def _requeue(self, session: Session) -> None:
+        """Note whether a session has waiting requests and credit that its abandoned requests do not use up."""
+        at_work = len(session.unanswered) - len(session.waiting) + self._leases.abandoned(session.identity)
+        self._queue.set_waiting(session.identity, waits=bool(session.waiting) and at_work < session.credit)
 
     def take_siblings(self, request: Request) -> list[Request]:
         """Take the waiting requests that are made from the same clip as ``request``."""
@@ -228,6 +220,7 @@ class Sessions:
         siblings = [other for other in session.waiting if other.clip == request.clip and not runs_alone(other)]
         for sibling in siblings:
             session.waiting.remove(sibling)
+        self._requeue(session)
         return siblings
 
     def put_back(self, request: Request) -> None:
@@ -237,6 +230,7 @@ class Sessions:
         session = self._sessions.get(request.session)
         if session is not None and (request.epoch, request.index) in session.unanswered:
             session.waiting.appendleft(request)
+            self._requeue(session)
 
     def mark_answered(self, request: Request, worker_seconds: float) -> bool:
         """Close a request; return False if it is not wanted: the session is gone, or the request was answered
@@ -248,11 +242,10 @@ class Sessions:
         session.unanswered.remove((request.epoch, request.index))
         if request.epoch == session.epoch:
             session.position = max(session.position, request.index + 1)
-        session.balance_seconds -= worker_seconds
+        self._queue.charge(request.session, worker_seconds)
+        self._requeue(session)
         if not session.unanswered:
-            # An idle session saves no credit balance. A debt stays; otherwise asking for one sample at a time would be
-            # free. The debt is at most the cost of the samples that were in work at the same time.
-            session.balance_seconds = min(session.balance_seconds, 0.0)
+            self._queue.drop_savings(request.session)
         session.served += 1
         return True
 
@@ -273,3 +266,134 @@ class Sessions:
             for session in self._sessions.values()
             if session.left_at is not None or session.liveness.silence(now) >= SILENT_SECONDS
         ]
+
+
+@dataclass(slots=True)
+class _Balance:
+    turn: int
+    balance_ns: int = 0  # without what a waiting debtor has earned
+    place: _Place | None = None  # None: does not wait
+
+
+class FairQueue:
+    """Share worker time between consumers by deficit round robin, at logarithmic cost for each request.
+
+    Deficit round robin: Shreedhar and Varghese, "Efficient fair queuing using deficit round robin", SIGCOMM 1995. The
+    cost of a sample is known only once it is made, so a consumer pays afterwards. Waiting consumers are served in turn
+    while their balance is not negative. If all are in debt, each earns the number of quanta that pays the smallest
+    debt. A consumer whose samples take ten times the work gets a tenth of the samples, not ten times the time.
+
+        waiting, balance >= 0     heap by turn: the consumer that was served longest ago comes first
+        waiting, balance < 0      heap by the earnings that pay the debt: ``earned`` of the queue minus the balance
+        not waiting               in no heap; earns nothing
+
+    Quanta are not added to every balance: the queue counts what each waiting debtor has earned. Balances are whole
+    nanoseconds, so that this sum is exact. Heap entries that no longer hold are skipped when they reach the top, and
+    removed when they outnumber the consumers.
+    """
+
+    def __init__(self) -> None:
+        self._accounts: dict[bytes, _Balance] = {}
+        self._debts_ns: dict[bytes, int] = {}  # of absent consumers
+        self._turns = count()
+        self._earned_ns = 0
+        self._heaps: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = [], []  # solvent, in debt
+
+    def add(self, identity: bytes, debtors: Iterable[bytes] = ()) -> None:
+        """Add a consumer, which does not wait yet.
+
+        Args:
+            identity: the consumer.
+            debtors: absent consumers whose debts it takes over.
+        """
+        debt_ns = sum(self._debts_ns.pop(each, 0) for each in debtors)
+        self._accounts[identity] = _Balance(next(self._turns), -debt_ns)
+
+    def remove(self, identity: bytes) -> None:
+        """Remove a consumer; its debt is remembered."""
+        balance_ns = self._balance_ns(self._accounts.pop(identity))
+        if balance_ns < 0:
+            self._remember(identity, -balance_ns)
+
+    def charge(self, identity: bytes, seconds: float) -> None:
+        """Charge worker time to a consumer, whether it is present or not."""
+        cost_ns = round(seconds * _SECOND_NS)
+        account = self._accounts.get(identity)
+        if account is None:
+            self._remember(identity, cost_ns)
+        else:
+            self._settle(identity, account, self._balance_ns(account) - cost_ns, waits=account.place is not None)
+
+    def balance_seconds(self, identity: bytes) -> float:
+        """Return what a consumer has earned and not used; negative: its debt."""
+        return self._balance_ns(self._accounts[identity]) / _SECOND_NS
+
+    def drop_savings(self, identity: bytes) -> None:
+        """Drop what an idle consumer has earned and not used.
+
+        A debt stays; otherwise asking for one sample at a time would be free. The debt is at most the cost of the
+        samples that were in work at the same time.
+        """
+        account = self._accounts[identity]
+        account.balance_ns = min(account.balance_ns, 0)
+
+    def set_waiting(self, identity: bytes, *, waits: bool) -> None:
+        """Note whether a consumer waits for a worker."""
+        account = self._accounts[identity]
+        if waits != (account.place is not None):
+            self._settle(identity, account, self._balance_ns(account), waits=waits)
+
+    def next(self) -> bytes | None:
+        """Return the consumer to serve, and put its next turn behind those of all others; None if none waits."""
+        if (identity := self._first(in_debt=False)) is None:
+            if self._first(in_debt=True) is None:
+                return None
+            self._pay_smallest_debt()
+            return self.next()
+        account = self._accounts[identity]
+        account.turn = next(self._turns)
+        self._settle(identity, account, account.balance_ns, waits=True)
+        return identity
+
+    def _pay_smallest_debt(self) -> None:
+        debt_ns = self._heaps[True][0][0] - self._earned_ns
+        self._earned_ns += (debt_ns // _QUANTUM_NS + 1) * _QUANTUM_NS
+        while (debtor := self._first(in_debt=True)) is not None and self._heaps[True][0][0] <= self._earned_ns:
+            account = self._accounts[debtor]
+            self._settle(debtor, account, self._balance_ns(account), waits=True)
+
+    def _balance_ns(self, account: _Balance) -> int:
+        in_debt, key = account.place or (False, 0)
+        return self._earned_ns - key if in_debt else account.balance_ns
+
+    def _settle(self, identity: bytes, account: _Balance, balance_ns: int, *, waits: bool) -> None:
+        """Set a balance, and move the consumer to the heap where it belongs."""
+        account.balance_ns = balance_ns
+        in_debt = balance_ns < 0
+        place = (in_debt, self._earned_ns - balance_ns if in_debt else account.turn) if waits else None
+        if place == account.place:
+            return
+        account.place = place
+        if place is None:
+            return
+        heap = self._heaps[in_debt]
+        heapq.heappush(heap, (place[1], identity))
+        if len(heap) > 2 * len(self._accounts) + _MOST_STALE:
+            heap[:] = {entry for entry in heap if self._holds(entry, in_debt=in_debt)}
+            heapq.heapify(heap)
+
+    def _first(self, *, in_debt: bool) -> bytes | None:
+        """Return the consumer at the top of a heap; None if the heap is empty."""
+        heap = self._heaps[in_debt]
+        while heap and not self._holds(heap[0], in_debt=in_debt):
+            heapq.heappop(heap)
+        return heap[0][1] if heap else None
+
+    def _holds(self, entry: tuple[int, bytes], *, in_debt: bool) -> bool:
+        account = self._accounts.get(entry[1])
+        return account is not None and account.place == (in_debt, entry[0])
+
+    def _remember(self, identity: bytes, debt_ns: int) -> None:
+        self._debts_ns[identity] = self._debts_ns.pop(identity, 0) + debt_ns
+        if len(self._debts_ns) > _MOST_DEBTS:
+            del self._debts_ns[next(iter(self._debts_ns))]

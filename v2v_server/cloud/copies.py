@@ -64,7 +64,7 @@ class Copies:
         return self.bucket.url
 
     def __fspath__(self) -> str:
-        """For who names a corpus, not a file: :func:`v2v_server.catalogue.refresh.index_path`."""
+        """For who names a corpus, not a file: :func:`v2v_server.corpus.refresh.index_path`."""
         return self.bucket.url
 
     @cached_property

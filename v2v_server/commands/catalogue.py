@@ -12,12 +12,12 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.spec import SCENES
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.index.parts import Shard
 from v2v_server.cloud.copies import COPIES_GIB
-from v2v_server.console.progress import CatalogueProgress, catalogue_progress
-from v2v_server.console.shutdown_summary import format_duration
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.index.parts import Shard
 from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
+from v2v_server.status.progress import CatalogueProgress, catalogue_progress
+from v2v_server.status.shutdown_summary import format_duration
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 

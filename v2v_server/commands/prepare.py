@@ -31,11 +31,11 @@ from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
-from v2v_server.catalogue.catalogue import open_catalogue
-from v2v_server.catalogue.listfile import LIST_SUFFIXES
-from v2v_server.console.progress import catalogue_progress
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
+from v2v_server.status.progress import catalogue_progress
 from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
 from v2v_server.store.packing import SIZES
 from v2v_server.system.process import usable_cores

@@ -17,8 +17,8 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
 from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
-from v2v_server.catalogue.files import corpus_root
 from v2v_server.cloud.bucket import is_url
+from v2v_server.corpus.files import corpus_root
 
 
 def main(argv: Sequence[str] | None = None) -> int:

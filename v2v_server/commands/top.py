@@ -13,8 +13,8 @@ from rich.live import Live
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import ServerLost, V2VError
-from v2v_server.console.asking import Looker
-from v2v_server.console.top import draw, line
+from v2v_server.status.client import StatusClient
+from v2v_server.status.top import draw, line
 
 _LIVE_SECONDS, _LINE_SECONDS = 1.0, 10.0
 
@@ -45,30 +45,30 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     console = Console()
-    with Looker(arguments.connect, arguments.keys) as looker:
-        state = looker.look(arguments.timeout_seconds)  # report an absent server at once
+    with StatusClient(arguments.connect, arguments.keys) as client:
+        state = client.get_status(arguments.timeout_seconds)  # report an absent server at once
         if not console.is_terminal:
-            _lines(looker, state, arguments)
+            _lines(client, state, arguments)
         elif arguments.once:
             console.print(draw(state))
         else:
-            _live(console, looker, state, arguments.timeout_seconds)
+            _live(console, client, state, arguments.timeout_seconds)
 
 
-def _lines(looker: Looker, state: dict[str, Any], arguments: argparse.Namespace) -> None:
+def _lines(client: StatusClient, state: dict[str, Any], arguments: argparse.Namespace) -> None:
     print(line(state), flush=True)
     while not arguments.once:
         time.sleep(_LINE_SECONDS)
-        print(line(looker.look(arguments.timeout_seconds)), flush=True)
+        print(line(client.get_status(arguments.timeout_seconds)), flush=True)
 
 
-def _live(console: Console, looker: Looker, state: dict[str, Any], timeout_seconds: float) -> None:
+def _live(console: Console, client: StatusClient, state: dict[str, Any], timeout_seconds: float) -> None:
     with Live(draw(state), console=console, screen=True, auto_refresh=False) as live:
         while True:
             time.sleep(_LIVE_SECONDS)
             note = ""
             try:
-                state = looker.look(timeout_seconds)
+                state = client.get_status(timeout_seconds)
             except ServerLost as error:  # the server may come back
                 note = f"{error} The state shown is old."
             live.update(draw(state, note), refresh=True)

@@ -1,5 +1,6 @@
 """Samples without a server.
 
+leases.py   the leases that a server would send
 remake.py   any sample of any stream again: ``v2v-simulate``, tests, bug reports
 preview.py  what a recipe makes of a video, as pictures
 motion.py   whole pictures without noise, and seeds whose cameras see motion

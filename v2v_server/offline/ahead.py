@@ -8,19 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.corpus import find_corpus
-from v2v_server.catalogue.files import Notice, corpus_root
-from v2v_server.catalogue.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
-from v2v_server.catalogue.refresh import Progress, index_path, up_to_date
-from v2v_server.catalogue.scenes import Looking
 from v2v_server.cloud.copies import COPIES_GIB, copies_of
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.corpus import find_corpus
+from v2v_server.corpus.files import Notice, corpus_root
+from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.video.rows import Rows
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """What to catalogue, and how; see :func:`v2v_server.catalogue.catalogue.open_catalogue`."""
+    """What to catalogue, and how; see :func:`v2v_server.corpus.catalogue.open_catalogue`."""
 
     videos: str
     list_file: str | None = None
@@ -55,7 +56,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     Args:
         asked: the corpus.
         parts: folder of the parts that other hosts made; files that match are not probed again.
-        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: as there; or parts are missing or cannot be read.
@@ -86,7 +87,7 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     Args:
         asked: the corpus.
         out: folder of the parts, which all hosts see.
-        progress, notice: as in :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
         CorpusError: there is no such corpus, or a folder cannot be written to.
@@ -95,10 +96,15 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     bucket = copies_of(os.fspath(asked.videos), asked.copies, asked.copies_gib, asked.cache_dir)
     corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    looking = Looking(corpus.rows, corpus.manifest) if asked.scene else None
+    scenes = SceneCollection(corpus.rows, corpus.manifest) if asked.scene else None
     index = index_path(corpus.root, asked.cache_dir, shard)
-    store, records, notes = up_to_date(corpus.root, ids, index, looking, asked.processes, progress, notice)
+    store, table, notes = refresh_index(corpus.root, ids, index, scenes, asked.processes, progress, notice)
     store.close()
     if notes:
         raise CorpusError(notes[0])
-    return Part(write_part(index, out, shard), len(corpus.ids), len(ids), Counter(records.problems.values()))
+    return Part(
+        write_part(index, out, shard),
+        len(corpus.ids),
+        len(ids),
+        Counter(problem for problem in table.problem if problem is not None),
+    )

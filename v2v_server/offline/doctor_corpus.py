@@ -12,9 +12,9 @@ from itertools import islice
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.cloud.copies import Copies
 from v2v_server.config import recipe_setting
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.aperture import clean_aperture
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
@@ -31,7 +31,7 @@ def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, s
     """Check a corpus and yield lines of the report.
 
     Args:
-        videos, rows, cache_dir: as of :func:`v2v_server.catalogue.catalogue.open_catalogue`.
+        videos, rows, cache_dir: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
         recipe: name of a preset, or a YAML file.
         shown: how many refusals of a kind to name.
 

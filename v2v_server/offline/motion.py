@@ -17,10 +17,10 @@ from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.cloud.copies import open_local
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.flow import view_part
+from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.draw import draw

@@ -25,8 +25,8 @@ from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.cloud.copies import open_local
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence

@@ -21,12 +21,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.console.progress import catalogue_progress
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.event_files import check_event_file, write_events
+from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.status.progress import catalogue_progress
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample

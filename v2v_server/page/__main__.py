@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import uvicorn
 
-from v2v_server.console.asking import Looker
 from v2v_server.page.app import make_app
 from v2v_server.page.silent import BoundedProtocol
 from v2v_server.page.source import Source
+from v2v_server.status.client import StatusClient
 from v2v_server.system.process import die_with_parent
 
 _NICE = 10
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     die_with_parent(arguments.parent_pid)
     os.nice(_NICE)
     # No key: this address admits the server's own user, see v2v_server.page.child.
-    source = Source(Looker(arguments.connect, keys=""))
+    source = Source(StatusClient(arguments.connect, keys=""))
     config = uvicorn.Config(
         make_app(source, filter(None, arguments.names.split(","))),
         log_level="warning",

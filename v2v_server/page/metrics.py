@@ -66,7 +66,7 @@ class StateCollector:
     """Collector of the metrics of one state.
 
     Args:
-        state: ``v2v_server.console.state.ServiceState.to_dict()``; None if the server does not answer.
+        state: ``v2v_server.status.state.ServiceState.to_dict()``; None if the server does not answer.
     """
 
     def __init__(self, state: _State | None) -> None:

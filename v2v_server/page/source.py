@@ -18,19 +18,19 @@ KNOWN_SECONDS = 15.0
 """A health check accepts a state of this age."""
 
 
-class Looks(Protocol):
-    """Where states come from: a :class:`v2v_server.console.asking.Looker`."""
+class GetsStatus(Protocol):
+    """Where states come from: a :class:`v2v_server.status.client.StatusClient`."""
 
-    def look(self, timeout_seconds: float) -> dict[str, Any]:
-        """See :meth:`v2v_server.console.asking.Looker.look`."""
+    def get_status(self, timeout_seconds: float) -> dict[str, Any]:
+        """See :meth:`v2v_server.status.client.StatusClient.get_status`."""
 
 
 @dataclass(frozen=True, slots=True)
-class Glimpse:
+class LatestStatus:
     """The last answer of the server.
 
     Attributes:
-        state: ``v2v_server.console.state.ServiceState.to_dict()``; None if the server did not answer.
+        state: ``v2v_server.status.state.ServiceState.to_dict()``; None if the server did not answer.
         trouble: why it did not answer; empty if it did.
         at: time of the answer, seconds.
     """
@@ -44,26 +44,26 @@ class Source:
     """Request the state from a server, one request at a time and at most a few per second.
 
     Args:
-        looker: sends the requests; used by one thread at a time.
+        client: sends the requests; used by one thread at a time.
         clock: returns monotonic time, seconds.
     """
 
-    def __init__(self, looker: Looks, clock: Callable[[], float] = time.monotonic) -> None:
-        self._looker = looker
+    def __init__(self, client: GetsStatus, clock: Callable[[], float] = time.monotonic) -> None:
+        self._client = client
         self._clock = clock
         self._lock = asyncio.Lock()
-        self._latest: Glimpse | None = None
-        self._answered: Glimpse | None = None
-        self._asking: asyncio.Future[Glimpse] | None = None
+        self._latest: LatestStatus | None = None
+        self._answered: LatestStatus | None = None
+        self._asking: asyncio.Future[LatestStatus] | None = None
 
-    async def latest(self) -> Glimpse:
+    async def latest(self) -> LatestStatus:
         """Return the newest state, which is at most :data:`FRESH_SECONDS` old."""
         async with self._lock:
             if self._latest is None or self._clock() - self._latest.at >= FRESH_SECONDS:
                 self._latest = await asyncio.to_thread(self._look)
             return self._latest
 
-    async def known(self) -> Glimpse:
+    async def known(self) -> LatestStatus:
         """Return what is known without waiting for the server, unless nothing recent is known.
 
         A state up to :data:`KNOWN_SECONDS` old counts; the next one is asked for in the background.
@@ -76,14 +76,14 @@ class Source:
             return self._latest
         return await asyncio.shield(self._asking)
 
-    def _look(self) -> Glimpse:
+    def _look(self) -> LatestStatus:
         try:
-            state = self._looker.look(_ANSWER_SECONDS)
+            state = self._client.get_status(_ANSWER_SECONDS)
         except RemoteError as error:
             if error.code == ErrorCode.BUSY and self._answered is not None:  # the server is alive
                 self._answered = replace(self._answered, at=self._clock())
-            return Glimpse(None, str(error), self._clock())
+            return LatestStatus(None, str(error), self._clock())
         except V2VError as error:
-            return Glimpse(None, str(error), self._clock())
-        answered = self._answered = Glimpse(state, "", self._clock())
+            return LatestStatus(None, str(error), self._clock())
+        answered = self._answered = LatestStatus(state, "", self._clock())
         return answered

@@ -7,7 +7,7 @@ reproduce the exact frames of their sources, or MP4.
 The folder stays consistent after any interruption: a file gets its final name only when complete and verified, and its
 line in the manifest after that. A second run keeps files that the manifest lists if file and source are unchanged, and
 does the rest. Records of videos that a run does not include are set aside, not dropped (see
-:mod:`v2v_server.catalogue.manifest`).
+:mod:`v2v_server.corpus.manifest`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.manifest import Header, PreparedVideo
-from v2v_server.catalogue.manifest_writer import ManifestWriter
-from v2v_server.catalogue.scene import Scene
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.manifest_writer import ManifestWriter
+from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode

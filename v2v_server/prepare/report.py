@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from v2v_protocol.refusal import Refusal
-from v2v_server.catalogue.manifest import PreparedVideo
+from v2v_server.corpus.manifest import PreparedVideo
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Report:
         kept: number of videos that an earlier run had finished.
         looked_at: number of videos that an earlier run had finished except for their scene statistics.
         aside: number of videos of earlier runs that this run does not include; see
-            :mod:`v2v_server.catalogue.manifest`.
+            :mod:`v2v_server.corpus.manifest`.
         not_looked_at: prepared videos whose statistics could not be computed, and why. Their files stay.
         unusable: files of the source that a server cannot use either.
         floor_db: lowest PSNR of a clip, dB.

@@ -11,9 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, VideoError
-from v2v_server.catalogue.catalogue import Catalogue
-from v2v_server.catalogue.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.video.fingerprint import fingerprint
 

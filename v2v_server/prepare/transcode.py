@@ -21,8 +21,8 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import VideoError
-from v2v_server.catalogue.look import Look
-from v2v_server.catalogue.scene import MOST_FRAMES, Scene
+from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
 from v2v_server.store.clips import stored_pictures
 from v2v_server.store.encoding import Encoding
@@ -110,16 +110,16 @@ def transcode(job: Transcoding) -> Made:
     partial = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     try:
         frames = _frames(job, index)
-        seen = Look()
+        analysis = SceneAnalysis()
         if job.scene:
-            frames = _watched(frames, seen)
+            frames = _watched(frames, analysis)
         made = (
             _stored(job, index, partial, frames) if job.encoding.is_lossless else _encoded(job, index, partial, frames)
         )
         partial.replace(job.target)
     finally:
         partial.unlink(missing_ok=True)
-    return replace(made, scene=seen.scene()) if job.scene else made
+    return replace(made, scene=analysis.scene()) if job.scene else made
 
 
 def look_again(job: Transcoding) -> Scene:
@@ -129,17 +129,17 @@ def look_again(job: Transcoding) -> Scene:
         VideoError: the source is not the catalogued file, or a frame of it does not decode.
     """
     check_fingerprint(job.source, job.fingerprint)
-    seen = Look()
+    analysis = SceneAnalysis()
     for frame in islice(_frames(job, FrameIndex.from_bytes(job.index)), MOST_FRAMES):
-        seen.add(frame)
-    return seen.scene()
+        analysis.add(frame)
+    return analysis.scene()
 
 
-def _watched(frames: Iterator[npt.NDArray[np.uint8]], seen: Look) -> Iterator[npt.NDArray[np.uint8]]:
+def _watched(frames: Iterator[npt.NDArray[np.uint8]], analysis: SceneAnalysis) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield the same frames; those at the beginning are analysed as they pass."""
     for number, frame in enumerate(frames):
         if number < MOST_FRAMES:
-            seen.add(frame)
+            analysis.add(frame)
         yield frame
 
 

@@ -19,14 +19,16 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.index.runs import CutVideos
-from v2v_server.catalogue.videos import VideoEntry
-from v2v_server.catalogue.videos import Videos as CatalogueVideos
+from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
 MOST_CLIP_BYTES = 2 << 30
 """Largest size of the decoded frames of one lease, bytes."""
+_BLOCK = 256
+"""Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
 
 
 Videos = Sequence[VideoEntry]
@@ -51,14 +53,14 @@ class Columns:
         frames: int64 [N], frames of each video.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        cut: the videos whose usable runs are not just the whole video; None if runs are unknown.
+        split: the videos whose usable frames are not one run of all; None if runs are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
         if isinstance(videos, CatalogueVideos):
-            self.frames, sizes, self.cut = videos.frames, _sizes(videos.height_px, videos.width_px), videos.cut
+            self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
         else:
-            self.frames, sizes, self.cut = _columns(videos)
+            self.frames, sizes, self.split = _columns(videos)
         _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
         self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
@@ -69,19 +71,21 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
     return height_px.astype(np.int64) << 32 | width_px
 
 
-def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], CutVideos | None]:
+def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
     """Return frames, sizes, and the videos with shot boundaries."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [(place, video.runs) for place, video in enumerate(videos) if video.runs != ((0, video.frames),)]
-    known = [(place, those) for place, those in runs if those is not None]
-    return frames, sizes, CutVideos.of(known) if len(known) == len(runs) else None
+    runs = [video.runs for video in videos if video.runs is not None]
+    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
 
 
 class SequenceTable:
     """All sequences of a corpus under one spec, in catalogue order, looked up by rank.
+
+    It keeps only the number of sequences before each block of videos, 32 bytes for a thousand videos, so that every
+    consumer may have a spec of its own. A look-up counts the sequences of one block.
 
     Args:
         videos: the catalogue's entries, in its order.
@@ -92,43 +96,46 @@ class SequenceTable:
     Attributes:
         count: N, total number of sequences.
         videos: number of videos that give at least one.
-        refusals: the videos that give no sequence; each refusal is built when it is read.
-        spoilt: sequences at 0, L, 2L ... that are left out or moved because of what they show.
 
     Raises:
         UsageError: the spec asks for scenes and the catalogue has no scene statistics.
     """
 
     def __init__(self, videos: Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
-        columns = columns or Columns(videos)
-        recipe = spec.recipe
-        self._all, self._recipe, self._stride = videos, recipe, recipe.frames_per_sequence
-        self._frames = columns.frames
-        self._cut: _CutSequences | None = None
-        self.spoilt = 0
-        counts = np.clip((columns.frames - recipe.frames_needed) // self._stride + 1, 0, spec.max_sequences_per_video)
-        suits = [_unsuited_size(videos[first], rows, spec) is None for first in columns.first_of_size]
-        counts *= np.array(suits, bool)[columns.size]
-        if spec.scene != "off":
-            if columns.cut is None:
-                raise UsageError(
-                    f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
-                    "start the server with --scene auto"
-                )
-            self._cut = _CutSequences(columns.cut, counts[columns.cut.numbers], spec)
-            self.spoilt = self._cut.spoilt
-            counts[columns.cut.numbers] = self._cut.counts
-        self._ends = np.cumsum(counts)
-        self.count = int(self._ends[-1]) if len(videos) else 0
+        self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
+        if spec.scene != "off" and self._columns.split is None:
+            raise UsageError(
+                f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
+                "start the server with --scene auto"
+            )
+        suits = [_unsuited_size(videos[first], rows, spec) is None for first in self._columns.first_of_size]
+        self._suits = np.array(suits, bool)
+        counts, _ = self._count(0, len(videos))
         self.videos = int(np.count_nonzero(counts))
-        self.refusals = Refusals(np.flatnonzero(counts == 0), videos, rows, spec)
+        ends = np.cumsum(counts)
+        self.count = int(ends[-1]) if len(videos) else 0
+        self._before = np.concatenate(([0], ends[_BLOCK - 1 :: _BLOCK]))  # sequences before each block
+        self._last: tuple[int, VideoSequence] | None = None
+
+    @property
+    def refusals(self) -> Refusals:
+        """The videos that give no sequence; each refusal is built when it is read."""
+        counts, _ = self._count(0, len(self._all))
+        return Refusals(np.flatnonzero(counts == 0), self._all, self._rows, self._spec)
+
+    @property
+    def spoilt(self) -> int:
+        """Number of sequences at 0, L, 2L ... that are left out or moved because of what they show."""
+        _, cut = self._count(0, len(self._all))
+        return 0 if cut is None else cut.spoilt()
 
     @property
     def longest_clips(self) -> tuple[int, ...]:
         """The ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
-        short = self._frames[self._frames < self._recipe.frames_needed]
-        runs = [] if self._cut is None else self._cut.too_short.tolist()
-        clips = (_longest_clip(frames, self._recipe) for frames in [*short.tolist(), *runs])
+        frames, recipe = self._columns.frames, self._spec.recipe
+        _, cut = self._count(0, len(self._all))
+        runs = [] if cut is None else cut.too_short()
+        clips = (_longest_clip(each, recipe) for each in [*frames[frames < recipe.frames_needed].tolist(), *runs])
         return tuple(voxels for voxels in clips if voxels)
 
     def __getitem__(self, rank: int) -> VideoSequence:
@@ -139,10 +146,42 @@ class SequenceTable:
         """
         if not 0 <= rank < self.count:
             raise IndexError(f"sequence {rank} of {self.count}")
-        video = int(self._ends.searchsorted(rank, side="right"))
-        place = rank - (int(self._ends[video - 1]) if video else 0)
-        start = None if self._cut is None else self._cut.start(video, place)
-        return VideoSequence(self._all[video], place * self._stride if start is None else start)
+        if self._last is None or self._last[0] != rank:  # a grant and its siblings ask for the same one
+            self._last = rank, self._find(rank)
+        return self._last[1]
+
+    def _find(self, rank: int) -> VideoSequence:
+        block = int(self._before.searchsorted(rank, side="right")) - 1
+        first, within = block * _BLOCK, rank - int(self._before[block])
+        counts, cut = self._count(first, first + _BLOCK)
+        ends = np.cumsum(counts)
+        at = int(ends.searchsorted(within, side="right"))
+        place = within - (int(ends[at - 1]) if at else 0)
+        start = None if cut is None else cut.start(first + at, place)
+        stride = self._spec.recipe.frames_per_sequence
+        return VideoSequence(self._all[first + at], place * stride if start is None else start)
+
+    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], _CutSequences | None]:
+        """Count the sequences of each of the videos ``first`` .. ``end`` - 1."""
+        columns, spec = self._columns, self._spec
+        counts = (columns.frames[first:end] - spec.recipe.frames_needed) // spec.recipe.frames_per_sequence + 1
+        counts = np.minimum(np.maximum(counts, 0), spec.max_sequences_per_video)
+        counts *= self._suits[columns.size[first:end]]
+        if spec.scene == "off" or columns.split is None:
+            return counts, None
+        cut = _between(columns.split, first, end)
+        sequences = _CutSequences(cut, counts[cut.numbers - first], spec)
+        counts[cut.numbers - first] = sequences.counts
+        return counts, sequences
+
+
+def _between(cut: SplitVideos, first: int, end: int) -> SplitVideos:
+    """Return those of the videos ``first`` .. ``end`` - 1."""
+    low, high = cut.numbers.searchsorted(np.array((first, end), np.int32)).tolist()  # int64 would convert them all
+    runs = slice(*cut.bounds[[low, high]].tolist())
+    return SplitVideos(
+        cut.numbers[low:high], cut.bounds[low : high + 1] - cut.bounds[low], cut.first[runs], cut.end[runs]
+    )
 
 
 class _CutSequences:
@@ -154,32 +193,36 @@ class _CutSequences:
         spec: determines the frames in a sequence, and the largest number for one video.
 
     Attributes:
-        counts: int32 [C], number of sequences of each video.
-        spoilt: total number that are not where they would be without shot boundaries.
-        too_short: frames of the longest run of each video that has no sequence because of its shot boundaries.
+        counts: int64 [C], number of sequences of each video.
     """
 
-    def __init__(self, cut: CutVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
-        needed, self._stride = spec.recipe.frames_needed, spec.recipe.frames_per_sequence
-        self._cut, owners = cut, cut.owners()
-        each = np.clip((cut.end - cut.first - needed) // self._stride + 1, 0, None)
-        upto = np.concatenate(([0], np.cumsum(each)))
-        # Number of sequences of its video before each run, and number that the run may add.
-        self._before = (upto[:-1] - upto[cut.bounds[:-1]][owners]).astype(np.int32)
-        most = np.where(whole > 0, spec.max_sequences_per_video, 0)[owners]
-        each = np.clip(most - self._before, 0, each)
-        self.counts = np.bincount(owners, each, len(whole)).astype(np.int32)
-        in_place = np.where(cut.first % self._stride, 0, np.clip(whole[owners] - cut.first // self._stride, 0, each))
-        self.spoilt = int(whole.sum() - in_place.sum())
-        self.too_short = cut.longest()[(whole > 0) & (self.counts == 0)]
+    def __init__(self, cut: SplitVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
+        self._cut, self._whole, self._stride = cut, whole, spec.recipe.frames_per_sequence
+        each = np.maximum((cut.end - cut.first - spec.recipe.frames_needed) // self._stride + 1, 0)
+        self._upto = np.concatenate(([0], np.cumsum(each)))  # sequences before each run, if a video may have any number
+        self._most = np.where(whole > 0, spec.max_sequences_per_video, 0)
+        self.counts = np.minimum(np.diff(self._upto[cut.bounds]), self._most)
+
+    def spoilt(self) -> int:
+        """Return the number of sequences that are not where they would be without shot boundaries."""
+        cut, owners = self._cut, self._cut.owners()
+        before = self._upto[:-1] - self._upto[cut.bounds[:-1]][owners]
+        each = np.clip(self._most[owners] - before, 0, np.diff(self._upto))
+        in_place = np.clip(self._whole[owners] - cut.first // self._stride, 0, each)
+        return int(self._whole.sum() - in_place[cut.first % self._stride == 0].sum())
+
+    def too_short(self) -> list[int]:
+        """Return the frames of the longest run of each video that has no sequence because of its shot boundaries."""
+        longest: list[int] = self._cut.longest()[(self._whole > 0) & (self.counts == 0)].tolist()
+        return longest
 
     def start(self, video: int, place: int) -> int | None:
         """Return the first frame of a sequence of a video; None if the video has no shot boundaries."""
         if (at := self._cut.find(video)) is None:
             return None
         low, high = self._cut.bounds[at : at + 2].tolist()
-        run = low + int(self._before[low:high].searchsorted(place, side="right")) - 1
-        return int(self._cut.first[run]) + self._stride * (place - int(self._before[run]))
+        run = int(self._upto[low:high].searchsorted(self._upto[low] + place, side="right")) - 1 + low
+        return int(self._cut.first[run]) + self._stride * (place - int(self._upto[run] - self._upto[low]))
 
 
 class Refusals(Sequence[Refusal]):

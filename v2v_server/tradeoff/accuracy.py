@@ -18,7 +18,7 @@ import numpy.typing as npt
 from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.store.clips import clips_of

@@ -19,8 +19,8 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker.produce import decode_for, make_sample

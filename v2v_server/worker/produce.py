@@ -22,8 +22,8 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.scene import Scene
 from v2v_server.cloud.copies import Copies, open_local
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.kernels import ARRAYS, list_events

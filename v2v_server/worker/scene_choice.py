@@ -28,7 +28,7 @@ import numpy.typing as npt
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.scene import CHANGE, CLIPPED, DARK, FLICKER, LAG_FRAMES, MOTION, NOISE, TILES, Scene
+from v2v_server.corpus.scenes.scene import CHANGE, CLIPPED, DARK, FLICKER, LAG_FRAMES, MOTION, NOISE, TILES, Scene
 from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
 
 MOVING = "dis-fast-lean"

@@ -8,12 +8,13 @@ import pytest
 from bench.processes import consume, peak_rss_bytes
 from bench.speed.null_workers import answer, null_service
 from tests.bench.small import FLAGS, RECIPE
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
 from v2v_protocol.wire import decode_map, decode_sample
+from v2v_server.broker.grants import check_result
 from v2v_server.broker.leases import Request
-from v2v_server.broker.terms import check_result, lease_for
+from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.protocol.wire_messages import messages
-from tests.server.corpus import SMALL, SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL, SMALL_SPEC, corpus, video
 from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import (
@@ -41,13 +41,13 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import AddToQuarantine, CutOff, GiveUp, ToConsumer
+from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import MOST_FAULTS
+from v2v_server.broker.grants import work_seconds
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
-from v2v_server.broker.terms import work_seconds
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
@@ -547,6 +547,21 @@ def test_an_index_that_another_process_holds_is_no_videos_fault() -> None:
     assert not at.dispatcher.counters.refused_candidates
 
 
+def test_leases_that_the_index_held_back_come_first_again_in_their_order() -> None:
+    held = {"a.mp4"}
+    at = peers(corpus(video("a.mp4", frames=200), held=held))
+    at.join(b"w1")
+    at.join(b"w2")
+    at.hello(shuffle=False)
+    at.want(*range(6))
+    assert at.dispatcher.waiting == 6
+    assert not at.leases[b"w1"]
+    held.clear()
+    at.tick(0.1)
+    granted = {lease.lease: lease.indices[0] for leases in at.leases.values() for lease in leases}
+    assert [granted[number] for number in sorted(granted)] == [0, 1, 2, 3]
+
+
 def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:
     at = peers()
     at.join(b"w1")
@@ -780,7 +795,7 @@ def test_who_sends_nothing_but_nonsense_is_cut_off() -> None:
     for _ in range(MOST_FAULTS):
         (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
         assert isinstance(answer, ToConsumer)
-    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [CutOff(b"bad")]
+    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [Disconnect(b"bad")]
     at.dispatcher.consumer_gone(b"bad", 0.0)
     (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
     assert isinstance(answer, ToConsumer)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.messages import Lease, LeaseFailed, Result
 from v2v_server.broker.blame import ALONE_AFTER, Cause

@@ -49,7 +49,7 @@ def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     (welcome,) = at.consumer_says(b"after", hello(OURS))
     assert isinstance(welcome, Welcome)
     (session,) = at.dispatcher.sessions
-    assert (session.identity, session.balance_seconds) == (b"after", -3.0)
+    assert (session.identity, at.dispatcher.sessions.balance_seconds(b"after")) == (b"after", -3.0)
 
 
 def test_consumers_without_a_secret_stay_apart() -> None:

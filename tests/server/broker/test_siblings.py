@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.server.corpus import corpus, video
+from tests.server.named_corpus import corpus, video
 from tests.server.peers import SMALL_SPEC, Peers, peers
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Hello

@@ -11,9 +11,9 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, VideoChanged
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.cloud.bucket import Bucket
 from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
 

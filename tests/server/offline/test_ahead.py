@@ -19,24 +19,24 @@ from hypothesis import strategies as st
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 from v2v_protocol.errors import UsageError
-from v2v_server.catalogue.index.file import IndexRow, Store
-from v2v_server.catalogue.index.parts import Shard
-from v2v_server.catalogue.refresh import index_path
 from v2v_server.commands.catalogue import main
+from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
+from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.refresh import index_path
 
 _SLOWLY = """
 import sys, time
-from v2v_server.catalogue import refresh, survey
+from v2v_server.corpus import probe
 from v2v_server.commands.catalogue import main
-refresh._WRITE_EVERY = 2
-look = survey._facts
+probe._MOST_TOGETHER = 2
+look = probe._facts
 def slow(path):
     time.sleep(0.1)
     return look(path)
-survey._facts = slow
+probe._facts = slow
 import v2v_server.offline.ahead as ahead
-up_to_date = ahead.up_to_date
-ahead.up_to_date = lambda root, ids, path, looking, processes, *more: up_to_date(root, ids, path, looking, 0, *more)
+refresh = ahead.refresh_index
+ahead.refresh_index = lambda root, ids, path, scenes, processes, *more: refresh(root, ids, path, scenes, 0, *more)
 sys.exit(main(sys.argv[1:]))
 """
 """Probes in the command's own process, where each file takes a while, and writes down two at a time."""
@@ -231,6 +231,7 @@ def test_what_is_no_shard(text: str) -> None:
 
 
 def test_an_index_that_knows_something_already_keeps_it(tmp_path: Path) -> None:
+    kind = FigureKind("scene", "1")
     with closing(Store(tmp_path / "one")) as one, closing(Store(tmp_path / "other")) as other:
         one.put(
             [
@@ -239,8 +240,8 @@ def test_an_index_that_knows_something_already_keeps_it(tmp_path: Path) -> None:
             ]
         )
         other.put([IndexRow("a", 2, fingerprint="new", problem="cut off"), IndexRow("c", 3, problem="cut off")])
-        other.not_looked_at("look")  # makes the table
-        other.put_scenes([("a", "new", "look", b"scene")])
-        assert one.take_in(tmp_path / "other") == 2
+        other.make_figures()
+        other.put_figures(kind, [Figures("a", "new", b"summary", b"scene")])
+        assert one.merge(tmp_path / "other") == 2
         assert [(row[0], row[4]) for row in one.rows()] == [("a", "new"), ("b", "kept"), ("c", "")]
-        assert one.scene("a", "new", "look") == b"scene"
+        assert one.figures("a", "new", kind) == b"scene"

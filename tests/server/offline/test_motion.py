@@ -15,8 +15,8 @@ from tests.clips import panned_luma, write_clip
 from v2v_pictures.camera import Camera
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.commands import preview as command
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline import motion
 from v2v_server.offline.motion import WholePictures, moving_seeds, noise_rate, quiet_voxels
 from v2v_server.offline.remake import Remaker

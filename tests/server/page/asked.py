@@ -1,4 +1,4 @@
-"""An application (ASGI) asked without a network, and a looker without a server."""
+"""An application (ASGI) asked without a network, and a client without a server."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from tests.server.console.watched import Watched
+from tests.server.status.services import Watched
 from v2v_protocol.errors import ServerLost
 from v2v_server.page.guard import App
 
@@ -62,14 +62,14 @@ async def asked(
     return answer
 
 
-class LookerAt:
+class FakeClient:
     """Looks at a watched service without a wire; counts how often. Without one, nobody answers."""
 
     def __init__(self, watched: Watched | None) -> None:
         self.watched = watched
         self.looks = 0
 
-    def look(self, timeout_seconds: float) -> dict[str, Any]:
+    def get_status(self, timeout_seconds: float) -> dict[str, Any]:
         self.looks += 1
         if self.watched is None:
             raise ServerLost("tcp://127.0.0.1:5555: no answer for 3 s; is v2v-serve running there?")

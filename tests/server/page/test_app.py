@@ -8,16 +8,16 @@ import platform
 
 import pytest
 
-from tests.server.console.watched import Watched, service
-from tests.server.page.asked import Answer, LookerAt, ask, asked
+from tests.server.page.asked import Answer, FakeClient, ask, asked
 from tests.server.peers import peers
+from tests.server.status.services import Watched, service
 from v2v_server.page.app import MOST_STREAMS, make_app
 from v2v_server.page.guard import App
 from v2v_server.page.source import FRESH_SECONDS, Source
 
 
 def app_of(watched: Watched | None) -> App:
-    return make_app(Source(LookerAt(watched)), ["watch.example"])
+    return make_app(Source(FakeClient(watched)), ["watch.example"])
 
 
 @pytest.fixture
@@ -136,24 +136,24 @@ def test_a_browser_runs_nothing_of_strangers_and_sends_nothing_elsewhere(watched
 
 
 def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(watched: Watched) -> None:
-    looker, now = LookerAt(watched), [0.0]
-    source = Source(looker, lambda: now[0])
+    client, now = FakeClient(watched), [0.0]
+    source = Source(client, lambda: now[0])
     app = make_app(source)
-    assert looker.looks == 0
+    assert client.looks == 0
 
     async def many() -> None:
         await asyncio.gather(*(asked(app, "/state") for _ in range(20)))
 
     asyncio.run(many())
-    assert looker.looks == 1
+    assert client.looks == 1
     now[0] = FRESH_SECONDS
     ask(make_app(source), "/state")
-    assert looker.looks == 2
+    assert client.looks == 2
 
 
 def test_health_does_not_wait_for_a_server_that_is_asked_again(watched: Watched) -> None:
     now = [0.0]
-    source = Source(LookerAt(watched), lambda: now[0])
+    source = Source(FakeClient(watched), lambda: now[0])
 
     async def known_while_another_question_is_under_way() -> bool:
         before = await source.latest()

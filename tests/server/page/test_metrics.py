@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.server.console.watched import service
 from tests.server.peers import peers
+from tests.server.status.services import service
 from v2v_protocol.messages import Hello
 from v2v_server.page.metrics import PARTS, exposition
 
@@ -80,7 +80,7 @@ def test_names_and_units_keep_to_the_convention(state: dict[str, Any]) -> None:
 
 
 def test_every_verdict_of_the_sentence_has_its_sample() -> None:
-    from tests.server.console.test_waiting import CASES
+    from tests.server.status.test_bottleneck import CASES
 
     assert {case[1] for case in CASES} == set(PARTS)
 

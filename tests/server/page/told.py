@@ -6,8 +6,8 @@ import json
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.server.console.watched import service
 from tests.server.peers import peers
+from tests.server.status.services import service
 from v2v_server.page.metrics import exposition
 
 

@@ -20,7 +20,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows

@@ -21,9 +21,9 @@ from hypothesis import strategies as st
 
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.commands.prepare import main as prepare_main
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.prepare.encode import encode_luma
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.report import Report

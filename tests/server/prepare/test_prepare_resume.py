@@ -21,8 +21,8 @@ from tests.server.prepare.test_prepare import H264, opened, psnr_db, run, whole
 from tests.server.prepare.test_prepare_isolate import children
 from tests.waiting import until
 from v2v_protocol.errors import CorpusError, VideoError
-from v2v_server.catalogue.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.commands.prepare import main, summary
+from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.prepare.resume import refuse_overlap
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
 from v2v_server.store.encoding import Encoding

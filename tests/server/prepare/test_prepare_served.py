@@ -17,8 +17,8 @@ from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
-from v2v_server.catalogue.manifest import MANIFEST_NAME
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.fingerprint import check_fingerprint

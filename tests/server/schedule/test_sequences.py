@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import re
+import tracemalloc
 from typing import Any
+from unittest import mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.server.corpus import SMALL, SMALL_SPEC, video
+from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.schedule import sequences
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
 from v2v_server.video.rows import Rows
@@ -79,20 +84,62 @@ def test_eraft_sequences_are_one_voxel_longer() -> None:
 _lengths = st.lists(st.integers(1, 120), max_size=12)
 
 
-@given(_lengths, st.integers(1, 12), st.integers(1, 4), st.integers(0, 1))
-def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: int, lead: int) -> None:
+_runs = st.lists(st.tuples(st.integers(0, 30), st.integers(1, 40)), max_size=4)
+_blocks = st.sampled_from((1, 2, 3, 512))
+
+
+@given(_lengths, st.integers(1, 12), st.integers(1, 4), st.integers(0, 1), _blocks)
+def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: int, lead: int, block: int) -> None:
     recipe = SMALL.replace(voxels_per_clip=voxels, lead_voxels=lead)
     spec = StreamSpec(recipe=recipe, max_sequences_per_video=most)
     videos = [video(f"v{number}", frames) for number, frames in enumerate(lengths)]
-    found = table(*videos, spec=spec)
-    expected = brute_force(videos, spec)
-    assert listed(found) == expected
+    with mock.patch.object(sequences, "_BLOCK", block):
+        found = table(*videos, spec=spec)
+        expected = brute_force(videos, spec)
+        assert listed(found) == expected
     assert found.count == len(expected)
     assert found.videos == len({name for name, _ in expected})
     assert found.videos + len(found.refusals) == len(videos)
     for name, start in expected:
         entry = next(entry for entry in videos if entry.id == name)
         assert start + recipe.frames_needed <= entry.frames
+
+
+@given(st.lists(_runs, max_size=8), st.integers(1, 6), _blocks)
+def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
+    stretches: list[list[tuple[int, int]]], most: int, block: int
+) -> None:
+    spec = StreamSpec(recipe=SMALL, max_sequences_per_video=most, scene="auto")
+    videos, expected = [], []
+    for number, each in enumerate(stretches):
+        ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
+        runs = tuple(zip(ends[::2], ends[1::2], strict=True))
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), runs=runs)
+        starts = [
+            start
+            for first, end in runs
+            for start in range(first, end - SMALL.frames_needed + 1, SMALL.frames_per_sequence)
+        ]
+        videos.append(entry)
+        expected += [(entry.id, start) for start in starts[:most]]
+    with mock.patch.object(sequences, "_BLOCK", block):
+        assert listed(table(*videos, spec=spec)) == expected
+
+
+def test_tables_of_a_thousand_geometries_take_little_memory() -> None:
+    """Each of a thousand consumers may have a spec of its own."""
+    videos = [video(f"v{number}", 100 + number % 900) for number in range(20_000)]
+    columns = sequences.Columns(videos)
+    tracemalloc.start()
+    try:
+        tables = [
+            SequenceTable(videos, FULL, StreamSpec(recipe=SMALL, max_sequences_per_video=most), columns)
+            for most in range(1, 51)
+        ]
+        kept_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept_bytes / len(tables) < 10_000
 
 
 @pytest.mark.parametrize("rank", [-1, 3, 2**48])

@@ -16,7 +16,7 @@ import pytest
 
 from v2v_protocol.recipe import PRESETS
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 
 SMALL: dict[str, Any] = {"voxels_per_clip": 4, "crop_height_px": 40, "crop_width_px": 56}

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.catalogue.catalogue import Catalogue
 from v2v_server.commands import prepare as prepare_cli
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.serve import load_catalogue, serve
 from v2v_server.system import process
 

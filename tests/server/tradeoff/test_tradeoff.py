@@ -20,9 +20,9 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.catalogue import open_catalogue
 from v2v_server.commands import tradeoff
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, spurious
 from v2v_server.tradeoff.diversity import diversity, effective_samples, overlap
 from v2v_server.tradeoff.errors import Tally, compare, correlation

@@ -7,15 +7,15 @@ import signal
 import stat
 from pathlib import Path
 
-from v2v_server.catalogue.index.file import IndexRow
-from v2v_server.catalogue.survey import examine
+from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.probe import probe_file
 
 
 def lethal(root: str, id: str) -> IndexRow:
     """Dies over files of that name, as over a bug of the decoder."""
     if "lethal" in id:
         os.kill(os.getpid(), signal.SIGSEGV)
-    return examine(root, id)
+    return probe_file(root, id)
 
 
 def killed_once(root: str, id: str) -> IndexRow:
@@ -24,13 +24,13 @@ def killed_once(root: str, id: str) -> IndexRow:
     if not file.stat().st_mode & stat.S_ISVTX:  # such a process may write no file, but change a mode
         file.chmod(file.stat().st_mode | stat.S_ISVTX)
         os.kill(os.getpid(), signal.SIGKILL)
-    return examine(root, id)
+    return probe_file(root, id)
 
 
 def always_killed(root: str, id: str) -> IndexRow:
     """Is killed from outside over every file."""
     os.kill(os.getpid(), signal.SIGKILL)
-    return examine(root, id)
+    return probe_file(root, id)
 
 
 def always_exits(root: str, id: str) -> IndexRow:
@@ -42,4 +42,4 @@ def waiting(root: str, id: str) -> IndexRow:
     """Waits for ever over files of that name, as over storage that does not answer."""
     if "waiting" in id:
         signal.pause()
-    return examine(root, id)
+    return probe_file(root, id)

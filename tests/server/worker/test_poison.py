@@ -7,7 +7,7 @@ from typing import cast
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
 from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Lease
@@ -16,7 +16,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import ALONE_AFTER, Cause
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, clearing
-from v2v_server.catalogue.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, write_clip
-from tests.server.corpus import SMALL_SPEC
+from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.broker.terms import lease_for
-from v2v_server.catalogue.catalogue import Catalogue, open_catalogue
 from v2v_server.commands.simulate import main as simulate
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable

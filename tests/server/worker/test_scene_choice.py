@@ -14,8 +14,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.catalogue.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
-from v2v_server.catalogue.videos import VideoEntry
+from v2v_server.corpus.scenes.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 from v2v_server.worker.scene_choice import MOVING, plan_flow

@@ -1,0 +1,338 @@
+"""Scene statistics: what an analysis finds in clips of known content, and how the index keeps it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage import data
+
+from tests.clips import damaged, panned_luma, write_clip
+from tests.server.corpus.failing_storage import failing_opens
+from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.scenes import collect
+from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.scene import (
+    CHANGE,
+    CLIPPED,
+    COLUMNS,
+    CONTRAST,
+    DARK,
+    FLICKER,
+    MOST_FRAMES,
+    MOTION,
+    NOISE,
+    SEGMENT_FRAMES,
+    UNKNOWN,
+    Scene,
+)  # fmt: skip
+from v2v_server.prepare.prepare import prepare
+from v2v_server.store.encoding import Encoding
+from v2v_server.system.isolate import run_isolated
+from v2v_server.video.rows import Rows
+
+Luma = npt.NDArray[np.uint8]
+
+
+def analyse(luma: Luma) -> Scene:
+    analysis = SceneAnalysis()
+    for picture in luma:
+        analysis.add(picture)
+    return analysis.scene()
+
+
+def pan(frames: int, right_px: int, height: int = 96, width: int = 160) -> Luma:
+    return panned_luma(frames, height, width, step=(0, right_px))
+
+
+def other(frames: int, right_px: int = 1, height: int = 96, width: int = 160) -> Luma:
+    """A pan over another photograph."""
+    photo = np.array(data.coffee()[..., 1], np.uint8)  # type: ignore[no-untyped-call]
+    columns = (np.arange(frames)[:, None] * right_px + np.arange(width)) % photo.shape[1]
+    return photo[100 : 100 + height][:, columns].transpose(1, 0, 2)
+
+
+def test_a_still_clip_neither_moves_nor_changes() -> None:
+    scene = analyse(np.repeat(pan(1, 0), 40, axis=0))
+    values = scene.values(0, 40)
+    assert scene.end == 40
+    assert len(scene.segments) == 3
+    assert not values[:, MOTION].any()
+    assert not values[:, CHANGE].any()
+    assert not values[:, [FLICKER, NOISE]].any()
+    assert scene.shot_boundaries == ()
+
+
+@pytest.mark.parametrize("pace_px", [1, 2, 4])
+def test_motion_is_in_pixels_a_frame(pace_px: int) -> None:
+    motion = analyse(pan(32, pace_px)).values(0, 32)[:, MOTION]
+    assert np.median(motion) == pytest.approx(pace_px, rel=0.15)
+
+
+def test_only_the_tiles_that_change_do() -> None:
+    luma = np.repeat(pan(1, 0, 96, 128), 17, axis=0)
+    luma[:, :24, :32] = other(17, 3, 24, 32)
+    change = analyse(luma).values(0, 17)[0, CHANGE]
+    assert change[0] > 5
+    assert not change[1:].any()
+
+
+def test_change_and_contrast_against_their_definitions() -> None:
+    luma = pan(20, 2, 64, 96)
+    blocks = luma.reshape(20, 8, 8, 12, 8).mean(axis=(2, 4))
+    values = analyse(luma).values(0, 20)
+    for segment, (low, high) in enumerate(((0, 16), (16, 19))):
+        changes = [np.abs(blocks[t] - blocks[max(0, t - 4)]) for t in range(low + 1, high + 1)]
+        tiles = np.max(changes, axis=0).reshape(4, 2, 4, 3).max(axis=(1, 3)).ravel()
+        assert values[segment, CHANGE] == pytest.approx(tiles, abs=1 / 64)
+    assert values[0, CONTRAST] == pytest.approx(max(blocks[t].std() for t in range(16)), abs=1 / 64)
+
+
+@pytest.mark.parametrize(("level", "dark", "clipped"), [(15, 1, 0), (16, 0, 0), (249, 0, 0), (250, 0, 1)])
+def test_dark_and_clipped_shares(level: int, dark: float, clipped: float) -> None:
+    luma = np.full((5, 40, 64), 100, np.uint8)
+    luma[:, :10] = level
+    values = analyse(luma).values(0, 5)[0]
+    assert values[DARK] == pytest.approx(dark / 4, abs=1e-3)
+    assert values[CLIPPED] == pytest.approx(clipped / 4, abs=1e-3)
+
+
+def test_noise_and_flicker_have_the_strength_they_were_given() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.full((33, 96, 160), 120.0)
+    noisy = np.rint(flat + rng.normal(0, 3.0, flat.shape)).astype(np.uint8)
+    # The stillest tenth lies a little below the mean.
+    assert analyse(noisy).values(0, 33)[0, NOISE] == pytest.approx(3.0, rel=0.15)
+    flickering = (flat + np.where(np.arange(33) % 2, 4, 0)[:, None, None]).astype(np.uint8)
+    assert analyse(flickering).values(0, 33)[0, FLICKER] == pytest.approx(4.0, abs=0.1)
+
+
+@pytest.mark.parametrize("at", [1, 2, 7, 16, 30, 39])
+def test_a_cut_is_found_where_it_is(at: int) -> None:
+    assert analyse(np.concatenate([pan(at, 2), other(40 - at, 2)])).shot_boundaries == (at,)
+
+
+def test_cuts_in_quick_succession_to_black_and_of_dark_scenes() -> None:
+    parts = [pan(12, 1), other(9), pan(11, 1)[:, ::-1], np.zeros((10, 96, 160), np.uint8), pan(12, 1)]
+    assert analyse(np.concatenate(parts)).shot_boundaries == (12, 21, 32, 42)
+    dark = np.concatenate([pan(12, 1), other(12)]) // 12
+    assert analyse(dark).shot_boundaries == (12,)
+
+
+@pytest.mark.parametrize("pace_px", [0, 1, 8, 20])
+def test_motion_is_no_cut(pace_px: int) -> None:
+    assert analyse(pan(60, pace_px)).shot_boundaries == ()
+
+
+def test_flashes_flicker_fades_and_starting_motion_are_no_cuts() -> None:
+    flash = pan(40, 1)
+    flash[20] = np.clip(flash[20].astype(int) * 2 + 60, 0, 255)
+    flicker = (pan(40, 1) * np.where(np.arange(40) % 2, 1.0, 0.8)[:, None, None]).astype(np.uint8)
+    fade = (pan(40, 1) * np.linspace(1, 0, 40)[:, None, None]).astype(np.uint8)
+    starts = np.concatenate([np.repeat(pan(1, 0), 20, axis=0), pan(21, 3)[1:]])
+    for luma in (flash, flicker, fade, starts):
+        assert analyse(luma).shot_boundaries == ()
+
+
+def test_runs_lie_between_cuts_and_hold_something_to_see() -> None:
+    black = np.zeros((48, 96, 160), np.uint8)
+    scene = analyse(np.concatenate([black, pan(52, 1), other(60)]))
+    assert scene.shot_boundaries == (48, 100)
+    assert scene.runs(160) == [(48, 100), (100, 160)]
+    # Frames that were not looked at are taken as they come.
+    assert scene.runs(500) == [(48, 100), (100, 500)]
+    assert analyse(black).runs(48) == []
+    assert Scene.unknown().runs(30) == [(0, 30)]
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    end = draw(st.integers(0, 300))
+    rows = -(-end // SEGMENT_FRAMES)
+    cuts = draw(st.sets(st.integers(1, end - 1), max_size=6)) if end > 1 else set()
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    return Scene(0, end, tuple(sorted(cuts)), rng.integers(0, UNKNOWN + 1, (rows, COLUMNS)).astype(np.uint16))
+
+
+@given(scenes())
+def test_runs_against_their_definition(scene: Scene) -> None:
+    frames = scene.end + 20
+    empty = scene.segments[:, CONTRAST] < 32
+    usable = [frame >= scene.end or not empty[frame // SEGMENT_FRAMES] for frame in range(frames)]
+    # An empty last segment reaches up to the end of its sixteen frames.
+    for frame in range(scene.end, min(frames, len(empty) * SEGMENT_FRAMES)):
+        usable[frame] = not empty[-1]
+    runs = scene.runs(frames)
+    held = [frame for first, end in runs for frame in range(first, end)]
+    assert held == [frame for frame in range(frames) if usable[frame]]
+    for first, end in runs:
+        assert not any(first < cut < end for cut in scene.shot_boundaries)
+        assert first == 0 or first in scene.shot_boundaries or not usable[first - 1]
+
+
+@given(scenes(), st.data())
+def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
+    back = Scene.from_bytes(scene.to_bytes())
+    assert back.to_bytes() == scene.to_bytes()
+    assert (back.first, back.end, back.shot_boundaries) == (scene.first, scene.end, scene.shot_boundaries)
+    start = data.draw(st.integers(0, 320))
+    count = data.draw(st.integers(1, 60))
+    part = Scene.from_bytes(scene.slice(start, count).to_bytes())
+    low, high = start, min(start + count, scene.end)
+    if low < high:
+        np.testing.assert_array_equal(part.values(low, high), scene.values(low, high))
+        assert part.shot_boundaries == tuple(cut for cut in scene.shot_boundaries if low < cut < high)
+    else:
+        assert not len(part.segments)
+
+
+@given(st.binary(max_size=60))
+def test_what_is_no_scene_is_refused(data: bytes) -> None:
+    for content in (data, b"VSC1" + data):
+        with pytest.raises(ProtocolError):
+            Scene.from_bytes(content)
+
+
+def test_a_scene_that_contradicts_itself_is_refused() -> None:
+    scene = analyse(pan(40, 1))
+    for other_scene in (
+        dataclasses.replace(scene, end=60),
+        dataclasses.replace(scene, shot_boundaries=(0,)),
+        dataclasses.replace(scene, shot_boundaries=(9, 9)),
+        dataclasses.replace(scene, shot_boundaries=(41,)),
+        dataclasses.replace(scene, first=3),
+        dataclasses.replace(scene, end=MOST_FRAMES + 1),
+    ):
+        with pytest.raises(ProtocolError):
+            Scene.from_bytes(other_scene.to_bytes())
+    with pytest.raises(ProtocolError, match="decompress"):
+        Scene.from_bytes(scene.to_bytes()[:-3])
+
+
+# --- of a corpus ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "videos"
+    made.mkdir()
+    write_clip(made / "cut.mkv", np.concatenate([pan(30, 2), other(40)]), codec="ffv1", pixel_format="gray")
+    write_clip(made / "whole.mp4", pan(50, 1), gop=50)
+    damaged(made / "whole.mp4", made / "broken.mp4", 30)
+    return made
+
+
+@contextmanager
+def opened(folder: Path, **settings: object) -> Iterator[Catalogue]:
+    settings = {"cache_dir": folder.parent / "cache", "processes": 0, "scene": True} | settings
+    catalogue = open_catalogue(folder, **settings)  # type: ignore[arg-type]
+    try:
+        yield catalogue
+    finally:
+        catalogue.close()
+
+
+def test_off_changes_nothing(folder: Path) -> None:
+    with opened(folder, scene=False) as before, opened(folder) as with_scenes, opened(folder, scene=False) as after:
+        assert before.digest == with_scenes.digest == after.digest
+        assert before.videos == after.videos
+        assert with_scenes.digest_under("off") == before.digest_under("off") == before.digest
+        assert with_scenes.digest_under("auto") != before.digest
+        with pytest.raises(UsageError, match="--scene auto"):
+            before.digest_under("auto")
+        with pytest.raises(CorpusError, match="without statistics"):
+            before.scene("cut.mkv")
+
+
+def test_a_corpus_is_looked_at_once(folder: Path) -> None:
+    looked: list[int] = []
+    with opened(folder, progress=lambda done, total: looked.append(total)) as first:
+        assert looked.count(3) == 6  # probed, then looked at
+        assert {video.id: video.runs for video in first.videos} == {
+            "broken.mp4": ((0, 50),), "cut.mkv": ((0, 30), (30, 70)), "whole.mp4": ((0, 50),),
+        }  # fmt: skip
+        # What lies behind the damage is unknown; who is served it finds the same error.
+        assert 25 <= first.scene("broken.mp4").end <= 31
+        digest = first.scene_digest
+    looked.clear()
+    with opened(folder, progress=lambda done, total: looked.append(total)) as again:
+        assert again.scene_digest == digest
+    assert looked == []
+    write_clip(folder / "whole.mp4", np.concatenate([pan(20, 1), other(30)]), gop=50)
+    with opened(folder, progress=lambda done, total: looked.append(total)) as changed:
+        assert looked == [1, 1]
+        assert next(video.runs for video in changed.videos if video.id == "whole.mp4") == ((0, 20), (20, 50))
+        assert changed.scene_digest != digest
+
+
+def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once at once, and else at the next start: otherwise a video would never have had a cut."""
+    with opened(folder, scene=False), opened(folder, cache_dir=tmp_path / "other") as undisturbed:
+        digest = undisturbed.scene_digest
+    monkeypatch.setattr(collect, "run_isolated", lambda work, jobs, *_, **__: run_isolated(work, jobs, 0))
+    left = failing_opens(monkeypatch, cut=2, whole=1)
+    with opened(folder) as first:
+        assert left == {"cut": 0, "whole": 0}
+        assert {video.id: video.runs for video in first.videos if video.id != "broken.mp4"} == {
+            "cut.mkv": ((0, 70),), "whole.mp4": ((0, 50),),
+        }  # fmt: skip
+        assert any("cut.mkv" in note for note in first.notes)
+    with opened(folder) as again:
+        assert again.scene_digest == digest
+
+
+def test_only_the_rows_in_use_are_looked_at(folder: Path) -> None:
+    luma = np.concatenate([pan(60, 1, 96), np.repeat(pan(1, 0, 64), 60, axis=0)], axis=1)
+    luma[30:, :96] = other(30)
+    write_clip(folder / "below.mkv", luma, codec="ffv1", pixel_format="gray")
+    for rows, runs in (("full", 2), ("0.6:1", 1)):
+        with opened(folder, rows=Rows.parse(rows)) as catalogue:
+            entry = next(video for video in catalogue.videos if video.id == "below.mkv")
+            assert len(entry.runs or ()) == runs
+
+
+@pytest.mark.slow
+def test_processes_look_as_well_as_one(folder: Path, tmp_path: Path) -> None:
+    with opened(folder) as one, opened(folder, cache_dir=tmp_path / "other", processes=2) as two:
+        assert one.scene_digest == two.scene_digest
+
+
+def test_a_prepared_folder_has_the_scenes_of_its_source(folder: Path, tmp_path: Path) -> None:
+    (folder / "broken.mp4").unlink()
+    target = tmp_path / "prepared"
+    with opened(folder) as source:
+        prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        looked: list[int] = []
+        with opened(target, progress=lambda done, total: looked.append(done)) as prepared:
+            for video in source.videos:
+                assert prepared.scene(video.id).to_bytes() == source.scene(video.id).to_bytes()
+            assert [video.runs for video in prepared.videos] == [video.runs for video in source.videos]
+
+
+def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path, tmp_path: Path) -> None:
+    (folder / "broken.mp4").unlink()
+    target = tmp_path / "prepared"
+    with opened(folder, scene=False) as source:
+        plain = prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0)
+        assert not any(video.scene for video in plain.videos)
+        before = {path.name: path.stat().st_ino for path in target.glob("*.mp4")}
+        again = prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        assert (plain.kept, again.kept) == (0, 0)
+        assert again.looked_at == 2
+        assert {path.name: path.stat().st_ino for path in target.glob("*.mp4")} == before
+        assert all(video.scene for video in again.prepared)
+        afresh = prepare(source, tmp_path / "afresh", Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        assert [video.scene for video in again.prepared] == [video.scene for video in afresh.prepared]
+        assert prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True).kept == 2
+        # Without them, what is there with them will do.
+        assert prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0).kept == 2

@@ -1,0 +1,589 @@
+"""The catalogue: stable names, incremental probing, and files that misbehave."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pwd
+import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, truncated, write_clip
+from tests.server.corpus.failing_storage import failing_opens
+from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
+from v2v_server.corpus import catalogue as catalogue_module
+from v2v_server.corpus import probe as probe_module
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.index.file import SCHEMA_VERSION
+from v2v_server.corpus.manifest import MANIFEST_NAME
+from v2v_server.corpus.probe import ProbeFile, probe_files
+from v2v_server.corpus.refresh import index_path
+from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.rows import Rows
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("sample") / "clip.mp4", panned_luma(30), b_frames=2)
+
+
+@pytest.fixture
+def corpus(tmp_path: Path, sample: Path) -> Path:
+    for name in ("a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"):
+        target = tmp_path / "corpus" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(sample, target)
+    return tmp_path / "corpus"
+
+
+class Opener:
+    """Opens catalogues with one cache, closes them in the end, and counts the files probed."""
+
+    def __init__(self, cache: Path) -> None:
+        self.cache = cache
+        self.probed: list[int] = []
+        self.opened: list[Catalogue] = []
+
+    def __call__(self, source: Path, **more: object) -> Catalogue:
+        steps: list[tuple[int, int]] = []
+        settings = {"cache_dir": self.cache, "processes": 0, "progress": lambda *step: steps.append(step)} | more
+        catalogue = open_catalogue(source, **settings)  # type: ignore[arg-type]
+        assert [done for done, _ in steps] == list(range(1, len(steps) + 1))
+        assert {total for _, total in steps} <= {len(steps)}
+        self.probed.append(len(steps))
+        self.opened.append(catalogue)
+        return catalogue
+
+
+@pytest.fixture
+def opener(tmp_path: Path):  # type: ignore[no-untyped-def]
+    opener = Opener(tmp_path / "cache")
+    yield opener
+    for catalogue in opener.opened:
+        catalogue.close()
+
+
+def ids(catalogue: Catalogue) -> list[str]:
+    return [video.id for video in catalogue.videos]
+
+
+def test_a_folder(corpus: Path, opener: Opener) -> None:
+    (corpus / ".hidden.mp4").write_bytes(b"x")
+    (corpus / ".cache").mkdir()
+    shutil.copy(corpus / "a.mp4", corpus / ".cache" / "d.mp4")
+    (corpus / "notes.md").write_text("x")
+    (corpus / "sub" / "loop").symlink_to(corpus)
+    (corpus / "broken.mp4").symlink_to(corpus / "nowhere.mp4")
+    catalogue = opener(corpus)
+    assert ids(catalogue) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
+    assert [refusal.video for refusal in catalogue.refusals] == ["broken.mp4"]
+    video = catalogue.videos[0]
+    assert (video.frames, video.width_px, video.height_px, video.codec) == (30, 64, 48, "h264")
+    assert video.frames_per_second == pytest.approx(25)
+    assert is_same_file(video.fingerprint, fingerprint(corpus / "a.mp4"))
+    assert catalogue.path("sub/b.mp4") == (corpus / "sub/b.mp4").resolve()
+    np.testing.assert_array_equal(catalogue.frame_index("a.mp4").seconds(0, 30), np.arange(30) / 25)
+    assert catalogue.notes == ()
+
+
+def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> None:
+    (corpus / "circle.mp4").symlink_to(corpus / "circle.mp4")
+    catalogue = opener(corpus)
+    assert len(ids(catalogue)) == 3
+    assert [(refusal.video, refusal.reason) for refusal in catalogue.refusals] == [
+        ("circle.mp4", "cannot be looked at: Too many levels of symbolic links")
+    ]
+
+
+def denied_at(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Permission is denied to look at this path alone."""
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if os.fspath(path) == str(place):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(os, "stat", denied)
+
+
+def test_an_index_keeps_what_cannot_be_looked_at_today(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = opener(corpus)
+    looked = os.stat
+
+    def denied(path: object, *more: object, **options: object) -> os.stat_result:
+        if "sub" in os.fspath(path):  # type: ignore[call-overload]
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return looked(path, *more, **options)  # type: ignore[call-overload,no-any-return]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", denied)
+        locked = opener(corpus)
+    assert ids(locked) == ["a.mp4"]
+    assert [refusal.video for refusal in locked.refusals] == ["sub"]
+    assert locked.notes == ()
+    again = opener(corpus)
+    assert again.digest == first.digest
+    assert opener.probed == [3, 0, 0]
+
+
+@pytest.mark.parametrize("where", ["", MANIFEST_NAME])
+def test_a_corpus_that_cannot_be_looked_at_is_one_line(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    denied_at(corpus / where, monkeypatch)
+    with pytest.raises(CorpusError, match=rf"^{corpus}: cannot be looked at: Permission denied$"):
+        opener(corpus)
+
+
+def test_a_folder_that_may_be_listed_but_not_entered_keeps_nobody_out(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denied_at(corpus / "sub" / MANIFEST_NAME, monkeypatch)
+    assert len(opener(corpus).videos) == 3
+
+
+def test_storage_that_fails_for_a_moment_costs_nothing(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = failing_opens(monkeypatch, a=1)
+    assert ids(opener(corpus)) == ["a.mp4", "sub/b.mp4", "sub/deep/c with space.MP4"]
+    assert left == {"a": 0}
+
+
+def test_storage_that_fails_at_one_start_is_asked_again_at_the_next(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = opener(corpus, cache_dir=corpus.parent / "other").digest
+    left = failing_opens(monkeypatch, a=2)
+    first = opener(corpus)
+    assert [(refusal.video, refusal.reason) for refusal in first.refusals] == [
+        ("a.mp4", "cannot be opened: Input/output error")
+    ]
+    assert left == {"a": 0}
+    assert opener(corpus).digest == whole
+    assert opener.probed == [3, 3, 1]
+
+
+def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener) -> None:
+    first = opener(corpus)
+    again = opener(corpus)
+    assert again.digest == first.digest
+    assert again.videos == first.videos
+    write_clip(corpus / "a.mp4", panned_luma(12))
+    changed = opener(corpus)
+    (corpus / "sub" / "b.mp4").unlink()
+    shutil.copy(corpus / "a.mp4", corpus / "new.mp4")
+    moved = opener(corpus)
+    assert opener.probed == [3, 0, 1, 1]
+    assert [video.frames for video in changed.videos] == [12, 30, 30]
+    assert ids(moved) == ["a.mp4", "new.mp4", "sub/deep/c with space.MP4"]
+    assert len({first.digest, changed.digest, moved.digest}) == 3
+    with pytest.raises(VideoChanged, match="catalogued anew"):
+        first.frame_index("a.mp4")
+    with pytest.raises(CorpusError, match="no video of this catalogue"):
+        moved.frame_index("sub/b.mp4")
+
+
+def test_a_video_replaced_in_its_middle_is_another_one(corpus: Path, opener: Opener) -> None:
+    path = write_clip(corpus / "long.avi", panned_luma(60, 96, 128), codec="rawvideo")
+    first = opener(corpus)
+    content = bytearray(path.read_bytes())
+    assert len(content) > 3 * 65536
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    changed = opener(corpus)
+    assert opener.probed == [4, 1]
+    before, after = (next(v for v in each.videos if v.id == "long.avi").fingerprint for each in (first, changed))
+    assert is_same_file(before, fingerprint(path))  # head and tail are what they were
+    assert not is_same_file(before, after)
+    assert first.digest != changed.digest
+
+
+def test_a_video_replaced_by_one_of_equal_size_and_time_is_probed_again(corpus: Path, opener: Opener) -> None:
+    path = write_clip(corpus / "raw.avi", panned_luma(12), codec="rawvideo")
+    status = path.stat()
+    first = opener(corpus)
+    write_clip(path, panned_luma(12)[::-1], codec="rawvideo")
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (status.st_size, status.st_mtime_ns)
+    assert opener(corpus).digest != first.digest
+    assert opener.probed == [4, 1]
+
+
+def test_a_video_that_is_doubted_is_probed_at_the_next_start_and_served_until_then(
+    corpus: Path, opener: Opener
+) -> None:
+    first = opener(corpus)
+    first.mark_stale("a.mp4")
+    assert len(first.frame_index("a.mp4")) == 30
+    first.fail_fast()
+    with closing(sqlite3.connect(next(opener.cache.iterdir()), isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        first.mark_stale("sub/b.mp4")  # another process writes: neither waited for nor an error
+        other.execute("ROLLBACK")
+    assert opener(corpus).digest == first.digest
+    opener(corpus)
+    assert opener.probed == [3, 1, 0]
+
+
+@pytest.mark.parametrize("step", ["fingerprint", "facts_of"])
+def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path, aside = corpus / "a.mp4", corpus / "aside"
+    work = getattr(probe_module, step)
+
+    def in_that_moment(of: Path) -> object:
+        if of != path:
+            return work(of)
+        path.rename(aside)
+        os.mkfifo(path)
+        try:
+            return work(of)
+        finally:
+            aside.rename(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(probe_module, step, in_that_moment)
+        (problem,) = opener(corpus).refusals
+    assert (problem.video, problem.reason) == ("a.mp4", "is no regular file")
+    assert len(opener(corpus).videos) == 3
+
+
+def test_a_video_that_changes_while_it_is_probed_is_probed_again(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = probe_module.facts_of
+
+    def meanwhile(path: Path) -> object:
+        facts = work(path)
+        if path.name == "a.mp4":
+            write_clip(path, panned_luma(12))
+        return facts
+
+    with monkeypatch.context() as patch:
+        patch.setattr(probe_module, "facts_of", meanwhile)
+        (problem,) = opener(corpus).refusals
+    assert problem.reason == "changes while it is read; the next start tries again"
+    assert [video.frames for video in opener(corpus).videos] == [12, 30, 30]
+
+
+def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    """On storage elsewhere a look takes a while too, and there may be a million files."""
+    notices: list[str] = []
+    opener(corpus)
+    write_clip(corpus / "a.mp4", panned_luma(12))
+    opener(corpus, notice=notices.append)
+    assert notices == [
+        *(f"looking for videos: {done} so far" for done in (1, 2, 3)),
+        "looking at files: 3 of 3, 1 of them new or changed",
+    ]
+    notices.clear()
+    listed = tmp_path / "list.txt"
+    listed.write_text("a.mp4\n")
+    opener(corpus, list_file=listed, notice=notices.append)
+    assert notices == [
+        "looking at the list's files: 1 of 1",
+        "looking at files: 1 of 1, 0 of them new or changed",
+        "looking for files that are gone: 2 of 2 that this corpus does not name",
+    ]
+    assert opener.probed == [3, 1, 0]
+
+
+def test_the_digest_knows_rows_and_thresholds_but_not_the_place(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    plain = opener(corpus)
+    assert opener(corpus, rows=Rows.parse("top:0.54")).digest != plain.digest
+    shutil.copytree(corpus, tmp_path / "elsewhere")
+    assert opener(tmp_path / "elsewhere").digest == plain.digest
+    listed = tmp_path / "list.txt"
+    listed.write_text("".join(f"{id} 30 0.2 0.3\n" for id in ids(plain)))
+    assert opener(corpus, list_file=listed).digest != plain.digest
+
+
+def test_what_a_list_names_is_not_opened_unless_it_is_a_file(corpus: Path, opener: Opener) -> None:
+    """A named pipe would be waited for until somebody writes into it."""
+    os.mkfifo(corpus / "pipe.mp4")
+    (corpus / "endless.mp4").symlink_to("/dev/zero")
+    (corpus / "folder.mp4").mkdir()
+    listed = corpus / "list.txt"
+    listed.write_text("pipe.mp4\nendless.mp4\nfolder.mp4\na.mp4\ngone.mp4\n")
+    catalogue = opener(listed)
+    assert ids(catalogue) == ["a.mp4"]
+    reasons = {refusal.video: refusal.reason for refusal in catalogue.refusals}
+    assert reasons.pop("gone.mp4").startswith("cannot be read: No such file")
+    assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is no regular file")
+    listed.write_text("pipe.mp4\n")
+    with pytest.raises(CorpusError, match=r"no video found.*pipe\.mp4: is no regular file"):
+        opener(listed)
+
+
+def test_lists(corpus: Path, opener: Opener) -> None:
+    listed = corpus / "list.txt"
+    listed.write_text("sub/b.mp4 99 0.2 0.3\na.mp4\ngone.mp4 5\n")
+    by_source, by_option = opener(listed), opener(corpus, list_file=listed)
+    assert by_source.digest == by_option.digest
+    assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
+    assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
+    assert [refusal.video for refusal in by_source.refusals] == ["gone.mp4"]
+    assert by_source.notes == ("1 videos are shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
+    # The part that the list leaves out stays in the index.
+    opener(corpus)
+    opener(listed)
+    assert opener.probed == [3, 1, 1, 1]
+
+
+def test_interlaced_videos_are_said_at_each_start(corpus: Path, opener: Opener) -> None:
+    write_clip(corpus / "fields.mp4", panned_luma(30, 64, 64), options={"x264-params": "interlaced=1"})
+    for catalogue in (opener(corpus), opener(corpus)):
+        assert len(catalogue.videos) == 4
+        (note,) = catalogue.notes
+        assert note.startswith("1 videos are interlaced (fields.mp4): their frames are served as they are stored")
+    assert opener.probed == [4, 0]
+
+
+def test_a_single_video(corpus: Path, opener: Opener) -> None:
+    catalogue = opener(corpus / "a.mp4")
+    assert (ids(catalogue), catalogue.root) == (["a.mp4"], corpus.resolve())
+
+
+def test_files_that_do_not_open(corpus: Path, opener: Opener, sample: Path) -> None:
+    (corpus / "empty.mp4").write_bytes(b"")
+    (corpus / "noise.avi").write_bytes(np.random.default_rng(0).bytes(5000))
+    truncated(sample, corpus / "no_moov.mp4", 0.5)
+    catalogue = opener(corpus)
+    assert len(catalogue.videos) == 3
+    reasons = {refusal.video: refusal.reason for refusal in catalogue.refusals}
+    assert set(reasons) == {"empty.mp4", "noise.avi", "no_moov.mp4"}
+    assert all("Invalid data" in reason for reason in reasons.values())
+    opener(corpus)
+    assert opener.probed == [6, 0]
+
+
+def test_nothing_to_serve(tmp_path: Path, opener: Opener) -> None:
+    with pytest.raises(CorpusError, match="there is no such folder"):
+        opener(tmp_path / "missing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CorpusError, match=r"no video found; looked for .*mp4"):
+        opener(tmp_path / "empty")
+    (tmp_path / "empty" / "bad.mp4").write_bytes(b"x")
+    with pytest.raises(CorpusError, match="none of 1 videos can be used"):
+        opener(tmp_path / "empty")
+    with pytest.raises(CorpusError, match="not a folder"):
+        opener(tmp_path / "empty" / "bad.mp4", list_file=tmp_path / "list.txt")
+
+
+@pytest.mark.parametrize("content", [b"this is no database at all" * 100, None])
+def test_an_index_that_cannot_be_used(corpus: Path, opener: Opener, content: bytes | None) -> None:
+    good = opener(corpus)
+    path = next(opener.cache.iterdir())
+    path.unlink()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    catalogue = opener(corpus)
+    assert catalogue.digest == good.digest
+    assert str(path) in catalogue.notes[0]
+    assert len(catalogue.frame_index("a.mp4")) == 30
+
+
+def test_a_full_disk(corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch) -> None:
+    connect = sqlite3.connect
+
+    def small(path: object, **more: object) -> sqlite3.Connection:
+        database = connect(path, **more)  # type: ignore[call-overload]
+        if path != ":memory:":
+            database.execute("PRAGMA max_page_count = 3")
+        return database  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(sqlite3, "connect", small)
+    for number in range(60):
+        shutil.copy(corpus / "a.mp4", corpus / f"{'long name ' * 15}{number}.mp4")
+    catalogue = opener(corpus, progress=None)
+    assert len(catalogue.videos) == 63
+    assert "full" in catalogue.notes[0]
+
+
+def test_an_index_of_another_version_is_replaced_with_a_note(corpus: Path, opener: Opener) -> None:
+    opener(corpus).close()
+    path = next(opener.cache.iterdir())
+    database = sqlite3.connect(path)
+    database.execute("ALTER TABLE video RENAME COLUMN codec TO old")
+    database.execute("PRAGMA user_version = 999")
+    database.commit()
+    database.close()
+    (note,) = opener(corpus).notes
+    assert f"(version 999, this one has {SCHEMA_VERSION}): every video was probed again" in note
+    assert opener(corpus).notes == ()
+    assert opener.probed == [3, 3, 0]
+
+
+def test_where_the_index_lies(corpus: Path, opener: Opener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("V2V_CACHE_DIR", raising=False)
+    opener(corpus, cache_dir=None)
+    assert len(list((tmp_path / "xdg" / "v2v").iterdir())) == 1
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "chosen"))
+    opener(corpus, cache_dir=None)
+    assert len(list((tmp_path / "chosen").iterdir())) == 1
+
+
+def test_a_user_without_a_home_is_told_where_to_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("V2V_CACHE_DIR", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(user: int) -> None:
+        raise KeyError(user)
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    with pytest.raises(CorpusError, match=r"no home folder .* --cache-dir or V2V_CACHE_DIR"):
+        index_path(tmp_path, None)
+    assert index_path(tmp_path, tmp_path).parent == tmp_path
+
+
+def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
+    shutil.copy(corpus / "a.mp4", corpus / "lethal.mp4")
+    names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
+    records = {record.id: record for record in probe_files(corpus, names, 2, lethal)}
+    assert set(records) == set(names)
+    assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
+    assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
+    assert [records[id].frames for id in ("a.mp4", "sub/b.mp4")] == [30, 30]
+
+
+def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
+    names = ["a.mp4", "sub/b.mp4"]
+    assert {record.id: record.problem for record in probe_files(corpus, names, 2, killed_once)} == dict.fromkeys(names)
+
+
+@pytest.mark.parametrize(("ended", "how"), [(always_killed, "signal SIGKILL"), (always_exits, "exit status 3")])
+def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ended: ProbeFile, how: str) -> None:
+    (record,) = probe_files(corpus, ["a.mp4"], 2, ended)
+    assert f"twice ({how}), which says nothing of the file" in (record.problem or "")
+    assert record.size_bytes == -1  # which no file has: the next start tries again
+
+
+def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "from v2v_server.corpus.catalogue import open_catalogue\n"
+        f"open_catalogue({str(corpus)!r}, cache_dir={str(opener.cache)!r}, processes=2)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert '`if __name__ == "__main__":`' in done.stderr
+    assert len(opener(corpus).videos) == 3
+
+
+@pytest.mark.slow
+def test_a_file_that_is_waited_for_in_vain_costs_only_itself(corpus: Path) -> None:
+    names = ["a.mp4", "waiting.mp4", "sub/b.mp4"]
+    records = {record.id: record for record in probe_files(corpus, names, 2, waiting, longest_seconds=10.0)}
+    assert [id for id, record in records.items() if record.problem is not None] == ["waiting.mp4"]
+    assert records["waiting.mp4"].size_bytes == -1  # to be tried again
+    assert "ended after 10 s without a result; the next start" in str(records["waiting.mp4"].problem)
+
+
+def test_fingerprints(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    content = bytearray(np.random.default_rng(1).bytes(300_000))
+    seen = set()
+    for position in (None, 0, 65_535, 234_465, 299_999):
+        changed = bytearray(content)
+        if position is not None:
+            changed[position] ^= 1
+        path.write_bytes(changed)
+        seen.add(fingerprint(path))
+    assert len(seen) == 5
+    check_fingerprint(path, fingerprint(path))
+    path.write_bytes(content[:-1])
+    with pytest.raises(VideoChanged, match="299999-"):
+        check_fingerprint(path, max(seen))
+    path.unlink()
+    with pytest.raises(VideoError, match="cannot be read: No such file"):
+        check_fingerprint(path, max(seen))
+
+
+def test_a_small_index_is_handed_on_as_it_is_stored(tmp_path: Path) -> None:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        whole = catalogue.frame_index("a.mp4").to_bytes()
+        assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
+
+
+def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
+    monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    write_clip(folder / "a.mp4", panned_luma(120), gop=12)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        first = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert catalogue.frame_index_bytes("a.mp4", 0, 20) is first
+        for start in range(1, 100):
+            first_frame, end = start // 16 * 16, min(-(-(start + 20) // 16) * 16, 120)
+            expected = catalogue.frame_index("a.mp4").slice(first_frame, end - first_frame).to_bytes()
+            assert catalogue.frame_index_bytes("a.mp4", start, 20) == expected
+        again = catalogue.frame_index_bytes("a.mp4", 0, 20)
+        assert again == first
+        assert again is not first
+        with pytest.raises(UsageError, match="asked of an index"):
+            catalogue.frame_index_bytes("a.mp4", 110, 20)
+
+
+def test_an_index_that_another_process_holds_is_said_at_once(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalogue = opener(corpus)
+    catalogue.fail_fast()
+    assert catalogue._store._database.execute("PRAGMA busy_timeout").fetchone() == (0,)
+    name = ids(catalogue)[0]
+    (file,) = (file for _, _, file in catalogue._store._database.execute("PRAGMA database_list"))
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(IndexUnreadable, match="locked"):
+            catalogue.frame_index_bytes(name, 0, 3)
+        other.execute("ROLLBACK")
+    assert catalogue.frame_index_bytes(name, 0, 3)
+
+
+def test_the_index_of_a_long_video_is_opened_once(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a day takes a tenth of a second in the broker's only thread, and every lease asked for it."""
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 40)
+    catalogue = opener(corpus)
+    opened: list[int] = []
+    from_bytes = FrameIndex.from_bytes
+
+    def opening(data: bytes) -> FrameIndex:
+        opened.append(len(data))
+        return from_bytes(data)
+
+    monkeypatch.setattr(FrameIndex, "from_bytes", opening)
+    names = ids(catalogue)[:2]
+    for start in (0, 5, 10, 5):
+        for name in names:
+            catalogue.frame_index_bytes(name, start, 3)
+    assert len(opened) == 2
+    monkeypatch.setattr(catalogue_module, "_KEPT_LONG_FRAMES", 1)
+    catalogue._long.clear()
+    for start in (1, 2, 3):
+        for name in names:
+            catalogue.frame_index_bytes(name, start, 3)
+            assert list(catalogue._long) == [name]

@@ -1,0 +1,338 @@
+"""The one model of the service: every number is right, plain, and bounded."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+
+import pytest
+
+from tests.server.corpus import SMALL_SPEC
+from tests.server.peers import Peers, answer_to, peers
+from tests.server.status.services import WALL, seen, service
+from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
+from v2v_protocol.messages import Denied, ErrorCode, GetStatus, Goodbye, Hello, Result, Want, WorkerHello
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.wire import decode, encode
+from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
+from v2v_server.broker.blame import Cause
+from v2v_server.broker.quarantine import QuarantineEntry
+from v2v_server.status.publisher import ANSWER_SECONDS, MOST_LOOKERS
+from v2v_server.status.snapshot import MOST_SHOWN
+from v2v_server.status.state import STATE_VERSION
+
+
+def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:
+    """The worker's oldest sample is done, and took that long."""
+    lease = at.leases[worker].popleft()
+    at.worker_says(worker, Result(lease.lease, 0, **took, memory_bytes=1 << 29), *answer_to(lease, cpu_seconds=1.5))  # type: ignore[arg-type]
+
+
+def hello(at: Peers, identity: bytes = b"c", name: str = "rank 1 of 2", host: str = "gpu-1") -> None:
+    at.consumer_says(identity, Hello({}, ("voxels",), 2, 7, name=name, host=host))
+
+
+# --- the model --------------------------------------------------------------------------------------------------------
+
+
+def test_a_service_without_anybody_says_what_it_serves() -> None:
+    state = service(peers(), workers="1:3").state()
+    assert (state.version, state.protocol, state.time) == (STATE_VERSION, PROTOCOL_VERSION, WALL)
+    assert (state.video_count, state.unusable_count, state.videos) == (5, 0, "/corpus")
+    assert (state.worker_count, state.consumer_count, state.workers_wanted) == (0, 0, (1, 3))
+    assert (state.workers, state.consumers, state.refusals, state.verdicts, state.cache) == ((), (), (), (), None)
+    assert state.waiting.part == "nobody"
+    assert not state.is_ready
+    assert state.spec["recipe"]["bins"] == 5
+
+
+def test_a_worker_is_told_with_what_it_is_at_and_what_it_took() -> None:
+    at = peers()
+    watched = service(at)
+    at.worker_says(b"w", WorkerHello("w", NUMERICS_VERSION, 2, "node-7"))
+    hello(at)
+    at.want(0, 1, 2, 3)
+    at.now = 5.0
+    lease = at.begin()
+    at.now = 8.0
+    (worker,) = watched.state().workers
+    assert (worker.name, worker.host, worker.state) == ("w", "node-7", "working")
+    assert (worker.clip, worker.frame, worker.clip_seconds) == (lease.video, lease.start_frame, 3.0)
+    assert (worker.leases, worker.samples, worker.restarts, worker.silent_seconds) == (2, 0, None, 3.0)
+    finish(at, decode_seconds=2.0, simulate_seconds=1.0, handover_seconds=0.5)
+    at.now = 10.0
+    state = watched.state()
+    (worker,) = state.workers
+    assert (worker.samples, worker.busy_share, worker.cpu_share, worker.memory_gib) == (1, 0.35, 0.15, 0.5)
+    assert (state.totals.decode_seconds, state.totals.simulate_seconds, state.totals.handover_seconds) == (
+        2.0,
+        1.0,
+        0.5,
+    )
+    assert (state.totals.cpu_seconds, state.totals.samples, state.totals.batches) == (1.5, 1, 0.5)
+
+
+def test_a_worker_rests_is_idle_or_lost() -> None:
+    at = peers()
+    watched = service(at)
+    for name in (b"idle", b"resting", b"lost"):
+        at.join(name)
+    at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
+    at.now = 31.0
+    for name in (b"idle", b"resting"):
+        at.dispatcher.registry.mark_heard(name, at.now)
+    at.dispatcher.registry.vanished(at.now)
+    states = {worker.name: worker for worker in watched.state().workers}
+    assert {name: worker.state for name, worker in states.items()} == {
+        "idle": "idle", "resting": "resting", "lost": "lost",
+    }  # fmt: skip
+    assert states["resting"].unreadable == "v0.mp4: no such file"
+    assert states["lost"].silent_seconds == 31.0
+
+
+def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
+    at = peers()
+    watched = service(at)
+    watched.supervisor.scale(2)
+    watched.supervisor.watch(0.0, 0)
+    at.join(b"toy1")
+    at.join(b"elsewhere")
+    state = watched.state()
+    assert {worker.name: worker.restarts for worker in state.workers} == {"toy1": 0, "elsewhere": None}
+    assert (state.worker_processes, state.worker_count) == (2, 2)
+
+
+def test_a_consumer_is_told_with_its_place_in_the_epoch() -> None:
+    at = peers()
+    watched = service(at)
+    hello(at)
+    at.consumer_says(b"c", Want(3, (10, 11, 12, 13), waited_seconds=0.0))
+    at.join()
+    at.work_off()
+    watched.pass_seconds(5.0)
+    at.consumer_says(b"c", Want(3, (20, 21, 22), waited_seconds=2.0))
+    at.finish()
+    watched.pass_seconds(5.0)
+    (consumer,) = watched.state().consumers
+    assert (consumer.name, consumer.host) == ("rank 1 of 2", "gpu-1")
+    assert b"c".hex() != consumer.id
+    assert (consumer.epoch, consumer.position, consumer.sequences) == (3, 21, 50)
+    assert (consumer.in_flight, consumer.waiting, consumer.served, consumer.batch_size) == (2, 0, 5, 2)
+    assert consumer.waiting_share == pytest.approx(0.2)
+    assert (consumer.state, consumer.waited_seconds, consumer.seed) == ("stalled", 2.0, 7)
+    assert consumer.eta_seconds == pytest.approx((50 - 21) / 2.1, rel=0.01)
+    assert watched.state().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
+
+
+def test_a_new_epoch_begins_at_its_beginning() -> None:
+    at = peers()
+    watched = service(at)
+    hello(at)
+    at.join()
+    at.want(40, 41)
+    at.work_off()
+    assert watched.state().consumers[0].position == 42
+    at.want(0, epoch=1)
+    at.work_off()
+    consumer = watched.state().consumers[0]
+    assert (consumer.epoch, consumer.position) == (1, 1)
+
+
+def test_a_consumer_whose_connection_has_ended_is_not_counted() -> None:
+    at = peers()
+    watched = service(at)
+    hello(at, b"stays")
+    hello(at, b"goes")
+    at.want(0, identity=b"goes")
+    assert watched.state().queued_share == 0.5
+    at.dispatcher.consumer_gone(b"goes", at.now)
+    state = watched.state()
+    assert (state.consumer_count, state.queued_share) == (1, 0.0)
+    assert [consumer.state for consumer in state.consumers] == ["idle", "gone"]
+    at.now = 11.0
+    at.tick(0.0)
+    assert [consumer.id for consumer in watched.state().consumers] == [state.consumers[0].id]
+
+
+def test_refusals_and_verdicts_are_told_newest_first() -> None:
+    at = peers()
+    watched = service(at)
+    hello(at)
+    at.join()
+    at.want(0)
+    at.begin()
+    at.fail(reason="cut short", frame=7)
+    at.begin()
+    at.fail(reason="<b>gone</b>", frame=None)
+    at.quarantine.extend([QuarantineEntry(1, "v3.mp4", "f", 12, "crash", WALL)])
+    state = watched.state()
+    assert [(each.reason, each.frame, each.kind, each.time) for each in state.refusals] == [
+        ("<b>gone</b>", None, "failed", WALL), ("cut short", 7, "failed", WALL),
+    ]  # fmt: skip
+    assert (state.quarantine_snapshot, state.quarantined) == (1, 1)
+    assert [(each.video, each.frame, each.reason) for each in state.verdicts] == [("v3.mp4", 12, "crash")]
+    assert state.totals.refused_candidates == 2
+
+
+def test_of_many_refusals_the_last_few_are_told() -> None:
+    at = peers()
+    for number in range(100):
+        at.dispatcher.candidates.latest.append((str(number), Refusal("v.mp4", None, "x" * 500)))
+    state = service(at).state()
+    assert len(state.refusals) == 20
+    assert state.refusals[0].time == "99"
+    assert len(state.refusals[0].reason) == 200
+
+
+def test_a_lost_worker_is_a_fault_and_gone() -> None:
+    at = peers()
+    watched = service(at)
+    at.join()
+    at.die(cause=Cause.KILLED)
+    state = watched.state()
+    assert (state.totals.workers_lost, state.totals.faults, state.workers) == (1, 1, ())
+
+
+def test_what_peers_call_themselves_is_short_and_printable() -> None:
+    at = peers()
+    hello(at, name="\x1b[2J" + "n" * 1000, host="\n<script>")
+    (consumer,) = service(at).state().consumers
+    assert len(consumer.name) <= 100
+    assert consumer.name.startswith("[2Jnnn")
+    assert consumer.host == "<script>"
+
+
+# --- its form ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_state_is_plain_json() -> None:
+    at = peers()
+    watched = service(at, cache="/nowhere")
+    hello(at)
+    at.join()
+    at.want(0, 1)
+    at.begin()
+    state = watched.state()
+    assert json.loads(state.to_json()) == json.loads(json.dumps(dataclasses.asdict(state)))
+    assert json.loads(state.to_json())["workers"][0]["name"] == "w"
+
+
+def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None:
+    at = peers()
+    watched = service(at)
+    for number in range(MOST_SHOWN + 50):
+        at.join(b"w%04d" % number)
+    for number in range(MOST_SHOWN + 50):
+        hello(at, b"c%04d" % number, name="\\" * 100, host='"' * 100)
+        at.want(0, 1, identity=b"c%04d" % number)
+    for worker in range(0, MOST_SHOWN, 2):
+        at.begin(b"w%04d" % worker)
+    watched.pass_seconds(1.0)
+    began = time.process_time()
+    state = watched.state()
+    encoded = state.to_json()
+    took = time.process_time() - began
+    assert (state.worker_count, state.consumer_count) == (MOST_SHOWN + 50, MOST_SHOWN + 50)
+    assert len(encoded) < 1 << 20
+    values = json.loads(encoded)
+    assert 0 < len(values["workers"]) <= MOST_SHOWN
+    assert took < 1.0  # 0.1 s on an idle core, twice that for lists that do not fit
+
+
+def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
+    at = peers()
+    for _ in range(20):
+        at.dispatcher.candidates.latest.append((WALL, Refusal("\x01" * 4000, None, "\x02" * 4000)))
+    at.quarantine.extend(
+        [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
+    )
+    state = service(at, cache="/not-utf8-\udcff").state()
+    encoded = state.to_json()
+    assert len(encoded) < 1 << 18
+    assert json.loads(encoded)["cache"]["folder"] == "/not-utf8-?"
+    assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
+
+
+# --- looking ----------------------------------------------------------------------------------------------------------
+
+
+def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
+    at = peers()
+    watched = service(at)
+    assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
+    (answer,) = watched.answers()
+    assert isinstance(answer, ToConsumer)
+    assert answer.identity == b"page"
+    assert json.loads(seen(answer))["version"] == STATE_VERSION
+    assert watched.state().consumer_count == 0
+
+
+def test_the_workers_side_may_look_too_and_is_no_worker_for_it() -> None:
+    at = peers()
+    watched = service(at)
+    watched.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
+    (answer,) = watched.answers()
+    assert isinstance(answer, ToWorker)
+    assert json.loads(seen(answer))["worker_count"] == 0
+
+
+def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
+    at = peers()
+    watched = service(at)
+    made = 0
+    for _ in range(20):
+        for _ in range(50):
+            assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
+        answers = watched.answers()
+        assert len(answers) <= 1
+        made += len(answers)
+        at.now += 0.1
+    assert made == 2.0 / ANSWER_SECONDS
+
+
+def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
+    at = peers()
+    watched = service(at)
+    worked = iter(range(1000))
+    watched.watch._processor_clock = lambda: float(next(worked)) / 10.0
+    made = []
+    for _ in range(200):
+        watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now))
+        made += [at.now] * len(watched.answers())
+        at.now += 0.1
+    # A tenth of a second of work each.
+    assert made == pytest.approx([0.0, 5.0, 10.0, 15.0], abs=0.5)
+
+
+def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> None:
+    at = peers()
+    watched = service(at)
+    for number in range(MOST_LOOKERS):
+        assert watched.watch.ask(SendStatus(b"%d" % number)) == []
+    (denied,) = watched.watch.ask(SendStatus(b"one too many"))
+    answer = decode(denied.frames[0])
+    assert isinstance(answer, Denied)
+    assert answer.code == ErrorCode.BUSY
+    answers = watched.answers()
+    assert len(answers) == MOST_LOOKERS
+    assert len({id(each.frames) for each in answers}) == 1
+
+
+def test_the_spec_of_the_server_is_told_resolved() -> None:
+    state = service(peers()).state()
+    assert set(state.spec) == set(SMALL_SPEC.to_dict())
+
+
+def test_a_consumer_cannot_have_waited_longer_than_it_was_there() -> None:
+    at = peers()
+    watched = service(at)
+    at.now = 10.0
+    hello(at)
+    at.now = 14.0
+    at.consumer_says(b"c", Want(0, (), waited_seconds=1e300))
+    at.consumer_says(b"c", Want(0, (), waited_seconds=3.0))
+    assert watched.state().consumers[0].waited_seconds == 4.0
+    at.consumer_says(b"c", Goodbye(4.0))
+    assert watched.state().totals.waited_seconds == 4.0
+    assert watched.state().consumers == ()

@@ -1,0 +1,14 @@
+"""The catalogue: which videos there are, under stable names, and what each of them holds.
+
+catalogue        the snapshot that everything else works from
+videos           its videos in columns
+corpus           which files a corpus has
+files            finding files, and asking about many at a time
+listfile         list files like the paper's
+probe            probing many files in processes of their own
+index            what probing found, on disk and in memory
+refresh          bring the index up to date
+scenes           statistics of what the videos show
+manifest         what a prepared folder states about itself
+manifest_writer  writing a manifest
+"""

@@ -1,0 +1,369 @@
+"""The catalogue: which videos a corpus has, under stable names, and what each of them holds."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
+from v2v_protocol.messages import Lease
+from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_protocol.spec import StreamSpec
+from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
+from v2v_server.corpus.corpus import Corpus, find_corpus, told
+from v2v_server.corpus.files import Notice
+from v2v_server.corpus.index.columns import VideoTable
+from v2v_server.corpus.index.file import Store
+from v2v_server.corpus.listfile import ListEntry
+from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.scenes.collect import SceneCollection
+from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
+from v2v_server.store.clips import STORE_FORMAT, check_file
+from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.system.process import without_collections
+from v2v_server.video.frame_index import FrameIndex, unseekable
+from v2v_server.video.rows import Rows
+
+_KEPT_SLICES = 64
+_KEPT_LONG_FRAMES = 1 << 22
+"""Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
+_SMALL_INDEX_BYTES = 4096
+"""Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
+that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
+
+    Attributes:
+        root: the folder that ids are relative to, resolved; or their copies, of videos in object storage.
+        rows: which rows of the pictures may be used.
+        videos: the videos that can be used, by id.
+        refusals: files, folders and lines of the list that give no video, by id.
+        notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
+        digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
+        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare.prepare`). Its videos
+            are those of its source in number, order, id and frames, so that every position means the same frames;
+            one without a sound prepared file is refused when it is opened, like a damaged one.
+        scene_digest: names this snapshot together with the statistics of its videos; None without them.
+    """
+
+    root: Path | Copies
+    rows: Rows
+    videos: Videos
+    refusals: tuple[Refusal, ...]
+    notes: tuple[str, ...]
+    digest: str
+    prepared: Header | None
+    scene_digest: str | None
+    _store: Store = field(repr=False, compare=False)
+    _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
+    _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
+    _scenes: SceneCollection | None = field(repr=False, compare=False)
+    _unknown: frozenset[str] = field(repr=False, compare=False)
+    _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
+    _long: dict[str, FrameIndex] = field(repr=False, compare=False, default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        """The root, for what works on folders only.
+
+        Raises:
+            CorpusError: the videos lie in object storage.
+        """
+        if isinstance(self.root, Copies):
+            raise CorpusError(f"{self.root}: is no folder of this host, which this needs: copy the videos to one first")
+        return self.root
+
+    def path(self, id: str) -> Path:
+        """Where the video lies.
+
+        Raises:
+            CorpusError: no such id in this catalogue, or the videos lie in object storage.
+        """
+        self._fingerprint(id)
+        return self.folder / id
+
+    def check(self, id: str, fingerprint: str) -> None:
+        """Make sure that the video is here as it was catalogued. In object storage it is if nothing else can be told,
+        and it is asked for only once.
+
+        Raises:
+            CorpusError: no such id in this catalogue.
+            VideoError: it is another one, is gone, or (on a disk) cannot be read.
+        """
+        if not isinstance(self.root, Copies):
+            return check_file(self.path(id), fingerprint)
+        self._fingerprint(id)
+        with suppress(sqlite3.Error):
+            known = self._store.state(id)
+            # A row in doubt (size -1) was found wanting before.
+            if known is None or known[0] < 0 or not self.root.is_there(id, *known):
+                raise VideoChanged(id, None, f"is gone from {self.root}, or changed there")
+        return None
+
+    def frame_index(self, id: str) -> FrameIndex:
+        """The frames of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue.
+            IndexUnreadable: another process holds the index, or its storage fails.
+            VideoChanged: another process has catalogued a changed file under this id since.
+            ProtocolError: what the index says of this video is damaged.
+        """
+        return FrameIndex.from_bytes(self._stored_index(id))
+
+    def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
+        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, and the pieces of the
+        cache that they lie in, encoded.
+
+        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
+        kept, because siblings ask for the same one after the other.
+
+        Raises:
+            CorpusError, IndexUnreadable, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and
+                :meth:`FrameIndex.slice`.
+        """
+        key = id, start, count
+        if key not in self._slices:
+            index = self._long.get(id)
+            encoded = b"" if index is not None else self._stored_index(id)
+            if index is None and len(encoded) > _SMALL_INDEX_BYTES:
+                index = self._keep_long(id, FrameIndex.from_bytes(encoded))
+            if index is not None:
+                index.position(start, count)
+                first = start // PIECE_FRAMES * PIECE_FRAMES
+                end = min(-(-(start + count) // PIECE_FRAMES) * PIECE_FRAMES, index.end)
+                encoded = index.slice(first, end - first).to_bytes()
+            while len(self._slices) >= _KEPT_SLICES:
+                del self._slices[next(iter(self._slices))]
+            self._slices[key] = encoded
+        return self._slices[key]
+
+    def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
+        """Opening the index of a day takes a tenth of a second, in the broker's only thread: a few stay open."""
+        while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
+            del self._long[next(iter(self._long))]
+        self._long[id] = index
+        return index
+
+    def _stored_index(self, id: str) -> bytes:
+        fingerprint = self._fingerprint(id)
+        if id in self._absent:
+            video = self._absent[id]
+            return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
+        try:
+            data = self._store.frame_index(id, self._files.get(id, fingerprint))
+        except sqlite3.Error as error:
+            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return data
+
+    def scene(self, id: str) -> Scene:
+        """The statistics of a video, read from the index on disk.
+
+        Raises:
+            CorpusError: no such id in this catalogue, or it was opened without ``scene``.
+            IndexUnreadable: another process holds the index, or its storage fails.
+            VideoChanged: another process has catalogued a changed file under this id since.
+        """
+        fingerprint = self._fingerprint(id)
+        if self._scenes is None:
+            raise CorpusError("this catalogue was opened without statistics of its videos")
+        if id in self._unknown:
+            return Scene.unknown()
+        try:
+            data = self._store.figures(id, self._files.get(id, fingerprint), self._scenes.kind)
+        except sqlite3.Error as error:
+            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
+        if data is None:
+            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+        return Scene.from_bytes(data)
+
+    @property
+    def facts(self) -> CorpusFacts:
+        """What is known in memory: all that a server's dispatcher needs."""
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest)
+
+    def digest_under(self, scene: str) -> str:
+        """See :meth:`CorpusFacts.digest_under`."""
+        return self.facts.digest_under(scene)
+
+    def fail_fast(self) -> None:
+        """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
+        self._store.fail_fast()
+
+    def mark_stale(self, id: str) -> None:
+        """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
+        say. Does nothing where the index cannot be written now."""
+        with suppress(sqlite3.Error):
+            self._store.mark_stale(id)
+
+    def close(self) -> None:
+        """Close the index; ``frame_index`` works no more."""
+        self._store.close()
+        if isinstance(self.root, Copies):
+            self.root.release()
+
+    def _fingerprint(self, id: str) -> str:
+        number = self.videos.find(id)
+        if number is None:
+            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
+        return self.videos.fingerprints[number]
+
+
+def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
+    """Return a lease with what the index on disk holds of its clip.
+
+    Args:
+        lease: without ``frame_index`` and ``scene``.
+        catalogue: where its video is catalogued.
+        spec: the spec that the lease names.
+
+    Raises:
+        IndexUnreadable: the index cannot be read at the moment.
+        V2VError: the index of this video is damaged, or belongs to another file.
+    """
+    video, start, count = lease.video, lease.start_frame, spec.recipe.frames_needed
+    scene = catalogue.scene(video).slice(start, count).to_bytes() if spec.scene != "off" else b""
+    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=scene)
+
+
+def open_catalogue(
+    source: str | os.PathLike[str],
+    *,
+    list_file: str | os.PathLike[str] | None = None,
+    rows: Rows | None = None,
+    cache_dir: str | os.PathLike[str] | None = None,
+    copies: str | os.PathLike[str] | None = None,
+    copies_gib: float = COPIES_GIB,
+    scene: bool = False,
+    processes: int = 1,
+    progress: Progress | None = None,
+    notice: Notice | None = None,
+) -> Catalogue:
+    """Take in a corpus: probe what is new or changed, forget what is gone.
+
+    Args:
+        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder; or
+            an address in object storage, ``s3://bucket/prefix``, see :mod:`v2v_server.cloud`.
+        list_file: a list that restricts the folder ``source`` to the videos it names.
+        rows: which rows may be used; all when None.
+        cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
+            ``~/.cache/v2v``.
+        copies: folder for copies of videos from object storage; None takes one where the index lies.
+        copies_gib: at most so much lies there.
+        scene: also take in what the videos show, which decodes what was not looked at yet; see
+            :mod:`v2v_server.corpus.scene`.
+        processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
+        progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
+        notice: told what is looked at before that, file by file, and how far it is.
+
+    Raises:
+        CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
+            be used.
+    """
+    corpus = find_corpus(source, list_file, rows, copies_of(os.fspath(source), copies, copies_gib, cache_dir), notice)
+    scenes = SceneCollection(corpus.rows, corpus.manifest) if scene else None
+    path = index_path(corpus.root, cache_dir)
+    store, table, notes = refresh_index(corpus.root, corpus.ids, path, scenes, processes, progress, notice)
+    try:
+        with without_collections():
+            return _snapshot(corpus, table, notes, store, scenes)
+    except BaseException:
+        store.close()
+        raise
+
+
+def _snapshot(
+    corpus: Corpus, on_disk: VideoTable, notes: list[str], store: Store, scenes: SceneCollection | None
+) -> Catalogue:
+    root, manifest, table = corpus.root, corpus.manifest, on_disk
+    problems, files = dict(corpus.refused), dict[str, str]()
+    absent: dict[str, PreparedVideo] = {}
+    if manifest is not None:
+        records = [on_disk.row(at) for at in range(len(on_disk))]
+        files = {record.id: record.fingerprint for record in records}
+        absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
+        table = VideoTable.of(manifest.as_source(record).columns for record in records)
+    else:
+        table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
+    usable = table.problem == np.array(None)
+    problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
+    table = table.where(usable)
+    thresholds, shorter = _listed(corpus.listed, Videos(table, {}))
+    videos = Videos(table, thresholds)
+    if not videos:
+        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{told(problems)}")
+    if absent:
+        if len(absent) == len(videos):
+            raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
+        reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
+        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{told(reasons)}"]
+    if manifest is not None and manifest.aside:
+        notes = [
+            *notes,
+            f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
+            "them; run it once for all to have them served",
+        ]
+    if len(woven := np.flatnonzero(videos.interlaced)):
+        first = videos[int(woven[0])].id
+        notes = [
+            *notes,
+            f"{len(woven)} videos are interlaced ({first}): their frames are served as they are stored, two fields "
+            "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
+            "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
+        ]
+    if corpus.left_out:
+        notes = [*notes, corpus.left_out]
+    if shorter:
+        notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
+    digest = videos.digest(corpus.rows)
+    scene_digest, unknown = None, set(absent)
+    if scenes is not None:
+        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        videos = Videos(table, thresholds, split)
+        if died := sorted(unknown - absent.keys()):
+            notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
+    return Catalogue(
+        root=root,
+        rows=corpus.rows,
+        videos=videos,
+        refusals=tuple(Refusal(id, None, problems[id], RefusalKind.UNUSABLE) for id in sorted(problems)),
+        notes=tuple(notes),
+        digest=digest,
+        prepared=None if manifest is None else manifest.header,
+        scene_digest=scene_digest,
+        _store=store,
+        _files=files,
+        _absent=absent,
+        _scenes=scenes,
+        _unknown=frozenset(unknown),
+    )
+
+
+def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:
+    """What a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
+    thresholds: dict[int, Thresholds] = {}
+    shorter = []
+    for entry in sorted({entry.id: entry for entry in listed}.values(), key=lambda entry: entry.id):
+        number = videos.find(entry.id)
+        if number is None:
+            continue
+        if (stated := (entry.threshold_pos, entry.threshold_neg)) != NO_THRESHOLDS:
+            thresholds[number] = stated
+        frames = int(videos.frames[number])
+        if entry.frames is not None and entry.frames > frames:
+            shorter.append(f"{entry.id} has {frames} frames, not {entry.frames}")
+    return thresholds, shorter

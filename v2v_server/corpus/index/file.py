@@ -1,0 +1,334 @@
+"""The index of a corpus on disk: what probing each file has found, so that the next start need not do it again.
+
+One SQLite file per corpus. A row is believed as long as the file's size and the times of its last modification and
+change of status stay the same: the latter is set by the system whatever a program does to the former. Writes are
+short transactions with a busy timeout, so several servers may share one index; since a row is a function of the file
+alone, it does not matter which of them wrote it.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from v2v_server.system.private import make_private
+
+SCHEMA_VERSION = 5
+"""Raise it with every change of the table or of what probing finds: an index of another version is made again."""
+
+_BUSY_SECONDS = 30.0
+_TABLE = """
+CREATE TABLE video (
+    id TEXT PRIMARY KEY,
+    size_bytes INTEGER NOT NULL,
+    mtime_ns INTEGER NOT NULL,
+    ctime_ns INTEGER NOT NULL,
+    fingerprint TEXT NOT NULL,
+    frames INTEGER NOT NULL,
+    width_px INTEGER NOT NULL,
+    height_px INTEGER NOT NULL,
+    frames_per_second REAL,
+    codec TEXT NOT NULL,
+    interlaced INTEGER NOT NULL,
+    problem TEXT,
+    frame_index BLOB
+)"""
+
+_FIGURES = """
+CREATE TABLE IF NOT EXISTS figures (
+    kind TEXT NOT NULL,
+    version TEXT NOT NULL,
+    id TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    summary BLOB NOT NULL,
+    data BLOB NOT NULL,
+    PRIMARY KEY (kind, version, id)
+)"""
+
+
+@dataclass(frozen=True, slots=True)
+class FigureKind:
+    """Figures of one kind.
+
+    Attributes:
+        name: what was measured, such as "scene".
+        version: how it was measured, and on which part of the pictures. Figures of other versions do not count.
+    """
+
+    name: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures of a video.
+
+    Attributes:
+        id, fingerprint: of the video.
+        summary: what a start reads of every video.
+        data: all figures, encoded.
+    """
+
+    id: str
+    fingerprint: str
+    summary: bytes
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class IndexRow:
+    """What is known of one file.
+
+    Attributes:
+        id: relative POSIX path.
+        size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
+            probed again at the next start.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
+        frames, width_px, height_px, frames_per_second, codec, interlaced: see
+            :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
+        problem: why the file cannot be used; None if it can.
+        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
+    """
+
+    id: str
+    size_bytes: int
+    mtime_ns: int = 0
+    ctime_ns: int = 0
+    fingerprint: str = ""
+    frames: int = 0
+    width_px: int = 0
+    height_px: int = 0
+    frames_per_second: float | None = None
+    codec: str = ""
+    interlaced: bool = False
+    problem: str | None = None
+    frame_index: bytes | None = None
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        """Return the attributes without the frame index."""
+        return tuple(getattr(self, name) for name in _COLUMNS)
+
+
+_COLUMNS = IndexRow.__slots__[:-1]
+_FIGURE_COLUMNS = "kind", "version", "id", "fingerprint", "summary", "data"
+
+
+def _insert(table: str, columns: Sequence[str]) -> str:
+    return f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
+
+
+class Store:
+    """An open index.
+
+    Args:
+        path: the SQLite file, made if missing; None keeps the index in memory.
+
+    Attributes:
+        path: that.
+        replaced_version: version of the index that lay there and could not be used; None if there was none.
+
+    Raises:
+        sqlite3.Error, OSError: the file cannot be made, opened or read.
+
+    Every method may also raise UnicodeDecodeError for a damaged file: SQLite's message then quotes what is not UTF-8.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            make_private(path)  # SQLite gives its other files the mode of this one
+        self.path = path
+        self.replaced_version: int | None = None
+        self._database = sqlite3.connect(
+            ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
+        )
+        try:
+            self._prepare()
+        except BaseException:
+            self._database.close()
+            raise
+
+    def _prepare(self) -> None:
+        if self._version() == SCHEMA_VERSION:
+            return
+        self._database.execute("BEGIN IMMEDIATE")
+        with self._database:
+            version = self._version()
+            if version == SCHEMA_VERSION:  # another process was faster
+                return
+            self.replaced_version = version or None
+            self._database.execute("DROP TABLE IF EXISTS video")
+            self._database.execute(_TABLE)
+            self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+    def _version(self) -> int:
+        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+
+    def rows(self) -> Generator[tuple[Any, ...], None, None]:
+        """Yield all records by id, as the attributes of :class:`IndexRow` without their frame indices.
+
+        Another program may have put any type into any column but the id.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = f"SELECT {', '.join(_COLUMNS)} FROM video WHERE typeof(id) = 'text' ORDER BY id"
+        with closing(self._database.execute(query)) as rows:
+            yield from rows
+
+    def frame_index(self, id: str, fingerprint: str) -> bytes | None:
+        """The encoded frame index of a file; None if the index does not know that state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT frame_index FROM video WHERE id = ? AND fingerprint = ?"
+        return _blob(self._database.execute(query, (id, fingerprint)).fetchone())
+
+    def state(self, id: str) -> tuple[int, int] | None:
+        """Size and time of the last modification of a file when it was probed; None if it is not known.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        row = self._database.execute("SELECT size_bytes, mtime_ns FROM video WHERE id = ?", (id,)).fetchone()
+        return None if row is None else (row[0], row[1])
+
+    def make_figures(self) -> bool:
+        """Make the table of figures if it is missing; return whether there is also a table of an earlier release.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._database.execute(_FIGURES)
+        return _has_table(self._database, "scene")
+
+    def summaries(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
+        """Yield (id, summary) of each video whose figures are those of its present fingerprint, sorted by id.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        yield from self._figures("summary", kind)
+
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
+        """Yield (id, summary, encoded figures) like :meth:`summaries`."""
+        yield from self._figures("summary, data", kind)
+
+    def _figures(self, columns: str, kind: FigureKind) -> Generator[tuple[Any, ...], None, None]:
+        query = (
+            f"SELECT id, {columns} FROM video JOIN figures USING (id, fingerprint) WHERE kind = ? AND version = ? "
+            "AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY id"
+        )
+        with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
+            yield from rows
+
+    def figures(self, id: str, fingerprint: str, kind: FigureKind) -> bytes | None:
+        """Return the encoded figures of a video; None if the index has none of this state of it.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT data FROM figures WHERE id = ? AND fingerprint = ? AND kind = ? AND version = ?"
+        return _blob(self._database.execute(query, (id, fingerprint, kind.name, kind.version)).fetchone())
+
+    def put_figures(self, kind: FigureKind, figures: Iterable[Figures]) -> None:
+        """Add or replace figures, in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        rows = [(kind.name, kind.version, each.id, each.fingerprint, each.summary, each.data) for each in figures]
+        self._change(_insert("figures", _FIGURE_COLUMNS), rows)
+
+    def earlier_scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
+        """Return the encoded scene of a video in the table of releases before 0.2; None if there is none.
+
+        The table stays as it is for servers of these releases that share the file.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
+        return _blob(self._database.execute(query, (id, fingerprint, look)).fetchone())
+
+    def put(self, records: Iterable[IndexRow]) -> None:
+        """Add or replace records, in one transaction.
+
+        Raises:
+            sqlite3.Error: the file is damaged, read-only, locked for too long, or the disk is full.
+        """
+        rows = [(*record.columns, record.frame_index) for record in records]
+        self._change(_insert("video", IndexRow.__slots__), rows)
+
+    def merge(self, path: Path) -> int:
+        """Add or replace all that another index knows, in one transaction.
+
+        Returns:
+            the number of its records.
+
+        Raises:
+            ValueError: the file is no index of this version.
+            sqlite3.Error: the file is damaged; or as for :meth:`put`.
+        """
+        # Immutable: the file may be on storage where SQLite's locks do not work.
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as other:
+            (version,) = other.execute("PRAGMA user_version").fetchone()
+            if version != SCHEMA_VERSION:
+                raise ValueError(f"is an index of version {version}, this program reads {SCHEMA_VERSION}")
+            self.make_figures()
+            self._database.execute("BEGIN IMMEDIATE")
+            with self._database:
+                for table, columns in ("video", IndexRow.__slots__), ("figures", _FIGURE_COLUMNS):
+                    if _has_table(other, table):
+                        rows = other.execute(f"SELECT {', '.join(columns)} FROM {table}")
+                        self._database.executemany(_insert(table, columns), rows)
+            return int(other.execute("SELECT COUNT(*) FROM video").fetchone()[0])
+
+    def forget(self, ids: Iterable[str]) -> None:
+        """Drop records, in one transaction.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._change("DELETE FROM video WHERE id = ?", [(id,) for id in ids])
+
+    def mark_stale(self, id: str) -> None:
+        """Let the next start probe a file again.
+
+        Raises:
+            sqlite3.Error: as for :meth:`put`.
+        """
+        self._change("UPDATE video SET size_bytes = -1 WHERE id = ?", [(id,)])
+
+    def fail_fast(self) -> None:
+        """From now on an index that another process holds is an error at once."""
+        self._database.execute("PRAGMA busy_timeout = 0")
+
+    def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
+        if not rows:
+            return
+        self._database.execute("BEGIN IMMEDIATE")
+        with self._database:
+            self._database.executemany(statement, rows)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+
+def _has_table(database: sqlite3.Connection, name: str) -> bool:
+    return (
+        database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone()
+        is not None
+    )
+
+
+def _blob(row: tuple[Any] | None) -> bytes | None:
+    """Return what a query for one blob found; None if that is no blob, since another program changed it."""
+    return row[0] if row is not None and isinstance(row[0], bytes) else None

@@ -1,0 +1,352 @@
+"""The manifest of a prepared folder: what was made of which source video, and how.
+
+One JSON object a line. The first describes the folder, each of the others one video, failed ones too. Lines are only
+ever appended; a last line that a killed process left unfinished counts as not written, and where an id comes twice, the
+later line holds.
+
+A folder stands for the corpus of the run that wrote its first line last. What earlier runs made of videos that this
+corpus does not have (a list left them out, their folder could not be read that day) is set aside: its lines stay, so
+that a run that asks for it again need not make it again, but it is not served.
+"""
+
+from __future__ import annotations
+
+import math
+from base64 import b64decode
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, field, fields, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+
+from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.safe_json import parse_json
+from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.files import UNPRINTABLE, answers, printable
+from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.store.clips import STORE_FORMAT
+from v2v_server.store.encoding import Encoding
+from v2v_server.video.fingerprint import is_same_file
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.rows import Rows
+
+MANIFEST_NAME = "v2v-prepared.jsonl"
+MANIFEST_VERSION = 2
+_Record = TypeVar("_Record", "Header", "PreparedVideo")
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What holds for the whole folder.
+
+    Attributes:
+        rows: rows of the source's pictures that it holds, canonical.
+        codec, size, quality, gop: see :class:`v2v_server.store.encoding.Encoding`.
+        videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
+            that are set aside do not count.
+        source: name of the source folder, for people.
+        source_digest: digest of the source's catalogue with these rows.
+        version: of this format.
+    """
+
+    rows: str
+    codec: str
+    size: str
+    quality: int
+    gop: int
+    videos: int
+    source: str
+    source_digest: str
+    version: int = MANIFEST_VERSION
+
+    @property
+    def encoding(self) -> Encoding:
+        """How its files are encoded."""
+        return Encoding(self.codec, self.size, self.quality, self.gop)
+
+    def same_settings(self, other: Header) -> bool:
+        """Whether videos of both may lie in one folder."""
+        return (self.rows, self.encoding) == (other.rows, other.encoding)
+
+    def settings(self) -> str:
+        """rows and encoding as text."""
+        return f"rows {self.rows}, {self.encoding}"
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedVideo:
+    """What was made of one video.
+
+    Attributes:
+        id: of the source, and the path of the prepared file below the folder.
+        source_fingerprint, source_bytes: of the source file.
+        frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
+        height_px, width_px: of the prepared picture, 0 where the source has not the rows asked for; in a lossless
+            folder of the source's picture, of which the file keeps some rows.
+        fingerprint, bytes: of the prepared file; "" and 0 with a problem.
+        psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
+        worst_psnr_db: the same of the worst frame.
+        problem: why there is no prepared file; None if there is one.
+        scene: statistics of the source's frames, base64 of ``Scene.to_bytes()``; "" where they were not asked for.
+    """
+
+    id: str
+    source_fingerprint: str
+    source_bytes: int
+    frames: int
+    frames_per_second: float | None
+    height_px: int
+    width_px: int
+    fingerprint: str = ""
+    bytes: int = 0
+    psnr_db: float | None = None
+    worst_psnr_db: float | None = None
+    problem: str | None = None
+    scene: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """A manifest as read.
+
+    Attributes:
+        root: the prepared folder.
+        header: see :class:`Header`.
+        videos: by id.
+        aside: by id, those of earlier runs that the last one was not asked for; no corpus has them.
+    """
+
+    root: Path
+    header: Header
+    videos: dict[str, PreparedVideo]
+    aside: dict[str, PreparedVideo] = field(default_factory=dict)
+
+    @property
+    def lossless(self) -> bool:
+        """Whether its files give the very pixels of their sources: the folder is then served as the source is."""
+        return self.header.encoding.is_lossless
+
+    def served_rows(self, rows: Rows | None) -> Rows:
+        """Which rows of its pictures a corpus of this folder has: all of a lossy one.
+
+        A lossless one has pictures of the source's size, of which those rows may be used that are kept, or others
+        where all are kept.
+
+        Args:
+            rows: that are asked for.
+
+        Raises:
+            CorpusError: it is not finished, or other rows are asked for than it holds.
+        """
+        if len(self.videos) != self.header.videos:
+            raise CorpusError(
+                f"{self.root}: prepared are {len(self.videos)} of {self.header.videos} videos; run v2v-prepare again "
+                "to finish (what is done is kept)"
+            )
+        asked = None if rows is None or str(rows) == "full" else rows
+        kept = Rows.parse(self.header.rows)
+        if self.lossless and asked is not None and kept == Rows():
+            return asked
+        if asked is not None and asked != kept:
+            raise CorpusError(
+                f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
+                "source only; leave --rows out, or serve the source"
+            )
+        return kept if self.lossless else Rows()
+
+    def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
+        """The ids that a corpus of this folder has; files that the manifest does not know are none.
+
+        Args:
+            listed: the ids that a list file names; None takes all.
+            refused: receives, by id, why one cannot be taken in.
+        """
+        wanted = sorted(self.videos) if listed is None else list(listed)
+        for id in wanted:
+            if id in self.aside:
+                refused[id] = "is prepared, but the last v2v-prepare was not asked for it; run it once for all of them"
+            elif id not in self.videos:
+                refused[id] = "is not in the prepared folder's manifest: the source had no such usable video"
+            elif not self.videos[id].height_px:
+                refused[id] = f"was not prepared: {self.videos[id].problem}"
+        return tuple(id for id in wanted if id not in refused)
+
+    def describes(self, record: IndexRow) -> bool:
+        """Whether the file that was probed is the one that was prepared.
+
+        A lossless one may be damaged since: it says itself what it was made of, and each of its blocks is checked when
+        it is read. The source itself will do in its place.
+        """
+        video = self.videos[record.id]
+        if self.lossless:
+            is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
+            return record.problem is None and record.frames == video.frames and is_either
+        return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
+
+    def as_source(self, record: IndexRow) -> IndexRow:
+        """The record of a prepared file, with what has to agree with its source even where there is no sound file:
+        the sequences of all others keep their places only if the source's frames are counted."""
+        video = self.videos[record.id]
+        made = video.fingerprint or f"none-of-{video.source_fingerprint}"
+        return replace(
+            record,
+            fingerprint=video.source_fingerprint if self.lossless else made,
+            frames=video.frames,
+            height_px=video.height_px,
+            width_px=video.width_px,
+            frames_per_second=video.frames_per_second,
+            problem=None,
+        )
+
+
+def find_manifest(root: Path) -> Manifest | None:
+    """The manifest of a resolved folder; None if it is no prepared one.
+
+    Raises:
+        CorpusError: the manifest makes no sense, or the folder is a part of a prepared one.
+        OSError: the folder cannot be looked into.
+    """
+    for folder in root.parents:
+        if (folder / MANIFEST_NAME).exists():
+            raise CorpusError(
+                f"{root} lies in the prepared folder {folder}, where its manifest is: name that folder, and restrict "
+                "it by a list file"
+            )
+    return read_manifest(root) if (root / MANIFEST_NAME).exists() else None
+
+
+def refuse_prepared_below(root: Path | Copies, ids: Iterable[str]) -> None:
+    """Make sure that no video of an ordinary corpus comes from a prepared folder, whose rows are cut already.
+
+    Raises:
+        CorpusError: one does.
+    """
+    if isinstance(root, Copies):
+        found = [name for name in root.listed if name.rpartition("/")[2] == MANIFEST_NAME]
+        if found:
+            raise CorpusError(f"{root}: {found[0]} makes it a prepared corpus: copy that to a disk")
+        return
+
+    def is_prepared(folder: PurePosixPath) -> bool:
+        try:
+            return (root / folder / MANIFEST_NAME).exists()
+        except OSError:  # where nobody may look, no video can be read either: each says so itself
+            return False
+
+    folders = {PurePosixPath(folder) for folder in {id.rpartition("/")[0] for id in ids}}
+    folders.update({parent for folder in folders for parent in folder.parents})
+    for folder, refused in answers(is_prepared, sorted(folders)):
+        if refused:
+            raise CorpusError(
+                f"{root / folder} is a prepared folder and cannot be a part of another corpus: name it itself, or move "
+                "it out"
+            )
+
+
+def read_manifest(root: Path) -> Manifest:
+    """The manifest in that folder.
+
+    Raises:
+        CorpusError: it cannot be read, or is no manifest of this version.
+    """
+    path = root / MANIFEST_NAME
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise CorpusError(f"{path}: cannot be read: {error.strerror or error}") from error
+    lines.pop()  # empty behind the last line's end; else the beginning of a line whose writer was killed
+    if not lines:
+        raise CorpusError(f"{path}: holds no whole line; prepare another folder")
+    videos: dict[str, PreparedVideo] = {}
+    aside: dict[str, PreparedVideo] = {}
+    for number, line in enumerate(lines, 1):
+        try:
+            if number == 1:
+                header = _header(line)
+            else:
+                video, is_aside = _video(line)
+                for records in (videos, aside):
+                    records.pop(video.id, None)
+                (aside if is_aside else videos)[video.id] = video
+        except (ValueError, TypeError, UsageError) as error:
+            raise CorpusError(f"{path}, line {number}: {error}; prepare another folder") from error
+    return Manifest(root, header, videos, aside)
+
+
+def _header(line: bytes) -> Header:
+    data = _object(line)
+    if data.get("version") != MANIFEST_VERSION:
+        raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
+    header = _record(Header, data)
+    header.encoding  # noqa: B018 - refuses what cannot be
+    Rows.parse(header.rows)
+    if not _whole(header.videos, 1, math.inf):
+        raise ValueError(f"{header.videos!r} videos")
+    return header
+
+
+def _video(line: bytes) -> tuple[PreparedVideo, bool]:
+    """The record, and whether it is set aside."""
+    data = _object(line)
+    aside = data.pop("aside", False) is True
+    video = _record(PreparedVideo, data)
+    path = PurePosixPath(video.id)
+    if printable(video.id) != video.id:
+        raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"id {video.id!r} leads out of the folder")
+    sizes = (video.height_px, video.width_px)
+    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(_whole(size, 0, LARGEST_SIDE_PX) for size in sizes):
+        raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
+    if video.scene:
+        try:
+            Scene.from_bytes(b64decode(video.scene, validate=True))
+        except ProtocolError as error:
+            raise ValueError(f"{video.id}: {error}") from error
+    return video, aside
+
+
+def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
+    """Return the record with these fields.
+
+    Raises:
+        ValueError: a field is unknown, missing or of another type.
+    """
+    known = {each.name: each for each in fields(kind)}
+    if unknown := data.keys() - known.keys():
+        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
+    for name, each in known.items():
+        if name not in data:
+            if each.default is MISSING:
+                raise ValueError(f"field {name!r} is missing")
+        elif not _FIELD_CHECKS[str(each.type)](data[name]):
+            raise ValueError(f"{name} = {data[name]!r:.80}: expected {each.type}")
+    return kind(**data)
+
+
+def _object(line: bytes) -> dict[str, Any]:
+    data = parse_json(line)
+    if not isinstance(data, dict):
+        raise ValueError("is no JSON object")
+    return data
+
+
+def _whole(value: object, least: float, most: float) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_rate(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
+
+
+_FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
+    # Annotations are text here, as in the wire's checks.
+    "int": lambda value: _whole(value, 0, 2**63 - 1),
+    "str": _is_text,
+    "str | None": lambda value: value is None or _is_text(value),
+    "float | None": lambda value: value is None or _is_rate(value),
+}

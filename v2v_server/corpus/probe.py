@@ -1,0 +1,167 @@
+"""Probe many files in processes of their own, so that a file that kills its reader costs only itself."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from v2v_protocol.errors import VideoError, VideoUnreadable
+from v2v_server.cloud.copies import Copies, open_local
+from v2v_server.corpus.index.file import IndexRow
+from v2v_server.store.clips import facts_of
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.video.fingerprint import fingerprint
+from v2v_server.video.probe import VideoFacts
+
+LONGEST_SECONDS = 3600.0
+"""Limit for reading a file from end to end on slow storage; beyond it the file is taken for one that never ends."""
+
+LARGEST_MEMORY_BYTES = 2 << 30
+"""Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
+frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
+
+_MOST_TOGETHER = 1024
+_MOST_SECONDS = 10.0
+Progress = Callable[[int, int], None]
+"""(files done so far, files to do)."""
+ProbeFile = Callable[[Path | Copies, str], IndexRow]
+"""(root, id) -> what is known of that file; see :func:`probe_file`."""
+T = TypeVar("T")
+
+
+def probe_file(root: Path | Copies, id: str) -> IndexRow:
+    """Probe one file; an error becomes the record's ``problem``.
+
+    A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
+    """
+    try:
+        before = _state(root, id)
+        with open_local(root, id, "") as path:
+            mark = fingerprint(path)
+            facts = _facts(path)
+        if _state(root, id) != before:
+            return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
+    except OSError as error:
+        return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
+    except VideoUnreadable as error:
+        return IndexRow(id, -1, problem=error.reason)
+    except VideoError as error:
+        where = "" if error.frame is None else f"frame {error.frame}: "
+        return IndexRow(id, *before, problem=where + error.reason)
+    except Exception as error:  # noqa: BLE001 - one strange file must not end the probing of all others
+        return IndexRow(id, *before, problem=f"probing failed: {type(error).__name__}: {error}")
+    return IndexRow(
+        id,
+        *before,
+        fingerprint=f"{mark}-{facts.content}" if facts.content else mark,
+        frames=facts.frames,
+        width_px=facts.width_px,
+        height_px=facts.height_px,
+        frames_per_second=None if math.isnan(facts.frames_per_second) else facts.frames_per_second,
+        codec=facts.codec,
+        interlaced=facts.interlaced,
+        frame_index=facts.index.to_bytes(),
+    )
+
+
+def _state(root: Path | Copies, id: str) -> tuple[int, int, int]:
+    """Return size in bytes, mtime and ctime in ns, or what replaces them in object storage."""
+    if isinstance(root, Copies):
+        return root.state(id)
+    status = (root / id).stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _facts(path: Path) -> VideoFacts:
+    """Return what is known of the video; retry once after an error of the system rather than of the decoder.
+
+    Raises:
+        VideoUnreadable: the system reported an error twice.
+        VideoError: the file is no video that this program serves.
+    """
+    try:
+        return facts_of(path)
+    except VideoError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+    try:
+        return facts_of(path)
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError):
+            raise VideoUnreadable(error.video, error.frame, error.reason) from error
+        raise
+
+
+def probe_files(
+    root: Path | Copies,
+    ids: Iterable[str],
+    processes: int,
+    probe: ProbeFile = probe_file,
+    longest_seconds: float = LONGEST_SECONDS,
+) -> Generator[IndexRow, None, None]:
+    """Yield a record of each id, in any order.
+
+    A file at which a process died is probed once more after all others, alone: the process may have been killed from
+    outside, or memory was too short for it and its neighbours.
+
+    Args:
+        root: the folder, or what lies in object storage, that ids are relative to.
+        ids: relative paths.
+        processes: number of processes to probe in; 0 probes in this one, which a file that crashes the decoder ends.
+        probe: probes one file; must be picklable.
+        longest_seconds: limit for one file; the next start tries it again.
+    """
+    isolated = partial(
+        run_isolated,
+        partial(probe, root),
+        deadline_seconds=lambda id: longest_seconds,
+        memory_bytes=LARGEST_MEMORY_BYTES,
+        writable=None if isinstance(root, Copies) else (),  # copies are fetched: from a network, into a folder
+    )
+    suspects: list[str] = []
+    for id, found in isolated(ids, processes):
+        if isinstance(found, Died) and found.overdue_seconds:
+            yield IndexRow(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
+        elif isinstance(found, Died):
+            suspects.append(id)
+        else:
+            yield found
+    for id, found in isolated(suspects, 1):
+        yield _culprit(root, id, found) if isinstance(found, Died) else found
+
+
+def _culprit(root: Path | Copies, id: str, death: Died) -> IndexRow:
+    if not death.is_crash:
+        why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
+        return IndexRow(id, -1, problem=f"{why}; the next start tries again")
+    why = f"crashes the decoder: the process that probed it died ({death.how})"
+    try:
+        return IndexRow(id, *_state(root, id), problem=why)
+    except (OSError, VideoUnreadable):
+        return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
+
+
+def batches(
+    items: Iterable[T], total: int, progress: Progress | None, clock: Callable[[], float] = time.monotonic
+) -> Iterator[list[T]]:
+    """Yield items in batches that are written to the index at once: a kill loses at most one.
+
+    Args:
+        total: number of items, for ``progress``.
+        progress: called after each item.
+    """
+    batch: list[T] = []
+    begun = clock()
+    for done, item in enumerate(items, 1):
+        batch.append(item)
+        if progress is not None:
+            progress(done, total)
+        if len(batch) == _MOST_TOGETHER or clock() - begun > _MOST_SECONDS:
+            yield batch
+            batch, begun = [], clock()
+    if batch:
+        yield batch

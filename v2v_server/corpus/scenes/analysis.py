@@ -1,0 +1,209 @@
+"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene`: every frame in blocks, every fourth one for motion.
+
+Shot boundaries. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure
+do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
+
+- at least 2 grey levels, and 0.35 of what two unrelated pictures of the same contrasts differ by, which is of the order
+  of sqrt(var m_t-1 + var m_t): it is another picture;
+- at least 3 times the median over the five steps before and after: not the pace of this shot;
+- not above twice d(t-1, t+1): the next frame does not go back, as after a flash.
+
+All of this is exact arithmetic, the same everywhere. Slow transitions (fades, dissolves) are no shot boundaries. Motion
+is that of dense inverse search on pictures of a quarter of the size, four frames apart, rounded to 1/64 px a frame.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.corpus.scenes.scene import (
+    CHANGE,
+    CLIPPED,
+    COLUMNS,
+    CONTRAST,
+    DARK,
+    FLICKER,
+    LAG_FRAMES,
+    MOTION,
+    NOISE,
+    SEGMENT_FRAMES,
+    TILES,
+    Scene,
+)
+from v2v_server.flow.methods import ULTRAFAST, Picture, dis, one_thread
+
+DARK_BELOW_LEVEL = 16
+CLIPPED_FROM_LEVEL = 250
+_BLOCK_PX = 8
+_SHRINK = 4
+_MOST_OF_THE_PICTURE = 0.95
+_STILLEST = 0.1
+_LEAST_BOUNDARY_LEVELS = 2.0
+_LEAST_BOUNDARY_SHARE = 0.35
+_LEAST_BOUNDARY_RATIO = 3.0
+_NEIGHBOURS = 5
+_LARGEST_RETURN = 0.5
+
+_Tiles = npt.NDArray[np.float64]
+"""[16], row by row."""
+
+
+class SceneAnalysis:
+    """Analyse a video frame by frame. Memory: three pictures, and some hundred bytes a frame."""
+
+    def __init__(self) -> None:
+        self._search = dis(ULTRAFAST, 1)
+        self._frames = 0
+        self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
+        self._last: Picture | None = None
+        self._reduced: tuple[int, Picture] | None = None  # the last frame with motion measured, and its number
+        self._means: list[float] = []
+        self._variances: list[float] = []
+        self._steps: list[float] = []  # d(t-1, t)
+        self._returns: list[float] = []  # d(t-1, t+1)
+        self._changes: list[_Tiles] = []  # of frame 1, 2 ...: largest change over four frames
+        self._motions: list[tuple[int, int, _Tiles]] = []  # (frame, later frame, px a frame)
+        self._shares: list[tuple[int, float, float]] = []  # (frame, dark, clipped)
+        self._noises: list[tuple[int, float]] = []
+
+    def add(self, picture: Picture) -> None:
+        """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
+        with one_thread():
+            self._add(np.ascontiguousarray(picture))
+
+    def _add(self, picture: Picture) -> None:
+        number, self._frames = self._frames, self._frames + 1
+        blocks = _block_sums(picture)
+        self._means.append(float(blocks.mean()) / 64)
+        self._variances.append(float(blocks.var()) / 64**2)
+        if self._blocks:
+            self._steps.append(_difference(self._blocks[-1], blocks))
+            self._changes.append(_largest(np.abs(blocks - self._blocks[0])) / 64)
+        if len(self._blocks) > 1:
+            self._returns.append(_difference(self._blocks[-2], blocks))
+        self._blocks = [*self._blocks, blocks][-LAG_FRAMES:]
+        if number % SEGMENT_FRAMES == 1 and self._last is not None:
+            self._noises.append((number, _noise(self._last, picture)))
+        if number % LAG_FRAMES == 0:
+            levels = np.cumsum(np.bincount(picture.ravel(), minlength=256)) / picture.size
+            self._shares.append((number, levels[DARK_BELOW_LEVEL - 1], 1 - levels[CLIPPED_FROM_LEVEL - 1]))
+            self._measure_motion(number, picture)
+        self._last = picture
+
+    def _measure_motion(self, number: int, picture: Picture) -> None:
+        reduced = _reduced(picture)
+        if self._reduced is not None:
+            before, earlier = self._reduced
+            field = self._search(earlier, reduced)
+            pace = _most(np.hypot(field[..., 0], field[..., 1])) * (_SHRINK / (number - before))
+            self._motions.append((before, number, pace))
+        self._reduced = (number, reduced)
+
+    def scene(self) -> Scene:
+        """Return the statistics; no frame may be added afterwards."""
+        if not self._frames:
+            return Scene.unknown()
+        if self._last is not None and (self._frames - 1) % LAG_FRAMES:
+            with one_thread():
+                self._measure_motion(self._frames - 1, self._last)
+        boundaries = self._shot_boundaries()
+        values = np.full((-(-self._frames // SEGMENT_FRAMES), COLUMNS), np.nan)
+        deviations = np.sqrt(self._variances)
+        means = np.array(self._means)
+        ripples = np.abs(means[1:-1] - (means[:-2] + means[2:]) / 2)
+        for number, row in enumerate(values):
+            low, high = number * SEGMENT_FRAMES, min((number + 1) * SEGMENT_FRAMES, self._frames)
+            inside = [
+                pace
+                for before, after, pace in self._motions
+                if before < high and after > low and not any(before < boundary <= after for boundary in boundaries)
+            ]
+            row[MOTION] = np.max(inside, axis=0) if inside else np.nan
+            row[CHANGE] = np.max(self._changes[low:high], axis=0) if low + 1 < self._frames else 0.0
+            row[CONTRAST] = deviations[low:high].max()
+            shares = [(dark, clipped) for frame, dark, clipped in self._shares if low <= frame < high]
+            row[[DARK, CLIPPED]] = np.mean(shares, axis=0)
+            rippled = ripples[max(0, low - 1) : high - 1]
+            row[FLICKER] = rippled.mean() if len(rippled) else 0.0
+            row[NOISE] = next((noise for frame, noise in self._noises if low <= frame < high), np.nan)
+        return Scene.of(self._frames, boundaries, values)
+
+    def _shot_boundaries(self) -> tuple[int, ...]:
+        boundaries = []
+        for at, step in enumerate(self._steps):  # from frame ``at`` to ``at + 1``
+            contrast = self._variances[at] + self._variances[at + 1]
+            if step < _LEAST_BOUNDARY_LEVELS or step**2 < _LEAST_BOUNDARY_SHARE**2 * contrast:
+                continue
+            around = self._steps[max(0, at - _NEIGHBOURS) : at] + self._steps[at + 1 : at + 1 + _NEIGHBOURS]
+            if around and step < _LEAST_BOUNDARY_RATIO * float(np.median(around)):
+                continue
+            if at < len(self._returns) and self._returns[at] < _LARGEST_RETURN * step:
+                continue  # a flash begins
+            if at and self._returns[at - 1] < _LARGEST_RETURN * step:
+                continue  # it ends
+            boundaries.append(at + 1)
+        return tuple(boundaries)
+
+
+def _block_sums(picture: Picture) -> npt.NDArray[np.int64]:
+    """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
+    height, width = picture.shape
+    rows, columns = max(1, height // _BLOCK_PX), max(1, width // _BLOCK_PX)
+    if height < _BLOCK_PX or width < _BLOCK_PX:
+        picture = cv2.copyMakeBorder(
+            picture, 0, max(0, _BLOCK_PX - height), 0, max(0, _BLOCK_PX - width), cv2.BORDER_REPLICATE
+        ).astype(np.uint8, copy=False)
+    whole = picture[: rows * _BLOCK_PX, : columns * _BLOCK_PX].astype(np.float32)
+    # float32 holds these sums exactly, so the order of summation does not matter.
+    means = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.rint(means * 64).astype(np.int64)
+
+
+def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
+    """Return the mean absolute difference of block means in grey levels, each picture's own mean taken off."""
+    change = second - first
+    count = change.size
+    return float(np.abs(count * change - change.sum()).sum()) / (64 * count**2)
+
+
+def _largest(blocks: npt.NDArray[np.int64]) -> _Tiles:
+    """Return [16], the largest value of each tile."""
+    rows, columns = (np.arange(TILES) * side // TILES for side in blocks.shape)
+    return np.maximum.reduceat(np.maximum.reduceat(blocks, rows, axis=0), columns, axis=1).ravel().astype(np.float64)
+
+
+def _most(pace: npt.NDArray[np.float32]) -> _Tiles:
+    """Return [16], what 95 % of each tile stays below."""
+    tiles = [part for row in _parts(pace, 0) for part in _parts(row, 1)]
+    return np.array([np.quantile(tile, _MOST_OF_THE_PICTURE) for tile in tiles])
+
+
+def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.float32]]:
+    """Return four parts of about equal size, of at least one row or column each."""
+    side = values.shape[axis]
+    starts = [at * side // TILES for at in range(TILES)]
+    ends = [max(start + 1, (at + 1) * side // TILES) for at, start in enumerate(starts)]
+    return [values.take(range(start, end), axis) for start, end in zip(starts, ends, strict=True)]
+
+
+def _noise(first: Picture, second: Picture) -> float:
+    """Return the standard deviation of one pixel's noise in grey levels.
+
+    It is measured in the tenth of the blocks whose difference varies least; motion adds to it only where no part of the
+    picture stands still.
+    """
+    height, width = (max(1, side // _BLOCK_PX) for side in first.shape)
+    part = np.s_[: height * _BLOCK_PX, : width * _BLOCK_PX]
+    change = cv2.subtract(second[part], first[part], dtype=cv2.CV_32F)
+    mean = cv2.resize(change, (width, height), interpolation=cv2.INTER_AREA)
+    square = cv2.resize(change * change, (width, height), interpolation=cv2.INTER_AREA)
+    variance = np.maximum(square - mean * mean, 0.0)
+    return float(np.sqrt(np.quantile(variance, _STILLEST) / 2))
+
+
+def _reduced(picture: Picture) -> Picture:
+    height, width = (max(1, side // _SHRINK) for side in picture.shape)
+    part = picture[: height * _SHRINK, : width * _SHRINK]
+    return cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

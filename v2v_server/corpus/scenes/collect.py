@@ -1,0 +1,184 @@
+"""The statistics of all videos of a corpus: from the index, from a prepared folder's manifest, or from an analysis.
+
+An analysis decodes the beginning of a video once, in a process of its own. The index keeps the result for the file's
+fingerprint and the rows that were analysed, together with the runs that follow from it: a start reads only these.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from array import array
+from base64 import b64decode
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
+from v2v_server.cloud.copies import Copies, open_local
+from v2v_server.corpus.index.columns import VideoTable, joined
+from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
+from v2v_server.corpus.manifest import Manifest
+from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
+from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, Scene
+from v2v_server.store.clips import pictures_of
+from v2v_server.system.compile_cache import compile_cache
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.orientation import Window
+from v2v_server.video.rows import Rows
+
+
+@dataclass(frozen=True, slots=True)
+class SceneCollection:
+    """How the videos of a corpus are analysed.
+
+    Attributes:
+        rows: of the corpus; all of a prepared one.
+        manifest: of a prepared folder, whose statistics are those of its source's frames where it has them.
+    """
+
+    rows: Rows
+    manifest: Manifest | None
+
+    @property
+    def kind(self) -> FigureKind:
+        """Distinguish analyses of one file."""
+        is_source = self.manifest is None or self.manifest.lossless
+        made = "" if self.manifest is None or is_source else f"prepared {self.manifest.header.rows}, "
+        return FigureKind("scene", f"{made}{self.rows}, look {ANALYSIS_VERSION}")
+
+    def collect(
+        self, store: Store, root: Path | Copies, table: VideoTable, processes: int, progress: Progress | None
+    ) -> None:
+        """Make sure that the index has the scene of each usable video, if it can be had.
+
+        Raises:
+            sqlite3.Error: the index cannot be written.
+        """
+        has_earlier = store.make_figures()
+        known = joined(table.ids, store.summaries(self.kind), [], (None,))
+        missing = [table.row(at) for at, (_, runs) in enumerate(known) if runs is None and table.problem[at] is None]
+        with closing(self._found(store, root, missing, has_earlier, processes)) as found:
+            for batch in batches(found, len(missing), progress):
+                store.put_figures(self.kind, (figures(record, scene) for record, scene in batch))
+
+    def read(
+        self, store: Store, ids: Sequence[str], frames: npt.NDArray[np.int64], unknown: set[str], digest: str
+    ) -> tuple[SplitVideos, str]:
+        """Return the usable runs of videos, and a digest that names all that is known of them.
+
+        Args:
+            ids, frames: of the videos of a snapshot, in its order.
+            unknown: ids of videos of which nothing is known; receives those that the index has no scene of.
+            digest: of the snapshot.
+
+        Raises:
+            sqlite3.Error: the index is damaged.
+        """
+        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+        encoded, lengths, nothing = bytearray(), array("q"), Scene.unknown().to_bytes()
+        whole = np.stack((0 * frames, frames), 1).astype("<i4")
+        known = joined(ids, store.all_figures(self.kind), [], (None, nothing))
+        for number, (id, runs, data) in enumerate(known):
+            if runs is None or len(runs) % 8 or id in unknown:
+                unknown.add(id)
+                runs, data = whole[number].tobytes(), nothing
+            sha.update(data)
+            encoded += runs
+            lengths.append(len(runs))
+        return SplitVideos.decode(frames, bytes(encoded), np.asarray(lengths)), sha.hexdigest()[:32]
+
+    def _found(
+        self, store: Store, root: Path | Copies, missing: list[IndexRow], has_earlier: bool, processes: int
+    ) -> Generator[tuple[IndexRow, Scene], None, None]:
+        by_id: dict[str, IndexRow] = {}
+        for record in missing:
+            data = self._prepared(record)
+            if data is None and has_earlier:
+                data = store.earlier_scene(record.id, record.fingerprint, self.kind.version)
+            if data is None:
+                by_id[record.id] = record
+            else:
+                yield record, Scene.from_bytes(data)
+
+        def jobs() -> Iterator[_Job]:
+            for record in by_id.values():
+                index = store.frame_index(record.id, record.fingerprint) or b""
+                yield _Job(record.id, record.fingerprint, index, self._window(record))
+
+        isolated = partial(
+            run_isolated,
+            partial(_analyse, root),
+            deadline_seconds=lambda job: LONGEST_SECONDS,
+            memory_bytes=2 * LARGEST_MEMORY_BYTES,
+            writable=None if isinstance(root, Copies) else compile_cache(),
+        )
+        suspects = []
+        for job, found in isolated(jobs(), processes):
+            if isinstance(found, Died) and found.overdue_seconds:
+                continue  # the next start tries again
+            if isinstance(found, Died) or not found:
+                suspects.append(job)
+            else:
+                yield by_id[job.id], Scene.from_bytes(found)
+        # Once more, alone: the process may have been killed from outside, or for lack of memory, or its storage failed
+        # for a moment. A second failure is not kept: such a video counts as unknown, and the next start tries again.
+        for job, found in isolated(suspects, 1):
+            if not isinstance(found, Died) and found:
+                yield by_id[job.id], Scene.from_bytes(found)
+
+    def _prepared(self, record: IndexRow) -> bytes | None:
+        """Return the encoded scene that the manifest states."""
+        if self.manifest is None or not self.manifest.videos[record.id].scene or not self.manifest.describes(record):
+            return None
+        return b64decode(self.manifest.videos[record.id].scene)
+
+    def _window(self, record: IndexRow) -> Window | None:
+        try:
+            top, bottom = self.rows.bounds(record.height_px)
+        except UsageError:
+            return None  # no sequence is made of it either
+        return top, 0, bottom - top, record.width_px
+
+
+def figures(record: IndexRow, scene: Scene) -> Figures:
+    """Return what the index keeps of a scene."""
+    runs = np.array(scene.runs(record.frames), "<i4").tobytes()
+    return Figures(record.id, record.fingerprint, runs, scene.to_bytes())
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    id: str
+    fingerprint: str
+    index: bytes
+    window: Window | None
+
+
+def _analyse(root: Path | Copies, job: _Job) -> bytes:
+    """Return the encoded scene of one video, from what decodes before the first error.
+
+    It is empty where the system, not the decoder, reports an error.
+    """
+    # Import lazily: processes that only open a catalogue need no OpenCV.
+    from v2v_server.corpus.scenes.analysis import SceneAnalysis
+
+    analysis = SceneAnalysis()
+    if job.index and job.window is not None:
+        try:
+            with open_local(root, job.id, job.fingerprint) as path:
+                pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
+                for picture in islice(pictures, MOST_FRAMES):
+                    analysis.add(picture)
+        except VideoError as error:
+            if isinstance(error, VideoUnreadable) or isinstance(error.__cause__, OSError):
+                return b""
+            # A worker that decodes the frames after the error reports the same error.
+    return analysis.scene().to_bytes()

@@ -1,0 +1,162 @@
+"""The videos of a snapshot in columns; an entry is made when it is read."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+from v2v_protocol.errors import UsageError
+from v2v_server.corpus.index.columns import CHUNK, VideoTable
+from v2v_server.corpus.scenes.runs import Runs, SplitVideos
+from v2v_server.video.rows import Rows
+
+Thresholds = tuple[float | None, float | None]
+NO_THRESHOLDS: Thresholds = (None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoEntry:
+    """A video that can be used.
+
+    Attributes:
+        id: relative POSIX path, the video's permanent name.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
+        frames: number of frames to decode.
+        width_px, height_px: size of the upright picture, before ``rows``.
+        frames_per_second: average rate; NaN where unknown.
+        codec: FFmpeg's name of the format.
+        threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
+        runs: (first frame, frame after the last) of each stretch without a shot boundary and with something to see;
+            None where the catalogue was opened without ``scene``.
+    """
+
+    id: str
+    fingerprint: str
+    frames: int
+    width_px: int
+    height_px: int
+    frames_per_second: float
+    codec: str
+    threshold_pos: float | None = None
+    threshold_neg: float | None = None
+    runs: Runs | None = None
+
+
+class Videos(Sequence[VideoEntry]):
+    """The videos of a snapshot by id: facts in memory, looked up by number without reading the index.
+
+    Args:
+        table: the usable rows, sorted by id.
+        thresholds: (positive, negative) of videos that have some, by number.
+        split: the videos whose usable frames are not one run of all; None where that is unknown.
+
+    Attributes:
+        ids, fingerprints, frames, width_px, height_px, interlaced: columns, one value for each video.
+        split: as given.
+    """
+
+    def __init__(
+        self, table: VideoTable, thresholds: Mapping[int, Thresholds], split: SplitVideos | None = None
+    ) -> None:
+        self._table, self._thresholds, self.split = table, thresholds, split
+        self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
+        self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
+
+    def find(self, id: str) -> int | None:
+        """Return the number of the video with an id; None if there is none."""
+        return self.ids.find(id)
+
+    def digest(self, rows: Rows) -> str:
+        """Return 32 hexadecimal digits that name these videos with these rows.
+
+        Fingerprints cover the track and its orientation.
+        """
+        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        table = self._table
+        columns = table.ids, table.fingerprints, table.frames, table.width_px, table.height_px, table.frames_per_second
+        for start in range(0, len(self), CHUNK):
+            parts = [column[start : start + CHUNK] for column in columns]
+            lists = [part if isinstance(part, list) else part.tolist() for part in parts]
+            lines = []
+            for number, values in enumerate(zip(*lists, strict=True), start):
+                limits = self._thresholds.get(number, NO_THRESHOLDS)
+                lines.append("\0".join(map(str, (*values, *limits))) + "\n")
+            sha.update("".join(lines).encode())
+        return sha.hexdigest()[:32]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Videos) and len(self) == len(other) and all(map(VideoEntry.__eq__, self, other))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __iter__(self) -> Iterator[VideoEntry]:
+        return map(self.__getitem__, range(len(self)))
+
+    @overload
+    def __getitem__(self, at: int) -> VideoEntry: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> tuple[VideoEntry, ...]: ...
+
+    def __getitem__(self, at: int | slice) -> VideoEntry | tuple[VideoEntry, ...]:
+        if isinstance(at, slice):
+            return tuple(self[number] for number in range(*at.indices(len(self))))
+        number = range(len(self))[at]
+        record = self._table.row(number)
+        pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
+        runs = None
+        if self.split is not None and (runs := self.split.runs(number)) is None:
+            runs = ((0, record.frames),)
+        return VideoEntry(
+            id=record.id,
+            fingerprint=record.fingerprint,
+            frames=record.frames,
+            width_px=record.width_px,
+            height_px=record.height_px,
+            frames_per_second=math.nan if record.frames_per_second is None else record.frames_per_second,
+            codec=record.codec,
+            threshold_pos=pos,
+            threshold_neg=neg,
+            runs=runs,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CorpusFacts:
+    """What is known of a corpus in memory: no part of it reads the index on disk.
+
+    Attributes:
+        videos: the videos that can be used, by id.
+        rows: the usable rows of each picture.
+        digest: names this snapshot.
+        scene_digest: names this snapshot together with the statistics of its videos; None without them.
+    """
+
+    videos: Sequence[VideoEntry]
+    rows: Rows
+    digest: str
+    scene_digest: str | None
+
+    def digest_under(self, scene: str) -> str:
+        """Return the digest that names this snapshot in samples of a spec.
+
+        Args:
+            scene: of the spec; with "off" the statistics do not count.
+
+        Raises:
+            UsageError: "auto", and the catalogue was opened without ``scene``.
+        """
+        if scene == "off":
+            return self.digest
+        if self.scene_digest is None:
+            raise UsageError(
+                f'scene = "{scene}" needs statistics of the videos, which this catalogue was opened without: start the '
+                "server with --scene auto"
+            )
+        return self.scene_digest
