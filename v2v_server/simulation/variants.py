@@ -38,6 +38,7 @@ def variants(
     step_seconds: float = 1.0,
     thresholds: tuple[float, float] | None = None,
     arrays: Collection[str] = ("voxels",),
+    levels_per_step: int = 0,
 ) -> frozenset[Variant]:
     """Return the variants that the draws of a recipe may need, as far as the recipe determines them.
 
@@ -50,10 +51,13 @@ def variants(
         step_seconds: time from one frame to the next; used only if something is stated per second.
         thresholds: thresholds that a list file states for the video; None if it states none.
         arrays: those that the kernel makes (``kernels.ARRAYS``), at least one.
+        levels_per_step: largest number of levels between two frames.
     """
-    events = recipe.worst_events(step_seconds, thresholds) * (EFFECTS_MARGIN if recipe.has_effects else 1.0)
+    events = recipe.worst_events(step_seconds, thresholds, levels_per_step) * (
+        EFFECTS_MARGIN if recipe.has_effects else 1.0
+    )
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
-    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or {"voxels"} != set(arrays)
+    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or levels_per_step > 0 or {"voxels"} != set(arrays)
     return frozenset(Variant(voxel_dtype, is_general, precision) for precision in precisions)
 
 
